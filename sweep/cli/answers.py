@@ -141,7 +141,7 @@ def limit(options: argparse.Namespace) -> int:
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if output is not None:
-        library.charts.write_figure(library.limit_figure.limit_panels(limits), output)
+        library.figure.write_figure([library.limit_figure.limit_figure(limits)], output)
     return answered(options, library.limit_figure.limit_findings(limits))
 
 
@@ -313,3 +313,17 @@ def calibration(options: argparse.Namespace) -> int:
         coefficients=options.coefficients, target_m=options.target_m)
     return answered(options, library.comparison_tables.calibration_findings(
         library.camera_calibration.calibration_summary(found), quoted(options.store)))
+
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep reference``.
+
+@command(
+    "pipelines/README.md", {
+        "sweep reference": "lists the subjects: sections of a pipeline, effects, variables, ...",
+        "sweep reference camera tilt_deg": "prints the parameters of [camera], and tilt_deg"},
+    argument("names", metavar="NAME", nargs="*", help="a subject, or a parameter"),
+    *FORM)
+def reference(options: argparse.Namespace) -> int:
+    """Explain parameters, effects, solvers, variables and flags."""
+    return answered(options, library.reference.reference(options.names))

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sweep import library
@@ -48,12 +49,20 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # ``sweep run``.
 
+EXAMPLES = ("smoke",)
+"""Pipelines that are installed with the package."""
+
+
 @command(
     "sweep/execution/README.md", {
-        "sweep run pipelines/smoke.toml": "writes runs/smoke.zarr",
+        "sweep run --example smoke": "writes runs/smoke.zarr, from a pipeline of the package",
         "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr":
             "runs the same experiment at other tilts"},
-    *PIPELINE, *PRECISION, *new_store(), *LARGE_RUN, SCHEDULER,
+    argument("pipeline", metavar="PIPELINE", nargs="?",
+             help="TOML file of the experiment, or a store that was made from it"),
+    argument("--example", choices=EXAMPLES,
+             help="a pipeline that is installed with the package, in place of a file"),
+    PIPELINE[1], *PRECISION, *new_store(), *LARGE_RUN, SCHEDULER,
     argument(
         "--time-limit", type=float, metavar="S", dest="time_limit_s",
         help="block timeout in seconds (default: 600, or ten times a block's work)"),
@@ -65,8 +74,13 @@ if TYPE_CHECKING:
 @beside_child
 def run(options: argparse.Namespace, child: Child) -> int:
     """Run a pipeline into a store, or continue an interrupted run."""
+    if (options.pipeline is None) == (options.example is None):
+        raise ArgumentError("pipeline", options.pipeline or "",
+                            "expected a TOML file, a store, or --example smoke")
+    if options.example is not None:
+        options.pipeline = str(Path(library.__file__).parent / "examples"
+                               / f"{options.example}.toml")
     pipeline = read_pipeline(options)
-
     announce_compilation(pipeline)
     options.stopped = "stopped before anything was computed" if options.overwrite else CONTINUES
     camera = [] if options.json else [f"camera: {library.facts.camera_facts(pipeline).line()}"]
@@ -290,7 +304,7 @@ def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:
             "draws this pose into scene.png",
         "sweep show pipelines/faults.toml --full --plain -o frame.png":
             "writes the whole frame of the first pose, without annotations"},
-    *PIPELINE, cell_argument("the pose and its configuration"), *picture("scene.png"))
+    *PIPELINE, cell_argument("the pose and its configuration"), *picture("scene.png"), JSON)
 def show(options: argparse.Namespace) -> int:
     """Draw the image of one pose with the detections in it."""
     pipeline = read_pipeline(options)
@@ -306,6 +320,10 @@ def show(options: argparse.Namespace) -> int:
         )
     )
     write_png(options.output, image)
+    if options.json:
+        print_json({"output": options.output, "detection": scene.detection,
+                    "estimate": scene.estimate, "area_px2": scene.area_px, **scene.errors})
+        return 0
     say(f"{options.output}: {scene.detection.name}, {scene.estimate.name}")
     settings = [word for setting in options.settings for word in ("--set", setting)]
     say_next(quoted("sweep", "plan", options.pipeline, *settings))
@@ -323,7 +341,7 @@ def show(options: argparse.Namespace) -> int:
             "recomputes the first cell, for 10 seconds at most"},
     STORE, cell_argument("the cell", ""), *picture(),
     argument("--time-limit", type=float, default=60.0, metavar="S", dest="time_limit_s",
-             help="timeout in seconds for each cell (default: 60)"))
+             help="timeout in seconds for each cell (default: 60)"), JSON)
 def repro(options: argparse.Namespace) -> int:
     """Recompute one cell of a store, compared with the stored one."""
     if not 0 < options.time_limit_s < math.inf:
@@ -337,17 +355,28 @@ def repro(options: argparse.Namespace) -> int:
         check_png(options.output)
 
     library.reproduction.check_selection(options.store, chosen)
-    status = 0
+    status, cells = 0, []
     for number, at in enumerate(chosen):
-        if number:
+        if number and not options.json:
             say()
         again = library.reproduction.reproduce(
             options.store, at, whole_frame=options.full, time_limit_s=options.time_limit_s
         )
+        status = max(status, int(bool(again.difference)))
+        if options.json:
+            cells.append({
+                "at": again.at, "stored": again.stored, "recomputed": again.recomputed,
+                "difference": again.difference, "exact": again.exact, "seconds": again.seconds,
+                "failures": again.failures, "changes": again.changes})
+            _write_image(again, options)
+            continue
         _print_cell(again)
         _write_image(again, options)
-        status = max(status, _print_verdict(again))
-    _say_next(options, again, status)
+        say(_verdict(again))
+    if options.json:
+        print_json({"store": options.store, "cells": cells})
+    else:
+        _say_next(options, again, status)
     return status
 
 
@@ -374,35 +403,29 @@ def _print_cell(again: Reproduction) -> None:
 def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
     if options.output is None:
         return
-    if again.image is None:
-        say("no image: rendering failed")
-        return
-
-    image = again.image
-    if again.inspection is not None and not options.plain:
-        image = library.scenes.draw_scene(
-            again.inspection,
-            library.cell_selection.coordinates_text(again.pipeline, again.cell_pipeline),
-        )
-    write_png(options.output, image)
-    say(f"{options.output}: image of the cell")
+    line = "no image: rendering failed"
+    if again.image is not None:
+        line, image = f"{options.output}: image of the cell", again.image
+        if again.inspection is not None and not options.plain:
+            image = library.scenes.draw_scene(
+                again.inspection,
+                library.cell_selection.coordinates_text(again.pipeline, again.cell_pipeline))
+        write_png(options.output, image)
+    if not options.json:
+        say(line)
 
 
-def _print_verdict(again: Reproduction) -> int:
-    """Print whether the values are the stored ones; return the exit status."""
+def _verdict(again: Reproduction) -> str:
+    """Return whether the values are the stored ones."""
     if again.unneeded:
-        say("the store does not hold this cell: the run settled its condition with fewer trials")
-        return 0
+        return "the store does not hold this cell: the run settled its condition with fewer trials"
     if again.stored is None:
-        say("the store does not hold this cell yet")
-        return 0
+        return "the store does not hold this cell yet"
     if again.difference:
-        say(f"differs from the store: {again.difference}")
-        return 1
+        return f"differs from the store: {again.difference}"
     how = "bit for bit" if again.exact else (
         "within the tolerances for another processor or version")
-    say(f"agrees with the store {how}")
-    return 0
+    return f"agrees with the store {how}"
 
 
 def _say_next(options: argparse.Namespace, again: Reproduction, status: int) -> None:
@@ -498,7 +521,7 @@ def verify(options: argparse.Namespace) -> int:
         print_json(report.to_json())
         return 1 if report.damage else 0
 
-    unstable = [each for each in report.damage if each.kind == "not deterministic"]
+    unstable = [each for each in report.damage if each.where == report.unstable]
     damaged = [each for each in report.damage if each not in unstable]
     for what, listed in (("repaired", report.repaired), ("damaged", damaged)):
         for damage in listed[:MAX_LINES]:
@@ -514,8 +537,6 @@ def verify(options: argparse.Namespace) -> int:
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})"
     )
-    if report.retried:
-        again += f", {report.retried:,} that had failed"
     state = "" if report.finished else ", unfinished"
     say(
         f"{report.store}: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
 from collections.abc import Sequence
 from typing import NoReturn
@@ -12,6 +13,7 @@ from sweep.cli.answers import (
     compare,
     error_model,
     limit,
+    reference,
     report,
     require,
     size,
@@ -19,7 +21,7 @@ from sweep.cli.answers import (
 )
 from sweep.cli.command import Command, argument, command, flushed
 from sweep.cli.experiments import plan, repro, run, show, status, verify
-from sweep.cli.programs import export, fit, photos, plugins, score
+from sweep.cli.programs import diagnose, export, fit, photos, plugins, score
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
@@ -29,8 +31,8 @@ from sweep.version import __version__
 
 SHELLS = ("bash", "zsh", "fish")
 
-FILES = ("PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR", "FILE", "FIGURE",
-         "PNG")
+FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR",
+         "FILE", "FIGURE", "PNG")
 """Arguments for which names of files and folders are offered."""
 
 
@@ -57,11 +59,16 @@ def completion(options: argparse.Namespace) -> int:
 # --------------------------------------------------------------------------------------------------
 # The parser of the command line, assembled from the commands' own declarations.
 
-COMMANDS = (
-    run, plan, size, limit, show, repro, tradeoff, report, require, error_model, calibration,
-    verify, status, export, score, photos, fit, compare, plugins, completion,
-)
-"""Every command, in the order in which the help lists them."""
+GROUPS = {
+    "experiments": (run, plan, show, status, verify, repro),
+    "answers": (report, require, size, limit, tradeoff, diagnose, error_model, calibration),
+    "your camera": (photos, fit, compare),
+    "other programs": (export, score, plugins),
+    "help": (reference, completion),
+}
+"""Every command, by group, in the order in which the help lists them."""
+
+COMMANDS = tuple(itertools.chain.from_iterable(GROUPS.values()))
 
 REMOVED = {
     "check-detector": "`sweep plugins check NAME` tries a detector or a solver",
@@ -76,15 +83,23 @@ REMOVED_FLAGS = {
 }
 """Flags of earlier versions -> what does their work."""
 
+UNGROUPED = "all commands"
+"""Title of the list that argparse makes of the commands."""
+
 INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)'")
 """Beginning of argparse's message for a command that does not exist."""
 
-GUIDES = ("README.md", "sweep/README.md")
-"""Pages for all commands: a first answer; architecture, development and the glossary."""
+GUIDES = ("README.md", "pipelines/questions/README.md", "sweep/README.md")
+"""Pages for all commands: a first answer; questions and the command that answers each;
+architecture, development and the glossary."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors say what may be meant."""
+    """A parser whose errors say what may be meant, and whose help has commands by group."""
+
+    def format_help(self) -> str:
+        """Return the help, without the list of all commands, which stands in groups below."""
+        return re.sub(f"{UNGROUPED}:\n.*?\n\n", "", super().format_help(), flags=re.DOTALL)
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and an error with a hint, and exit with status 2.
@@ -134,13 +149,15 @@ def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParse
     parser = Parser(
         prog="sweep",
         description="How well will I know the pose? Experiments with fiducial markers.",
-        epilog="`sweep COMMAND --help` explains a command, with examples.\n"
-        f"guides: {', '.join(GUIDES)}",
+        epilog=_groups() + "\n`sweep COMMAND --help` explains a command, with examples.\n"
+        "first run: sweep run --example smoke\n"
+        f"which command answers which question: {GUIDES[1]}\n"
+        f"guides: {GUIDES[0]}, {GUIDES[2]}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"sweep {__version__}")
     parser.set_defaults(command=None)
-    commands = parser.add_subparsers(metavar="COMMAND")
+    commands = parser.add_subparsers(metavar="COMMAND", title=UNGROUPED)
     for each in COMMANDS:
         added = commands.add_parser(
             each.name, help=each.summary, description=each.execute.__doc__,
@@ -149,6 +166,13 @@ def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParse
         each.add_arguments(added)
         added.set_defaults(command=each, flags=_flags(added))
     return parser, list(commands.choices.values())
+
+
+def _groups() -> str:
+    """Return the commands by group, each with its summary."""
+    return "".join(
+        f"{group}:\n" + "".join(f"    {each.name:12} {each.summary}\n" for each in commands)
+        for group, commands in GROUPS.items())
 
 
 def parse(

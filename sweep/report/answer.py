@@ -21,23 +21,29 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import DatasetError, StoreError
 from sweep.experiment.experiment import shows_boards, target_word
-from sweep.report.comparison import Comparison, comparison, target_axes
+from sweep.report.comparison import CARDS, COUNTED, Comparison, comparison
 from sweep.report.decisions import WORDS, condition_table, decision_table, valued
 from sweep.report.error_model_file import error_model_tables
-from sweep.report.figure import sentences, values_with_ends
 from sweep.report.figures import (
     board_tables,
     errors_table,
     precision_tables,
+    sentences,
     signed_errors_table,
     size_errors_table,
+    threshold_tables,
 )
-from sweep.report.formatting import interval_text, number
 from sweep.report.limit_figure import as_json as limits_as_json
 from sweep.report.limit_figure import interval_text as limit_interval
 from sweep.report.limit_figure import limit_table, limit_text, values_met
-from sweep.report.report_data import CONFIGURATION, ReportData, configurations, course_of
-from sweep.report.table import Table, each_cell
+from sweep.report.report_data import (
+    CONFIGURATION,
+    Configurations,
+    ReportData,
+    configurations,
+    course_of,
+)
+from sweep.report.table import Column, Table, each_cell, interval_text, number
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,26 +117,23 @@ def answer(data: ReportData) -> Answer:
     StoreError
         If the store lacks what the requirements are of.
     """
-    known = configurations(data)
     try:
         decided = required(data) if data.require else None
     except DatasetError as error:
         raise StoreError(f"{data.store}: {error}") from None
     compared = comparison(data, None if decided is None else (decided.best,))
-    best = decided.best if decided is not None else next(
-        k for k, each in enumerate(known.settings.combinations)
-        if each.items() <= compared.indices[compared.best].items())
-    one = compared.summary.isel({CONFIGURATION: compared.best})
-    tiles = tuple(_tile(one, heading, *card) for heading, card in CARDS.items())
-    name = compared.names[compared.best] if compared.several else ""
+    known = compared.known
+    one = known.summary.isel({CONFIGURATION: compared.best})
+    tiles = tuple(_tile(one, card) for card in CARDS)
+    name = compared.name if known.several else ""
     return Answer(
-        _headline(data, decided, compared, one), _notes(data), name, tiles,
+        _headline(data, decided, compared, tiles), _notes(data, known), name, tiles,
         (*(decided.tables if decided is not None else ()), compared.table()),
-        (*(decided.details if decided is not None else ()), *size_errors_table(data, best),
+        (*(decided.details if decided is not None else ()),
+         *size_errors_table(data, known.settings.combinations[compared.best], name),
          *board_tables(data), errors_table(one, name), signed_errors_table(data),
-         *precision_tables(data), *error_model_tables(data)),
-        _numbers(decided, compared),
-    )
+         *threshold_tables(data), *precision_tables(data), *error_model_tables(data)),
+        _numbers(decided, compared))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -182,7 +185,7 @@ def required(data: ReportData) -> Required:
     ArgumentError, DatasetError
         As `sweep.analysis.check_requirements`.
     """
-    known = configurations(data)
+    known = configurations(data, targets=False)
     axes = known.settings.axes
     results = data.results.isel({name: list(some) for name, some in axes.items()})
     table = data.once("required", lambda: check_requirements(results, data.require, data.per))
@@ -251,32 +254,30 @@ def _reached(limits: Sequence[xr.Dataset], others: Sequence[str]) -> str:
 # The line, the notes, and the numbers in the cards.
 
 def _headline(
-    data: ReportData, decided: Required | None, compared: Comparison, one: xr.Dataset
+    data: ReportData, decided: Required | None, compared: Comparison, tiles: Sequence[Tile]
 ) -> str:
     """Return the answer in one line."""
-    if not int(compared.summary["looked_for"].sum()):
+    if not int(compared.known.summary["looked_for"].sum()):
         return (f"The {target_word(data.pipeline)} was looked for in no pose: it was visible and "
                 "modelled in none.")
     if decided is not None:
         return decided.line
     if compared.line:
         return f"{compared.line}."
-    detected, median, rmse = (_tile(one, heading, *CARDS[heading]) for heading in (
-        "detected", "rotation error, median", "range error, RMSE"))
+    detected, _, median, _, rmse, *_ = tiles
     errors = "".join(
         f"; {tile.heading} {tile.value}{f' ({tile.detail})' if tile.detail else ''}"
-        for tile in (median, rmse) if float(one["solved_rate"]) > 0)
+        for tile in (median, rmse) if tile.numbers["value"] == tile.numbers["value"])
     return f"Detected in {detected.value} ({detected.detail}){errors}."
 
 
-def _notes(data: ReportData) -> str:
+def _notes(data: ReportData, known: Configurations) -> str:
     """Return warnings, and what the numbers do not tell, as sentences."""
     warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
     return warnings + sentences(
         "A board counts as detected if at least one of its markers is."
         if shows_boards(data.pipeline) else "",
-        *configurations(data).notes,
-        data.pooled(*(() if data.require else target_axes(data))))
+        *known.settings.grouping.notes, data.pooled(*known.settings.axes))
 
 
 def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:
@@ -289,29 +290,17 @@ def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:
     return numbers
 
 
-CARDS = {
-    "detected": ("detection_rate", " %", "looked_for"),
-    "solved": ("solved_rate", " %", "looked_for"),
-    "rotation error, median": ("rotation_median_deg", "\u00b0"),
-    "rotation error, RMSE": ("rotation_rmse_deg", "\u00b0"),
-    "range error, RMSE": ("range_rmse_percent", " %"),
-    "range bias": ("range_bias_percent", " %"),
-    "flips": ("flip_rate", " %", "solved"),
-}
-"""Heading -> variable, unit, and of a share what it is of."""
-
-
-def _tile(one: xr.Dataset, heading: str, name: str, unit: str, counted: str = "") -> Tile:
-    ends = values_with_ends(one, name, 100 if counted else 1)
-    value, low, high = (float(end) for end in ends)
-    numbers: dict[str, Any] = {
-        "value": value, "low": low, "high": high, "unit": unit.strip()}
-    if math.isinf(value):
+def _tile(one: xr.Dataset, column: Column) -> Tile:
+    heading, _, unit = column.heading.rpartition(", ")
+    unit = {"deg": "\u00b0"}.get(unit, f" {unit}")
+    (found,) = column.cells(one)
+    numbers: dict[str, Any] = {**found._asdict(), "unit": unit.strip()}
+    if math.isinf(found.value):
         return Tile(heading, "\u221e", "more than half not solved", numbers)
-    known = math.isfinite(low) and not math.isnan(high)
-    details = [interval_text(low, high, unit)] if known else []
-    if counted:
+    known = math.isfinite(found.low) and not math.isnan(found.high)
+    details = [interval_text(found.low, found.high, unit)] if known else []
+    if counted := COUNTED.get(column.variable):
         numbers[counted] = int(one[counted])
         details.append(f"of {int(one[counted]):,} {counted.replace('_', ' ')}")
-    text = "\u2013" if math.isnan(value) else f"{number(value)}{unit}"
+    text = number(found.value) if math.isnan(found.value) else f"{number(found.value)}{unit}"
     return Tile(heading, text, ", ".join(details), numbers)

@@ -9,40 +9,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from sweep.analysis import compare, error_statistics
-from sweep.experiment.parameters import PARAMETERS
-from sweep.report.figure import values_with_ends
-from sweep.report.formatting import interval_text, number
+from sweep.analysis import compare
 from sweep.report.report_data import (
     CONFIGURATION,
     Configurations,
     ReportData,
     by_configuration,
     configurations,
-    is_numeric,
-    settings_of,
 )
-from sweep.report.table import Columns, Table, column_texts
+from sweep.report.table import Column, Table, Value, number
+from sweep.tradeoff.pareto import WRONG, conditions_of
 
 MIN_FLIPPED = 10
 """Poses flipped in one of two configurations alone from which an RMSE with flips is compared."""
 
-COLUMNS: Columns = {
-    "n": ("looked_for", 1.0),
-    "detected, %": ("detection_rate", 100.0),
-    "solved, %": ("solved_rate", 100.0),
-    "rotation median, deg": ("rotation_median_deg", 1.0),
-    "rotation RMSE, deg": ("rotation_rmse_deg", 1.0),
-    "range RMSE, %": ("range_rmse_percent", 1.0),
-    "range bias, %": ("range_bias_percent", 1.0),
-    "flips, %": ("flip_rate", 100.0),
-}
-"""Heading -> variable of `sweep.analysis.error_statistics`, and its factor."""
+CARDS = (
+    Column("detected, %", "detection_rate", 100), Column("solved, %", "solved_rate", 100),
+    Column("rotation median, deg", "rotation_median_deg"),
+    Column("rotation RMSE, deg", "rotation_rmse_deg"),
+    Column("range RMSE, %", "range_rmse_percent"), Column("range bias, %", "range_bias_percent"),
+    Column("flips, %", "flip_rate", 100),
+)
+"""Numbers of each configuration, and of the named one in the report's cards."""
 
-TARGET_SECTIONS = ("marker", "board", "target")
-"""Sections of a pipeline whose parameters tell targets apart."""
+COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_rate": "solved"}
+"""Share -> what it is of."""
 
 
 class Quantity(NamedTuple):
@@ -101,22 +93,15 @@ class Difference:
     verdict: int
 
     @property
-    def numbers(self) -> str:
-        """Value and interval as text."""
-        interval = "" if np.isnan(self.low) and np.isnan(self.high) else (
-            f" ({interval_text(self.low, self.high)})")
-        return number(self.value) + interval
+    def numbers(self) -> Value:
+        """Value and interval."""
+        return Value(self.value, self.low, self.high)
 
     @property
     def text(self) -> str:
         """All as text: ``range RMSE ratio 0.540 (0.520 to 0.560): better``."""
         unit = f" {self.unit}" if self.unit else ""
-        return f"{self.quantity} {self.numbers}{unit}: {self.verdict_text}"
-
-    @property
-    def verdict_text(self) -> str:
-        """The verdict as a word."""
-        return VERDICTS[self.verdict]
+        return f"{self.quantity} {self.numbers}{unit}: {VERDICTS[self.verdict]}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,29 +110,22 @@ class Comparison:
 
     Attributes
     ----------
-    names, wrong
-        The n labels, and whether the estimator has a wrong belief.
-    summary
-        `sweep.analysis.error_statistics` by configuration (n,).
-    indices
-        Index along each axis, of every configuration.
+    known
+        The n configurations.
     best
         Number of the configuration that is named best.
     differences
         (n,) the best one against each: detection, solved, rotation, range; none against itself.
     """
 
-    names: list[str]
-    wrong: NDArray[np.bool_]
-    summary: xr.Dataset
-    indices: list[dict[str, int]]
+    known: Configurations
     best: int
     differences: list[tuple[Difference, ...]]
 
     @property
-    def several(self) -> bool:
-        """Whether there is more than one."""
-        return len(self.names) > 1
+    def name(self) -> str:
+        """Label of the configuration that is named best."""
+        return self.known.names[self.best]
 
     def verdict(self, k: int) -> int:
         """Return whether the best one is better than another: by the first decided quantity."""
@@ -156,15 +134,15 @@ class Comparison:
     @property
     def line(self) -> str:
         """The best configuration against the one that comes nearest to it, in one line."""
-        others = [k for k in range(len(self.names)) if k != self.best and not self.wrong[k]]
+        known = self.known
+        others = [k for k in known.order if k != self.best and not known.wrong[k]]
         if not others:
             return ""
-        order = preferred(self.summary, self.wrong)
-        rival = min(others, key=lambda k: (self.verdict(k), order.index(k)))
+        rival = min(others, key=lambda k: (self.verdict(k), known.order.index(k)))
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
             next((each for each in pair[2:] if not np.isnan(each.value)), pair[0])]
-        line = f"{self.names[self.best]} against {self.names[rival]}: " + "; ".join(
+        line = f"{self.name} against {known.names[rival]}: " + "; ".join(
             each.text for each in shown)
         if len(others) > 1:
             counts = {verdict: sum(self.verdict(k) == verdict for k in others)
@@ -176,29 +154,31 @@ class Comparison:
 
     def table(self) -> Table:
         """Return a row for each configuration, with the best one's paired differences."""
-        texts = column_texts(self.summary, COLUMNS)
+        known, columns = self.known, (Column("n", "looked_for"), *CARDS)
+        headings = [each.heading for each in columns]
+        rows = [[name, *cells] for name, *cells in zip(
+            known.names, *(each.cells(known.summary) for each in columns), strict=True)]
         caption = "Configurations, with 95 % intervals"
-        rows = [[name, *values] for name, *values in zip(
-            self.names, *texts.values(), strict=True)]
-        if not self.several:
-            return Table.of(caption, [CONFIGURATION, *texts], rows)
-        beaten = any(self.verdict(k) < 0 and not self.wrong[k] for k in range(len(rows)))
+        if not known.several:
+            return Table.of(caption, [CONFIGURATION, *headings], rows)
+        beaten = any(self.verdict(k) < 0 and not known.wrong[k] for k in range(len(rows)))
         for k, pair in enumerate(self.differences):
-            rows[k] += [each.numbers + " without flips" * (each.quantity == UNFLIPPED.words)
-                        for each in pair] or [""] * len(PAIRED)
+            rows[k] += [each.numbers for each in pair] or [None] * len(PAIRED)
             rows[k].insert(1, verdict_words(pair) if k != self.best else
                            "named" if beaten else "best")
+        few = any(each.quantity == UNFLIPPED.words for pair in self.differences for each in pair)
         return Table.of(
-            f"{caption}; differences, ratios and verdict: {self.names[self.best]} against each, "
-            "on the same images", [CONFIGURATION, "verdict", *texts, *PAIRED], rows, stub=2)
+            f"{caption}; differences, ratios and verdict: {self.name} against each, on the same "
+            f"images{'; rotation without flips where few poses differ by them' if few else ''}",
+            [CONFIGURATION, "verdict", *headings, *PAIRED], rows, stub=2)
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
-        return [{"configuration": self.names[self.best], "against": name,
+        return [{"configuration": self.name, "against": name,
                  "verdict": VERDICTS[self.verdict(k)],
-                 "differences": [dataclasses.asdict(each) | {"verdict": each.verdict_text}
+                 "differences": [dataclasses.asdict(each) | {"verdict": VERDICTS[each.verdict]}
                                  for each in self.differences[k]]}
-                for k, name in enumerate(self.names) if k != self.best]
+                for k, name in enumerate(self.known.names) if k != self.best]
 
 
 def verdict_words(differences: Sequence[Difference]) -> str:
@@ -227,87 +207,47 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
     data
         The store.
     among
-        Numbers of `configurations` of which one may be the best, as those that reach as far in
-        what is required; by default all. Targets are then pooled as there.
+        Numbers of the configurations, with targets pooled, of which one may be the best, such as
+        those that reach as far in what is required; by default all, by target.
     """
     return data.once(f"comparison {among}", lambda: _comparison(data, among))
 
 
-def target_axes(data: ReportData) -> tuple[str, ...]:
-    """Return the axes of the scene along which targets differ by more than a number."""
-    return tuple(
-        axis.name for axis in data.pipeline.axes
-        if axis.name in data.scene_axes and not is_numeric(axis) and any(
-            PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
-            if name in PARAMETERS))
-
-
 def _comparison(data: ReportData, among: Sequence[int] | None) -> Comparison:
-    known = configurations(data)
-    settings, names, wrong, summary = known.settings, known.names, known.wrong, known.summary
-    targets = target_axes(data) if among is None else ()
-    if targets:
-        settings = settings_of(data, also=targets)
-        names, summary = by_configuration(
-            data.pipeline, data.analysed(error_statistics, settings.grouping),
-            settings.grouping.dims)
-        wrong = np.array([_is_wrong(known, each) for each in settings.combinations])
-    indices = settings.combinations
-    usable = [k for k in preferred(summary, wrong) if among is None or k in among]
+    known = configurations(data, targets=among is None)
+    usable = [k for k in known.order if among is None or k in among]
     tried: dict[int, list[tuple[Difference, ...]]] = {}
+
+    def better_than(best: int) -> list[int]:
+        return [k for k in usable
+                if overall(tried[best][k]) < 0 and known.wrong[k] <= known.wrong[best]]
+
     left, best = list(usable), usable[0]
-    while len(indices) > 1 and left:
+    while known.several and left:
         best = left.pop(0)
-        tried[best] = _against_each(data, indices, best, settings.grouping)
-        better = _better(tried[best], usable, wrong, best)
+        tried[best] = _against_each(data, known, best)
+        better = better_than(best)
         if not better:
             break
         left = [k for k in better if k in left] + [k for k in left if k not in better]
     else:
         # In a circle each is worse than another one: the one that is worse than the fewest.
-        best = min(tried, default=best, key=lambda k: len(_better(tried[k], usable, wrong, k)))
-    return Comparison(names, wrong, summary, indices, best, tried.get(best, [()]))
-
-
-def _better(
-    differences: Sequence[Sequence[Difference]], usable: Sequence[int], wrong: NDArray[np.bool_],
-    best: int,
-) -> list[int]:
-    """Return the configurations that are better than one, and may be named in its place."""
-    return [k for k in usable if overall(differences[k]) < 0 and wrong[k] <= wrong[best]]
-
-
-def _is_wrong(known: Configurations, at: Mapping[str, int]) -> bool:
-    """Return whether a configuration of one target has a wrong belief."""
-    return any(
-        bool(known.wrong[k]) and all(at.get(name, index) == index for name, index in each.items())
-        for k, each in enumerate(known.settings.combinations))
-
-
-def preferred(summary: xr.Dataset, wrong: NDArray[np.bool_]) -> list[int]:
-    """Return the configurations by detection rate, then rotation RMSE, then range RMSE."""
-    def column(name: str, missing: float) -> NDArray[np.float64]:
-        values = summary[name].values.astype(np.float64)
-        return np.where(np.isnan(values), missing, values)
-
-    order = np.lexsort((
-        column("range_rmse_percent", np.inf), column("rotation_rmse_deg", np.inf),
-        -column("solved_rate", -1.0), -column("detection_rate", -1.0), wrong))
-    listed: list[int] = order.tolist()
-    return listed
+        best = min(tried, default=best, key=lambda k: len(better_than(k)))
+    return Comparison(known, best, tried.get(best, [()]))
 
 
 def _against_each(
-    data: ReportData, indices: Sequence[Mapping[str, int]], best: int, grouping: Any
+    data: ReportData, known: Configurations, best: int
 ) -> list[tuple[Difference, ...]]:
     """Return the differences of one configuration from each, of no quantity from itself."""
+    grouping, at = known.settings.grouping, known.settings.combinations[best]
     chosen = {name: list(some) for name, some in grouping.chosen}
-    reference = with_configuration(data.results, indices[best]).isel(chosen)
-    table = data.once(("against", tuple(indices[best].items()), grouping), lambda: compare(
+    reference = with_configuration(data.results, at).isel(chosen)
+    table = data.once(("against", tuple(at.items()), grouping), lambda: compare(
         data.results.isel(chosen), reference, grouping.dims))
     _, rows = by_configuration(data.pipeline, table, grouping.dims)
     return [() if k == best else _differences(rows.isel({CONFIGURATION: k}))
-            for k in range(len(indices))]
+            for k in range(len(known.names))]
 
 
 def _differences(row: xr.Dataset) -> tuple[Difference, ...]:
@@ -315,11 +255,10 @@ def _differences(row: xr.Dataset) -> tuple[Difference, ...]:
     rotation = UNFLIPPED if 0 < flipped < MIN_FLIPPED else ROTATION
     out = []
     for each in (DETECTION, SOLVED, rotation, RANGE):
-        value, low, high = (
-            float(end) for end in values_with_ends(row, each.variable, each.scale))
-        above, below = low > each.equal, high < each.equal
+        (numbers,) = Column("", each.variable, each.scale).cells(row)
+        above, below = numbers.low > each.equal, numbers.high < each.equal
         verdict = int(above) - int(below) if each.large_is_good else int(below) - int(above)
-        out.append(Difference(each.words, value, low, high, each.unit, verdict))
+        out.append(Difference(each.words, *numbers, each.unit, verdict))
     return tuple(out)
 
 
@@ -336,3 +275,51 @@ def with_configuration(results: xr.Dataset, at: Mapping[str, int]) -> xr.Dataset
             replaced[name] = one.expand_dims({dim: results[dim] for dim in dims}).transpose(
                 *variable.dims)
     return results.assign(replaced)
+
+
+# --------------------------------------------------------------------------------------------------
+# Which configuration a measured trade recommends: the comparison, and what each costs.
+
+
+def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = None) -> list[str]:
+    """Return a line for each condition: the best configuration, and the cheapest as good.
+
+    Parameters
+    ----------
+    data
+        The store that was measured.
+    trade
+        With ``cost_ms`` by condition and configuration.
+    budget_ms
+        Most milliseconds a frame of what is recommended.
+    """
+    results = data.results
+    if "renderer" in results.dims:
+        results = results.isel(renderer=[results["renderer"].values.tolist().index("exact")])
+    lines = []
+    for label, at, part in conditions_of(trade):
+        keep = {name: np.flatnonzero(results[name].values == value) for name, value in at.items()}
+        here = dataclasses.replace(data, results=results.isel(keep), made={})
+        known = configurations(here, targets=False)
+        costs = dict(zip(part["treatment"].values.tolist(), part["cost_ms"].values.tolist(),
+                         strict=True))
+        cost = [costs.get(name, np.nan) for name in known.names]
+        usable = [k for k in known.order if WRONG not in known.names[k] and np.isfinite(cost[k])]
+        within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]
+        start = f"{label}: " if label else ""
+        if not within:
+            near = min(usable, key=lambda k: cost[k], default=None)
+            lines.append(f"{start}nothing fits {budget_ms or 0:g} ms a frame" + (
+                "" if near is None else
+                f"; the nearest is {known.names[near]}, {number(cost[near])} ms"))
+            continue
+        found = comparison(here, tuple(within))
+        equal = [k for k in within if k == found.best or found.verdict(k) <= 0]
+        cheapest = min(equal, key=lambda k: cost[k])
+        budget = "" if budget_ms is None else f"within {budget_ms:g} ms a frame: "
+        line = f"{start}{budget}{found.name}, {number(cost[found.best])} ms a frame"
+        if cheapest != found.best:
+            line += (f"; not shown to be worse and cheaper is {known.names[cheapest]}, "
+                     f"{number(cost[cheapest])} ms")
+        lines.append(line + (f"; {found.line}" if found.line else ""))
+    return lines

@@ -18,9 +18,14 @@ from sweep.errors import ArgumentError
 from sweep.experiment.cell_selection import parse_selection
 from sweep.experiment.draws import REPLICATES
 from sweep.messages import label, nearest, quoted
-from sweep.report.formatting import coordinate, interval_text, number, plural
-from sweep.report.table import Findings, Table
-from sweep.tradeoff.pareto import digits
+from sweep.report.table import (
+    Findings,
+    Table,
+    coordinate,
+    interval_text,
+    number,
+    plural,
+)
 
 if TYPE_CHECKING:
     from sweep.analysis.choices import Answer, Cause
@@ -179,7 +184,7 @@ def headline(choice: Choice) -> str:
             "confidence")
     if choice.best is not None:
         answer, cost = choice.answers[choice.best], choice.costs[choice.best]
-        ms = "" if cost is None else f", {digits(cost.ms)} ms a frame"
+        ms = "" if cost is None else f", {number(cost.ms)} ms a frame"
         name = _name(choice, answer, answer.value)
         if not choice.is_undecided:
             return f"{name} is the {wish} choice{ms}: it meets {what}"
@@ -209,7 +214,7 @@ def _why(choice: Choice, k: int) -> str:
     if answer.met and cost is not None and not choice.within_budget(k):
         at = f" at {described(cost.condition)}" if cost.condition else ""
         state = "not within" if cost.low > (choice.budget_ms or 0.0) else "not decided: within"
-        out.append(f"takes {digits(cost.ms)} ms ({digits(cost.low)} to {digits(cost.high)}){at}: "
+        out.append(f"takes {number(cost.ms)} ms ({number(cost.low)} to {number(cost.high)}){at}: "
                    f"{state} {choice.budget_ms:g} ms")
     return "; ".join(out)
 
@@ -243,7 +248,7 @@ def alternatives(choice: Choice) -> Table:
         value = ["none" if each is None else coordinate(each)
                  for each in (answer.value, answer.next)] if along else [
                      "yes" if answer.met else "no"]
-        ms = "" if cost is None else f"{digits(cost.ms)}{'*' * (k in choice.front)}"
+        ms = "" if cost is None else f"{number(cost.ms)}{'*' * (k in choice.front)}"
         rows.append([*map(str, answer.alternative.values()), *value, ms, _why(choice, k)])
     front = "; * no other is as good and cheaper" if choice.front else ""
     return Table.of(

@@ -16,10 +16,9 @@ from sweep.analysis.error_models import UNITS, WORDS, Use, cell_edges, error_mod
 from sweep.errors import ArgumentError
 from sweep.experiment.facts import camera_facts
 from sweep.messages import to_json
-from sweep.report.formatting import interval_text, number
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Findings, Table
+from sweep.report.table import Findings, Table, interval_text, number
 from sweep.version import __version__
 
 SCHEMA = "sweep-error-model/2"
@@ -284,7 +283,7 @@ ANGLES_DEG = (0.0, 30.0, 60.0)
 
 def error_model_tables(data: ReportData) -> tuple[Table, ...]:
     """Return the table of a store's error models if they were made, as `--error-model` does."""
-    models = data.known(error_models.__name__)
+    models = data.made.get(error_models.__name__)
     return () if models is None else (error_model_table(models),)
 
 

@@ -1,9 +1,10 @@
-"""The figures of a report, each as data of one analysis, and its tables of errors."""
+"""The figures of a report, each a table of one analysis by configuration, and tables of errors."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,99 +16,81 @@ from sweep.analysis import (
     efficiency,
     error_statistics,
     failure_composition,
-    flip_rate,
     marker_ranking,
     per_marker,
     precision_reached,
 )
 from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.binning import Bins
+from sweep.analysis.dataset import of_photographs
 from sweep.analysis.poses import SIGNED
 from sweep.analysis.precision import Reached
+from sweep.analysis.quantiles import IntervalOf
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
 from sweep.experiment.experiment import target_word
 from sweep.experiment.parameters import Stage
+from sweep.experiment.same_meaning import used_settings
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
-from sweep.report.charts import Panel, Series, draw_dots, draw_lines, rows_height
-from sweep.report.figure import (
-    Curve,
-    Figure,
-    Grouped,
-    along_axis,
-    denominators,
-    dots_of,
-    grouped,
-    interval_sentence,
-    map_panel,
-    sentences,
-)
-from sweep.report.formatting import number
+from sweep.report.comparison import trade_lines
+from sweep.report.figure import MAX_LINES, Figure
 from sweep.report.report_data import (
     AREA,
     BOTH,
     CONFIGURATION,
     IDS,
-    MAX_LINES,
     Analysis,
     Grouping,
     ReportData,
-    axis_label,
+    Settings,
+    best_first,
     by_configuration,
     configurations,
     course_of,
-    first_detector,
-    group_labels,
     is_numeric,
+    settings_of,
 )
-from sweep.report.table import Columns, Table, cells, each_cell, table_of
-from sweep.report.tradeoff_figure import trade_panels, trade_table_and_text
+from sweep.report.table import Column, Table, Value, each_cell, table_of
+from sweep.report.tradeoff_figure import trade_figure
+from sweep.tradeoff.pareto import configuration_label
 
 # --------------------------------------------------------------------------------------------------
-# Columns and curves that several figures share.
+# Columns that several figures share.
 
-LOOKED_FOR: Columns = {"looked for": ("looked_for", 1.0)}
-RATES: Columns = LOOKED_FOR | {"detected, %": ("detection_rate", 100.0)}
-FLIPPED: Columns = {"flipped, %": ("flip_rate", 100.0)}
-ERRORS: Columns = {
-    "solved, %": ("solved_rate", 100.0),
-    "rotation median, deg": ("rotation_median_deg", 1.0),
-    "rotation p95, deg": ("rotation_p95_deg", 1.0),
-    "rotation RMSE without flips, deg": ("rotation_rmse_unflipped_deg", 1.0),
-    "range median, %": ("range_median_percent", 1.0),
-    "range p95, %": ("range_p95_percent", 1.0),
-    "range RMSE without flips, %": ("range_rmse_unflipped_percent", 1.0),
-    "range bias, %": ("range_bias_percent", 1.0),
-}
+LOOKED_FOR = Column("looked for", "looked_for")
+SOLVED_COUNT = Column("n solved", "solved")
+DETECTED = Column("detected, %", "detection_rate", 100)
+SOLVED = Column("solved, %", "solved_rate", 100)
+FLIPS = Column("flips, % of the solved", "flip_rate", 100)
+ROTATION_MEDIAN = Column("rotation median, deg", "rotation_median_deg")
+ROTATION_P95 = Column("rotation p95, deg", "rotation_p95_deg")
+RANGE_MEDIAN = Column("range median, %", "range_median_percent")
+RANGE_P95 = Column("range p95, %", "range_p95_percent")
+RANGE_BIAS = Column("range bias, %", "range_bias_percent", level=0.0)
+RATES = (LOOKED_FOR, DETECTED)
+ERROR_CURVES = (ROTATION_MEDIAN, ROTATION_P95, RANGE_MEDIAN, RANGE_P95)
+ERRORS = (
+    SOLVED, ROTATION_MEDIAN, ROTATION_P95,
+    Column("rotation RMSE without flips, deg", "rotation_rmse_unflipped_deg"),
+    RANGE_MEDIAN, RANGE_P95, Column("range RMSE without flips, %", "range_rmse_unflipped_percent"),
+    RANGE_BIAS, FLIPS)
 SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
 """Kinds of errors, as `sweep.analysis.error_statistics` takes them."""
 
-IN_MM, IN_DEG = ("x", "y", "z"), ("yaw", "pitch", "roll")
-SIGNED_COLUMNS: Columns = {"solved": ("solved", 1.0)} | {
-    f"{name} {words}, {unit}": (f"{name}_{statistic}_{stored}", scale)
-    for names, unit, stored, scale in ((IN_MM, "mm", "m", 1000.0), (IN_DEG, "deg", "deg", 1.0))
-    for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))
-}
+SIGNED_COLUMNS = (SOLVED_COUNT, RANGE_BIAS, *(
+    Column(f"{name} {words}, {unit}", f"{name}_{statistic}_{stored}", scale,
+           0.0 if words == "bias" else None)
+    for names, unit, stored, scale in (("xyz", "mm", "m", 1000.0),
+                                       (("yaw", "pitch", "roll"), "deg", "deg", 1.0))
+    for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))))
 """Bias and standard deviation along the camera's axes and about the angles."""
 
-DETECTED = Curve("detection_rate", "Detected", "%", 100.0, share=True)
-SOLVED = Curve("solved_rate", "Solved", "%", 100.0, share=True)
-FLIPS = Curve("flip_rate", "Flipped", "% of the solved", 100.0, share=True)
-ROTATION_P95 = Curve("rotation_p95_deg", "Rotation error, p95", "deg")
-ERROR_CURVES = (
-    Curve("rotation_median_deg", "Rotation error, median", "deg"), ROTATION_P95,
-    Curve("range_median_percent", "Range error, median", "%"),
-    Curve("range_p95_percent", "Range error, p95", "%"),
-)
-RANGE_BIAS = Curve("range_bias_percent", "Range bias", "%", level=0.0)
-SIGNED_CURVES = (
-    RANGE_BIAS, *(Curve(f"{name}_bias_m", f"{name} bias", "mm", 1000.0, level=0.0)
-                  for name in IN_MM),
-    Curve("yaw_bias_deg", "Yaw bias", "deg", level=0.0),
-)
+SIGNED_CURVES = tuple(
+    column for column in SIGNED_COLUMNS
+    if column.level == 0 and not column.heading.startswith(("pitch", "roll")))
 BOUND_CURVES = tuple(
-    Curve(f"{quantity}_over_bound", f"{quantity.capitalize()} RMSE over the bound", level=1.0)
+    Column(f"{quantity} RMSE over the bound", f"{quantity}_over_bound", level=1.0)
     for quantity in ("rotation", "range"))
 INFINITE_ERRORS = (
     "In median and p95 a pose that is not solved counts as an infinite error (drawn at the edge); "
@@ -119,24 +102,146 @@ SHORT_NAMES = {AREA: "area", "side_px": "size", "distance_m": "distance", "size_
 MIN_BINNED_SIZES = 20
 """From this many sizes on, the detection rate is drawn against bins of the area."""
 
+MAX_BINS, MAX_ROWS = 40, 24
+"""Groups of a numeric axis, and of any other."""
 
-def _along(
-    data: ReportData, name: str, title: str, text: str, analysis: Analysis, along: str,
-    curves: Sequence[Curve], caption: str, columns: Columns, *, stages: Sequence[Stage] = BOTH,
-    angles: bool = True, counted: str = "looked_for", covers: Sequence[str] = (),
-) -> Figure:
-    """Return the figure of an analysis along an axis."""
-    found = along_axis(data, analysis, along, stages, angles=angles)
-    return Figure(name, title, found.caption(text, curves, counted), found.table(caption, columns),
-                  found.panels(curves), covers)
+MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
+"""Angles that are lines of one configuration, and panels of several."""
 
 
-def _short(name: str) -> str:
+def short_name(name: str) -> str:
+    """Return the name of an axis as it stands in titles."""
     return SHORT_NAMES.get(name, name)
 
 
-def _size_axes(data: ReportData) -> list[str]:
-    return [name for name in (data.size_axis, data.angle_axis) if name]
+def sentences(*parts: str) -> str:
+    """Return the parts that are not empty, joined by spaces."""
+    return " ".join(part for part in parts if part)
+
+
+def denominators(summary: xr.Dataset, name: str = "looked_for") -> str:
+    """Return a sentence with the denominators: ``Each value is of 40 to 200 poses ...``."""
+    what = {"looked_for": "poses looked for", "solved": "solved poses"}[name]
+    counts = summary[name].values[summary[name].values > 0]
+    if not counts.size:
+        return f"No {what}."
+    low, high = int(counts.min()), int(counts.max())
+    span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    return f"Each value is of {span} {what}."
+
+
+def interval_sentence(data: ReportData, summary: xr.Dataset) -> str:
+    """Return a sentence that says what intervals are over, or why there are none."""
+    photographs = of_photographs(data.results)
+    ends = [each for name, each in summary.items() if str(name).endswith(("_low", "_high"))]
+    if any(bool(np.isfinite(end).any()) for end in ends):
+        return "Intervals have 95 % and are over the " + (
+            "photographs, each with all its markers one draw." if photographs
+            else "random draws, conditional on the grid.")
+    few = "median_interval" in summary and bool(
+        (summary["median_interval"] == IntervalOf.too_few_draws).any())
+    return "No intervals: " + (
+        "too few photographs." if photographs else "too few draws." if few
+        else "nothing was drawn at random.")
+
+
+# --------------------------------------------------------------------------------------------------
+# An analysis by configuration and groups of poses: what a figure shows.
+
+
+@dataclass(frozen=True, eq=False)
+class Grouped:
+    """An analysis by configuration and groups of poses. No configuration is pooled.
+
+    Attributes
+    ----------
+    data
+        The store.
+    settings
+        The configurations.
+    summary
+        The analysis (configuration, *dims).
+    dims
+        Dimensions of the groups; the last one is along x.
+    notes
+        Sentences for the reader on bins and chosen values.
+    """
+
+    data: ReportData
+    settings: Settings
+    summary: xr.Dataset
+    dims: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def several(self) -> bool:
+        """Whether there is more than one configuration."""
+        return self.summary.sizes[CONFIGURATION] > 1
+
+    def table(self, caption: str, columns: Sequence[Column], counted: str = "looked_for") -> Table:
+        """Return the table of all configurations, with 95 % intervals."""
+        summary = self.summary if self.several or not self.dims else (
+            self.summary.isel({CONFIGURATION: 0}))
+        named = [CONFIGURATION] if CONFIGURATION in summary.dims else []
+        return table_of(summary, f"{caption}, with 95 % intervals", [*named, *self.dims], columns,
+                        self.data.results, counted=counted)
+
+    def figure(
+        self, name: str, title: str, text: str, caption: str, columns: Sequence[Column],
+        curves: Sequence[Column], *, counted: str = "looked_for", by: str = "",
+        covers: Sequence[str] = (), marked: str = "",
+    ) -> Figure:
+        """Return a figure; its caption also says what holds of all: intervals, counts, pooling."""
+        dims, count = self.dims, self.summary.sizes[CONFIGURATION]
+        if not by and (self.several or len(dims) > 1):
+            by = CONFIGURATION if self.several else self.data.label(dims[0])
+        order = best_first(self.data, self.settings)
+        cut = bool(dims) and count > MAX_LINES
+        names = self.summary[CONFIGURATION].values
+        return Figure(
+            name, title, sentences(
+                text, interval_sentence(self.data, self.summary),
+                denominators(self.summary, counted) if counted in self.summary else "",
+                f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
+                "over the whole grid; the table has all." if cut else "",
+                *self.notes, self.data.pooled(*dims, *self.settings.axes)),
+            self.table(caption, columns, counted), curves,
+            self.data.label(dims[-1]) if dims else "", by,
+            [str(names[k]) for k in order[:MAX_LINES]] if cut else (), marked, "", covers)
+
+
+def grouped(
+    data: ReportData, analysis: Analysis, groups: Grouping | None = None,
+    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *, targets: bool = True,
+) -> Grouped:
+    """Return an analysis by configuration and groups.
+
+    ``stages`` are those whose settings make a difference: of the detection rate the detector's.
+    """
+    groups = groups or Grouping()
+    settings = settings_of(data, stages, without, targets=targets)
+    grouping = settings.grouping + groups
+    _, summary = by_configuration(
+        data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
+    return Grouped(data, settings, summary, groups.dims, grouping.notes)
+
+
+def along_axis(
+    data: ReportData, analysis: Analysis, along: str, stages: Sequence[Stage] = BOTH, *,
+    angles: bool = True,
+) -> Grouped:
+    """Return an analysis along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
+    axis = data.pipeline.axis(along)
+    groups = data.along(along, MAX_BINS if axis is None or is_numeric(axis) else MAX_ROWS)
+    if angles and data.angle_axis and along != data.angle_axis:
+        several = len(settings_of(data, stages, (along,)).combinations) > 1
+        groups = data.along(data.angle_axis, MAX_ANGLE_PANELS if several else MAX_ANGLES,
+                            binned=not several) + groups
+    return grouped(data, analysis, groups, stages, (along,))
+
+
+# --------------------------------------------------------------------------------------------------
+# The figures.
 
 
 def _detection(data: ReportData) -> Figure | None:
@@ -146,25 +251,21 @@ def _detection(data: ReportData) -> Figure | None:
     along = AREA if axis is None or data.length(axis) >= MIN_BINNED_SIZES else axis
     word = target_word(data.pipeline)
     detected = f"the {word} is detected" + (", by at least one marker" * (word != "marker"))
-    by = f", by {data.angle}" if data.angle else ""
-    return _along(
-        data, "detection", f"Detection rate by {_short(along)}",
-        f"Share of the poses looked for in which {detected}, against its {_short(along)}{by}.",
-        detection_rate, along, [DETECTED], "Detection rate", RATES | {"draws": ("draws", 1)},
-        stages=(Stage.detection,), covers=_size_axes(data))
+    return along_axis(data, detection_rate, along, (Stage.detection,)).figure(
+        "detection", f"Detection rate by {short_name(along)}",
+        f"Share of the poses looked for in which {detected}.", "Detection rate",
+        (*RATES, Column("draws", "draws")), [DETECTED], covers=data.size_axes)
 
 
 def _errors(data: ReportData) -> Figure | None:
     if data.size is None:
         return None
-    by = f", by {data.angle}" if data.angle else ""
-    return _along(
-        data, "errors", f"Errors of the pose by {_short(data.size)}",
-        f"Error of the estimated pose against the {target_word(data.pipeline)}'s "
-        f"{_short(data.size)}{by}: median and 95 % quantile (p95) of the rotation error and of "
-        f"the range error (depth, relative to the true depth). {INFINITE_ERRORS}",
-        error_statistics, data.size, ERROR_CURVES, "Errors", LOOKED_FOR | ERRORS,
-        covers=_size_axes(data))
+    return along_axis(data, error_statistics, data.size).figure(
+        "errors", f"Errors of the pose by {short_name(data.size)}",
+        "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
+        "relative to the true depth), and the solved poses that are nearer to the mirror of the "
+        f"truth (flips). {INFINITE_ERRORS}", "Errors", (LOOKED_FOR, *ERRORS),
+        (*ERROR_CURVES, FLIPS), covers=data.size_axes)
 
 
 def signed_error_statistics(
@@ -184,14 +285,13 @@ def _bias(data: ReportData) -> Figure | None:
     along = signed_axis(data)
     if along is None:
         return None
-    return _along(
-        data, "bias", f"Bias by {_short(along)}",
-        "Mean error of the solved poses that are not flipped, estimated minus true, against the "
-        f"{_short(along)}: the range in percent of the true depth; x (right), y (down) and z "
-        f"(forward) of the {target_word(data.pipeline)}'s position in the camera's frame; yaw. "
-        "The table also has the standard deviations, and pitch and roll.",
-        signed_error_statistics, along, SIGNED_CURVES, "Bias and standard deviation",
-        SIGNED_COLUMNS, angles=False, counted="solved")
+    return along_axis(data, signed_error_statistics, along, angles=False).figure(
+        "bias", f"Bias by {short_name(along)}",
+        "Mean error of the solved poses that are not flipped, estimated minus true: the range in "
+        "percent of the true depth; x (right), y (down) and z (forward) of the "
+        f"{target_word(data.pipeline)}'s position in the camera's frame; yaw. The table also has "
+        "the standard deviations, and pitch and roll.", "Bias and standard deviation",
+        SIGNED_COLUMNS, SIGNED_CURVES, counted="solved")
 
 
 MIN_DRAWN = 3
@@ -199,97 +299,61 @@ MIN_DRAWN = 3
 
 
 def _configurations(data: ReportData) -> Figure | None:
-    if not data.setting_axes:
-        return None
     known = configurations(data)
-    found = Grouped(data, known.settings, known.summary.assign_coords(
-        {CONFIGURATION: known.names}), (), known.notes)
-    curves = [SOLVED, ERROR_CURVES[0], ERROR_CURVES[2],
-              *([FLIPS] if known.summary["solved"].sum() > 0 else [])]
+    if not known.several:
+        return None
     axes = {axis.name: axis for axis in data.pipeline.axes}
-    covers = [name for name in data.setting_axes
-              if len(known.settings.axes[name]) == data.length(name)
+    covers = [name for name, some in known.settings.axes.items()
+              if len(some) == data.length(name)
               and (not is_numeric(axes[name]) or data.length(name) < MIN_DRAWN)]
-    return Figure(
+    return Grouped(data, known.settings, known.summary, (), known.settings.grouping.notes).figure(
         "configurations", f"Configurations compared: {', '.join(known.settings.grouping.dims)}",
-        found.caption(
-            "Share of the poses looked for that are solved, and the median errors, of each "
-            "configuration on the same images; a pose that is not solved counts as an infinite "
-            "error (right edge, \u221e).", curves),
-        found.table("Configurations", LOOKED_FOR | ERRORS | FLIPPED), found.panels(curves), covers)
+        "Share of the poses looked for that are solved, and the median errors, of each "
+        "configuration; a pose that is not solved counts as an infinite error (right edge).",
+        "Configurations", (LOOKED_FOR, *ERRORS), (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS),
+        covers=covers)
 
 
 def _trade(data: ReportData) -> Figure | None:
     if data.trade is None:
         return None
-    table, text = trade_table_and_text(data.trade)
-    return Figure("trade", "Cost and accuracy", text, table, trade_panels(data.trade))
+    budget = data.trade.attrs.get("budget_ms")
+    return trade_figure(data.trade, lines=trade_lines(data, data.trade, budget))
 
-
-MAP_COLUMNS, MAP_ROWS = 24, 20
-
-
-def _maps(data: ReportData) -> Figure | None:
-    if data.size_axis is None or data.angle_axis is None:
-        return None
-    groups = data.along(data.angle_axis, MAP_ROWS) + data.along(data.size_axis, MAP_COLUMNS)
-    errors = grouped(data, error_statistics, groups)
-    detected = grouped(data, detection_rate, groups, (Stage.detection,))
-    flips = grouped(data, flip_rate, groups)
-    seen = int(flips.summary["solved"].sum()) > 0
-    return Figure(
-        "maps", f"Detection, rotation error and flips over {_short(data.size_axis)} and "
-                f"{data.angle}",
-        errors.caption(
-            "Detection rate; 95 % quantile of the rotation error, in which a pose that is not "
-            "solved counts as an infinite error (\u221e); and the share of the solved poses that "
-            "are nearer to the mirror of the truth than to the truth, which hardly differ at a "
-            f"{data.angle} near 0."),
-        errors.table("Detection rate, rotation error and flips", RATES | {
-            "rotation p95, deg": ("rotation_p95_deg", 1.0), "solved": ("solved", 1.0)} | FLIPPED),
-        [*detected.maps(DETECTED), *errors.maps(ROTATION_P95), *(flips.maps(FLIPS) * seen)])
-
-
-# Outcomes: solved, or the flag that says why not.
 
 MAX_BARS = 24
 
 
 def _outcomes(data: ReportData) -> Figure:
     names = [name for name in (data.size_axis, *data.scene_axes, data.size)
-             if name is not None and name != IDS]
+             if name is not None and name != IDS
+             and data.pipeline.axis(name) not in data.target_axes]
     axis = names[0] if names else None
     found = grouped(data, failure_composition, data.along(axis, MAX_BARS) if axis else None)
-    summary = found.summary
-    if axis and axis in summary.indexes and np.issubdtype(summary[axis].dtype, np.number):
-        summary = summary.isel({axis: np.argsort(summary[axis].values, kind="stable")})
-    counts = summary["count"].sum([name for name in summary["count"].dims if name != "outcome"])
-    all_outcomes = [str(name) for name in summary["outcome"].values.tolist()]
-    happened = [name for name in all_outcomes if counts.sel(outcome=name) > 0
-                and np.isfinite(summary["share"].sel(outcome=name)).any()]
-    parts = {f"{name}{end}": summary[f"share{end}"].sel(outcome=name, drop=True)
-             for name in happened for end in ("", "_low", "_high")}
-    total = summary["count"].where(summary["share"].notnull(), 0).sum("outcome")
-    found = Grouped(data, found.settings, xr.Dataset(
-        parts | {"looked_for": total.astype(int)}), found.dims, found.notes)
-    excluded = ", ".join(f"{int(counts.sel(outcome=name)):,} {name}"
-                         for name in outcomes(counted=False)
-                         if name in all_outcomes and counts.sel(outcome=name) > 0)
-    return Figure(
+    counts = found.summary["count"].sum(
+        [name for name in found.summary["count"].dims if name != "outcome"])
+    count_of = {str(name): int(counts.sel(outcome=name)) for name in counts["outcome"].values}
+    excluded = outcomes(counted=False)
+    happened = [name for name, count in count_of.items() if count and name not in excluded]
+    left_out = ", ".join(f"{count_of[name]:,} {name}" for name in excluded if count_of.get(name))
+    total = found.summary["count"].where(found.summary["share"].notnull(), 0).sum("outcome")
+    summary = found.summary.sel(outcome=happened).assign(looked_for=total.broadcast_like(
+        found.summary["count"].sel(outcome=happened)).astype(int))
+    dims = ("outcome", *found.dims) if found.dims else ("outcome",)
+    shown = Grouped(data, found.settings, summary, dims, found.notes)
+    return shown.figure(
         "failures", "Outcomes of the poses",
-        found.caption(
-            "Shares of the poses looked for" + (f", by {_short(axis)}" if axis else "")
-            + ": solved, or the flag that says why not."
-            + (f" Not counted in the shares: {excluded}." if excluded else "")),
-        found.table("Shares in percent", LOOKED_FOR | {
-            f"{name.replace('_', ' ')}, %": (name, 100.0) for name in happened}),
-        found.bars("Outcome", {name: name for name in happened}))
+        "Shares of the poses looked for" + (f", by {short_name(axis)}" if axis else "")
+        + ": solved, or the flag that says why not."
+        + (f" Not counted in the shares: {left_out}." if left_out else ""),
+        "Outcomes", (LOOKED_FOR, Column("share, %", "share", 100)),
+        [Column("share, %", "share", 100)], by="outcome")
 
 
 # The place in the frame.
 
 ACROSS, DOWN = "frame_u_percent", "frame_v_percent"
-FRAME_COLUMNS, FRAME_ROWS = 8, 6
+FRAME_COLUMNS, FRAME_ROWS = 8, 4
 MIN_RANGE_PERCENT = 10.0
 """From this range of places on, in percent of the frame's width, there is a figure."""
 
@@ -315,19 +379,15 @@ def _frame(data: ReportData) -> Figure | None:
     def over_frame(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
         return detection_rate(results.assign(place), per, bins)
 
-    found = grouped(data, over_frame, Grouping(bins=tuple(
+    return grouped(data, over_frame, Grouping(bins=tuple(
         (name, (*np.linspace(0, 100, count + 1)[:-1].tolist(), float(np.nextafter(100, 101))))
-        for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS)))), (Stage.detection,))
-    return Figure(
+        for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS)))), (Stage.detection,)
+    ).figure(
         "frame", "Detection by place in the frame",
-        found.caption(
-            f"Detection rate by the place of the {target_word(data.pipeline)}'s centre in the "
-            "frame, in percent of its width and height from the top left corner; a dash: no pose "
-            "was looked for there."),
-        found.table("Detection rate by place", RATES), found.maps(DETECTED, upwards=False))
+        f"Detection rate by the place of the {target_word(data.pipeline)}'s centre in the frame, "
+        "in percent of its width and height from the top left corner.", "Detection rate by place",
+        RATES, [DETECTED], by=data.label(DOWN))
 
-
-# Marker IDs.
 
 WEAKEST = 24
 """Marker IDs that have a row of their own in the chart."""
@@ -343,34 +403,30 @@ def _ranking(data: ReportData) -> Figure | None:
     ranked = ranked.isel(marker=np.flatnonzero(ranked["looked_for"].values > 0))
     ranked = ranked.isel(marker=np.lexsort(
         (ranked[IDS].values, ranked["detection_rate"].values, ~ranked["weak"].values)))
-    labels = [[str(value) for value in ranked[dim].values.tolist()] for dim in dims]
-    names = [" ".join(parts) for parts in zip(*labels, strict=True)][:WEAKEST]
-    weakest = ranked.isel(marker=slice(0, WEAKEST))
-    dots, weak = dots_of(weakest, "detection_rate", 100), weakest["weak"].values.astype(bool)
-    expected = 100 * weakest["expected_rate"].values.astype(np.float64)
-    columns = [cells(ranked, *each) for each in (
-        ("looked_for",), ("detection_rate", 100), ("expected_rate", 100), ("p_adjusted",),
-        ("weak",))]
+    names = [" ".join(str(ranked[dim].values[k]) for dim in dims)
+             for k in range(ranked.sizes["marker"])]
+    columns = (*RATES, Column("expected, %", "expected_rate", 100),
+               Column("p, adjusted", "p_adjusted"), Column("weak", "weak"))
+    table = table_of(ranked.assign_coords(marker=names), "IDs by detection rate, with 95 % "
+                     "intervals", ["marker"], columns)
     return Figure(
-        "ranking", "Marker IDs, the weakest first" + (f": {whose}" if whose else ""),
-        sentences(
-            f"Detection rate of each ID{' of each dictionary' if len(dims) > 1 else ''}; the small "
-            "upright line is the rate expected from its scenes if all IDs were alike. "
-            f"{int(ranked['weak'].sum()):,} of {ranked.sizes['marker']:,} IDs are weak "
-            "(diamonds): below the expected rate, with an adjusted p-value under 0.05.",
+        "ranking", "Marker IDs, the weakest first" + (f": {whose}" if whose else ""), sentences(
+            f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. "
+            f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
+            "rate expected if all were alike, with an adjusted p-value under 0.05.",
             interval_sentence(data, summary), denominators(summary), data.pooled(*dims)),
-        Table.of(
-            "IDs by detection rate, with 95 % intervals",
-            [*(axis_label(summary, dim) for dim in dims), "looked for", "detected, %",
-             "expected, %", "p, adjusted", "weak"],
-            [list(row) for row in zip(*labels, *columns, strict=True)], stub=len(dims)),
-        [Panel("Weakest IDs", "Rows of the weakest IDs with their detection rates in percent.",
-               lambda axes: draw_dots(axes, names, dots, "detected, %", share=True, marked=weak,
-                                      ticks=expected), height=rows_height(len(names)))],
-        (IDS,))
+        table, [DETECTED], shown=names[:WEAKEST], marked="weak", covers=(IDS,))
 
 
-# The accuracy bound.
+def first_detector(data: ReportData) -> tuple[dict[str, int], str]:
+    """Return the detector's settings of the first configuration in order, and their label."""
+    known = configurations(data)
+    best = known.settings.combinations[known.order[0]]
+    names = {axis.name for axis in data.pipeline.axes_of(Stage.detection)}
+    index = {name: k for name, k in best.items() if name in names}
+    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
+    return index, configuration_label(used_settings(data.pipeline, values)) if index else ""
+
 
 SIZE_COLUMNS = 12
 
@@ -392,16 +448,13 @@ def _bound(data: ReportData) -> Figure | None:
             {"any": data.results["bound"].isin(present_values(BoundStatus)).any()}))["any"]):
         return None
     along = data.size_axis or data.angle_axis
-    found = grouped(data, error_over_bound, data.along(along, SIZE_COLUMNS) if along else None)
-    return Figure(
+    return grouped(
+        data, error_over_bound, data.along(along, SIZE_COLUMNS) if along else None
+    ).figure(
         "bound", "Errors relative to the accuracy bound",
-        found.caption(
-            "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not "
-            "flipped and have a bound: 1 (dashed) is the best that an unbiased estimator can "
-            "reach.", BOUND_CURVES),
-        found.table("RMSE over the bound", {
-            "rotation": ("rotation_over_bound", 1.0), "range": ("range_over_bound", 1.0)}),
-        found.panels(BOUND_CURVES))
+        "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not flipped "
+        "and have a bound: 1 (dashed) is the best that an unbiased estimator can reach.",
+        "RMSE over the bound", BOUND_CURVES, BOUND_CURVES)
 
 
 # Thresholds on the ambiguity: what they keep of the poses, and of the flips.
@@ -425,6 +478,18 @@ ANSWERS = {
 }
 """What the choice says, in the table."""
 
+KEPT = (Column("poses kept, % of the solved", "kept_rate", 100),
+        Column("flips kept, % of the flips", "flips_kept_rate", 100))
+KEPT_AT_USUAL = (
+    Column("solved", "solved"), Column("flips", "flipped"),
+    Column(f"kept at {USUAL:g}, %", "kept_rate", 100),
+    Column(f"flips kept at {USUAL:g}", "kept_flipped"),
+    Column(f"right of the rejected at {USUAL:g}, %", "rejected_right_rate", 100),
+    Column("threshold found?", "choice"), Column("threshold", "chosen_threshold"),
+    Column("kept there, %", "chosen_kept_rate", 100),
+    Column("flips there, %", "chosen_flip_rate", 100),
+    Column("right poses rejected there, %", "chosen_right_rejected_rate", 100))
+
 
 def _ambiguity(data: ReportData) -> Figure | None:
     """Return the figure if any pose has another solution, any is a flip, not all are frontal."""
@@ -440,40 +505,38 @@ def _ambiguity(data: ReportData) -> Figure | None:
                             & (pooled["flipped"] > 0).values)
     if not curved.size:
         return None
-    along = data.size or data.angle_axis
-    conditions = data.along(along, CONDITIONS) if along else Grouping()
-    table = _by_configuration(data, conditions)
-    wanted, names = 100 * float(table.attrs["flip_rate"]), pooled[CONFIGURATION].values.tolist()
-    none = np.full(pooled.sizes["threshold"], np.nan)
-    lines = [
-        Series(names[k], 100 * one["kept_rate"].values, 100 * one["flips_kept_rate"].values, none,
-               none)
-        for k in curved[:MAX_LINES].tolist() for one in [pooled.isel({CONFIGURATION: k})]]
-    panels = [Panel(
-        "Flips kept against poses kept",
-        "Lines of the share of flips that is kept against that of poses, over the threshold.",
-        lambda axes: draw_lines(
-            axes, lines, ("poses kept, % of the solved", "flips kept, % of the flips"),
-            share=True, linear=True), wide=True)]
-    panels += [
-        map_panel(title, names, group_labels(table, along), scale * part.transpose(
-            CONFIGURATION, along).values, (data.label(along), ""), share=scale != 1)
-        for name, title, scale in (
-            ("kept_flip_rate", f"Flips of the poses that {USUAL:g} keeps, %", 100),
-            ("right_rejected_rate", f"Right poses that {USUAL:g} rejects, %", 100),
-            ("chosen_threshold", f"Threshold for {wanted:g} % flips", 1))
-        for part in [table[name].sel(threshold=USUAL) if "threshold" in table[name].dims
-                     else table[name]] if part.notnull().any()] if along else []
+    table = pooled.isel({CONFIGURATION: curved})
+    wanted = 100 * float(pooled.attrs["flip_rate"])
     return Figure(
-        "ambiguity", "A threshold on the ambiguity: flips and poses that it keeps",
-        sentences(
-            "A pose is kept if its reprojection error is at most the threshold times that of the "
-            "other planar solution; poses without another solution are always kept. Each point "
-            f"is a threshold. A threshold for {wanted:g} % flips is the largest that is shown to "
-            "keep them at that share of the kept poses at most (the 95 % bound of all thresholds "
-            "tried together); the table says why there is none.", *conditions.notes,
-            data.pooled(*conditions.dims)),
-        _threshold_table(data, table, along, wanted), panels)
+        "ambiguity", "A threshold on the ambiguity: flips and poses that it keeps", sentences(
+            "A pose is kept if its reprojection error is at most the threshold times the error of "
+            "the other planar solution; poses without another solution are always kept. Each point "
+            f"is a threshold. The table of thresholds below has the largest that is shown to keep "
+            f"{wanted:g} % flips of the kept poses at most (the 95 % bound of all thresholds tried "
+            "together), or says why there is none.", data.pooled()),
+        table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
+                 KEPT), KEPT[1:], KEPT[0].heading, CONFIGURATION)
+
+
+def threshold_tables(data: ReportData) -> list[Table]:
+    """Return what the usual threshold on the ambiguity keeps at each size, and the one to take."""
+    if _ambiguity(data) is None:
+        return []
+    along = data.size or data.angle_axis
+    grouping = data.along(along, CONDITIONS) if along else Grouping()
+    table = _by_configuration(data, grouping)
+    usual = {f"{column.variable}{end}": table[f"{column.variable}{end}"].sel(
+                 threshold=USUAL, drop=True)
+             for column in KEPT_AT_USUAL for end in ("", "_low", "_high")
+             if f"{column.variable}{end}" in table
+             and "threshold" in table[f"{column.variable}{end}"].dims}
+    words = xr.apply_ufunc(np.vectorize(
+        lambda flag: ANSWERS[ThresholdChoice(int(flag))], otypes=[object]), table["choice"])
+    wanted = 100 * float(table.attrs["flip_rate"])
+    return [table_of(
+        table.assign(usual).assign(choice=words),
+        f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
+        [CONFIGURATION, *grouping.dims], KEPT_AT_USUAL, data.results)]
 
 
 def _by_configuration(data: ReportData, grouping: Grouping) -> xr.Dataset:
@@ -485,35 +548,12 @@ def _by_configuration(data: ReportData, grouping: Grouping) -> xr.Dataset:
     return by_configuration(data.pipeline, table, data.setting_axes)[1].assign_attrs(table.attrs)
 
 
-def _threshold_table(
-    data: ReportData, table: xr.Dataset, along: str | None, wanted: float
-) -> Table:
-    at_usual = table[["kept_rate", "kept_flipped", "rejected_right_rate"]]
-    parts = {f"{name}{end}": table[f"{name}{end}"].sel(threshold=USUAL, drop=True)
-             for name in at_usual for end in ("", "_low", "_high") if f"{name}{end}" in table}
-    words = xr.apply_ufunc(np.vectorize(
-        lambda flag: ANSWERS[ThresholdChoice(int(flag))], otypes=[object]), table["choice"])
-    return table_of(
-        table.assign(parts).assign(choice=words),
-        f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
-        [CONFIGURATION, *([along] if along else [])], {
-            "solved": ("solved", 1.0), "flips": ("flipped", 1.0),
-            f"kept at {USUAL:g}, %": ("kept_rate", 100.0),
-            f"flips kept at {USUAL:g}": ("kept_flipped", 1.0),
-            f"right of the rejected at {USUAL:g}, %": ("rejected_right_rate", 100.0),
-            f"{wanted:g} % by a threshold?": ("choice", 1.0),
-            "threshold": ("chosen_threshold", 1.0), "kept there, %": ("chosen_kept_rate", 100.0),
-            "flips there, %": ("chosen_flip_rate", 100.0),
-            "right poses rejected there, %": ("chosen_right_rejected_rate", 100.0),
-        }, data.results)
-
-
 # --------------------------------------------------------------------------------------------------
 # The figures of a store, in the order in which they stand.
 
 FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
-    _detection, _errors, _bias, _configurations, _trade, _maps, _ambiguity, _outcomes, _frame,
-    _ranking, _bound,
+    _detection, _errors, _bias, _configurations, _trade, _ambiguity, _outcomes, _frame, _ranking,
+    _bound,
 )
 """Makers of figures, None for a store that a figure does not fit; add one here."""
 
@@ -532,12 +572,11 @@ def _effect(data: ReportData, name: str) -> Figure:
     """Return the figure of rates and errors along an axis or a drawn parameter."""
     axis = data.pipeline.axis(name)
     meaning = data.pipeline.parameters[name].declaration.meaning if axis is None else axis.meaning
-    return _along(
-        data, f"effect-{name}", f"The effect of {name}",
+    return along_axis(data, error_statistics, name, angles=False).figure(
+        f"effect-{name}", f"The effect of {name}",
         "Detection rate, median and 95 % quantile (p95) of rotation and range error, and signed "
-        f"mean of the range error (bias), by {name} ({meaning}). {INFINITE_ERRORS}",
-        error_statistics, name, [DETECTED, *ERROR_CURVES, RANGE_BIAS], f"By {name}",
-        RATES | ERRORS, angles=False)
+        f"mean of the range error (bias), by {name} ({meaning}). {INFINITE_ERRORS}", f"By {name}",
+        (*RATES, *ERRORS), [DETECTED, *ERROR_CURVES, RANGE_BIAS])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -569,55 +608,52 @@ def board_tables(data: ReportData) -> list[Table]:
         sources=data.results)]
 
 
-def size_errors_table(data: ReportData, best: int) -> list[Table]:
-    """Return detection, bias and spread of a configuration at each size; none without poses."""
+def size_errors_table(data: ReportData, at: Mapping[str, int], name: str) -> list[Table]:
+    """Return detection, bias and spread of one configuration, the indices ``at``, by size."""
     axis = signed_axis(data)
+    targets = any(each.name in at for each in data.target_axes)
     found = grouped(data, signed_error_statistics,
-                    data.along(axis, MAX_SIZE_ROWS) if axis else None)
-    table = found.summary.isel({CONFIGURATION: best})
+                    data.along(axis, MAX_SIZE_ROWS) if axis else None, targets=targets)
+    table = found.summary.isel({CONFIGURATION: found.settings.combinations.index(dict(at))})
     if not np.nan_to_num(table["solved"].values).sum():
         return []
-    whose = f" with {configurations(data).names[best]}" if found.several else ""
     return [table_of(
-        table, f"Errors{f' by {axis}' if axis else ''}{whose}, with 95 % intervals: range p95 "
-        "(not solved: infinite), bias and standard deviation of the solved poses without flips",
-        found.dims, RATES | {"range p95, %": ("range_p95_percent", 1.0)} | SIGNED_COLUMNS,
-        data.results)]
+        table, f"Errors{f' by {axis}' if axis else ''}{f' with {name}' if name else ''}, with 95 % "
+        "intervals: range p95 (not solved: infinite), bias and standard deviation of the solved "
+        "poses without flips", found.dims, (*RATES, RANGE_P95, *SIGNED_COLUMNS), data.results)]
 
 
 def signed_errors_table(data: ReportData) -> Table:
     """Return bias and spread in all frames, with rows for each configuration."""
-    found = grouped(data, _signed_in_all_frames)
-    names = found.names if found.several else [""]
-    rows = []
-    for quantity in (each for group in GROUPS for each in SIGNED[group]):
-        columns = [cells(found.summary, quantity.named(name)) for name in ("bias", "sd")]
-        rows += [[f"{quantity.words}, {quantity.unit}", *([name] if name else []), *values]
-                 for name, *values in zip(names, *columns, strict=True)]
-    stub = ["error", *([CONFIGURATION] if found.several else [])]
+    found = grouped(data, signed_in_all_frames)
+    rows = [
+        [f"{quantity.words}, {quantity.unit}", str(name), *values]
+        for quantity in (each for group in GROUPS for each in SIGNED[group])
+        for name, *values in zip(found.summary[CONFIGURATION].values, *(
+            Column("", quantity.named(name)).cells(found.summary) for name in ("bias", "sd")),
+            strict=True)]
     return Table.of("Bias and spread of the solved poses without flips, with 95 % intervals",
-                    [*stub, "bias", "standard deviation"], rows, stub=len(stub))
+                    ["error", CONFIGURATION, "bias", "standard deviation"], rows, stub=2)
 
 
-def _signed_in_all_frames(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
+def signed_in_all_frames(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
+    """Return signed errors in the frames of the camera and of the target."""
     return error_statistics(results, per, bins, GROUPS)
 
 
 def errors_table(errors: xr.Dataset, name: str) -> Table:
     """Return the statistics of a configuration's errors over the whole grid."""
-    quantities = {
-        f"{words}, {'%' if unit == 'percent' else unit}": f"{quantity}_{{}}_{unit}"
-        for quantity, (words, unit) in QUANTITIES.items()
-    }
     rows = [
         [heading, *(
-            cells(errors, each.format(statistic))[0] if each.format(statistic) in errors else ""
-            for each in quantities.values())]
-        for heading, statistic in error_headings().items()
-    ]
+            Column("", variable).cells(errors)[0] if variable in errors else None
+            for quantity, (_, unit) in QUANTITIES.items()
+            for variable in [f"{quantity}_{statistic}_{unit}"])]
+        for heading, statistic in error_headings().items()]
+    headings = [f"{words}, {'%' if unit == 'percent' else unit}"
+                for words, unit in QUANTITIES.values()]
     whose = f", with {name}" if name else ""
     return Table.of(f"Errors over the whole grid{whose}, with 95 % intervals",
-                    ["statistic", *quantities], rows)
+                    ["statistic", *headings], rows)
 
 
 def precision_tables(data: ReportData) -> list[Table]:
@@ -641,8 +677,8 @@ def precision_table(table: xr.Dataset) -> Table:
                 (Reached.reached, Reached.not_reached)))
             rows.append([
                 str(name), " · ".join(map(str, at.values())) or "all",
-                number(float(one["wanted"])), number(float(half.max())),
-                *(f"{int((part['reached'] == flag).sum()):,}" for flag in Reached)])
+                Value(float(one["wanted"])), Value(float(half.max())),
+                *(int((part["reached"] == flag).sum()) for flag in Reached)])
     return Table.of(
         f"Precision of {first.size:,} conditions, which took {int(first.min()):,} to "
         f"{int(first.max()):,} poses each: conditions by what was reached; of rates the "

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from sweep.analysis.limits import Reach
-from sweep.analysis.requirements import Decision
 from sweep.messages import quoted
-from sweep.report.charts import Panel, Series, draw_dots, draw_lines, rows_height
-from sweep.report.figure import map_panel
-from sweep.report.formatting import coordinate, coordinates, number, short_coordinate
-from sweep.report.report_data import axis_label
-from sweep.report.table import UNDECIDED, Findings, Table, each_cell
+from sweep.report.figure import Figure
+from sweep.report.table import (
+    UNDECIDED,
+    Column,
+    Findings,
+    Table,
+    axis_label,
+    coordinate,
+    coordinates,
+    each_cell,
+    number,
+    table_of,
+)
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -32,8 +37,8 @@ def limit_table(limits: xr.Dataset) -> Table:
     rows = []
     for at, one in each_cell(limits, dims):
         rows.append([*map(coordinate, at.values()), limit_text(one),
-                     interval_text(one), "yes" if one["settled"] else "no", cause_text(one),
-                     beyond_text(one), f"{int(one['poses']):,}"])
+                     interval_text(one), bool(one["settled"]), cause_text(one),
+                     beyond_text(one), int(one["poses"])])
     required = " and ".join(map(str, limits.attrs["require"]))
     at_all = ", ".join(limits.attrs["at_all"])
     return Table.of(
@@ -172,7 +177,8 @@ def with_unit(one: xr.Dataset, value: float) -> str:
 
 
 def _short(one: xr.Dataset, value: float) -> str:
-    return short_coordinate(value, one[one.attrs["along"]].values.tolist())
+    values: list[float] = one[one.attrs["along"]].values.astype(float).tolist()
+    return dict(zip(values, coordinates(values), strict=True)).get(value, coordinate(value))
 
 
 def as_json(limits: xr.Dataset) -> dict[str, Any]:
@@ -194,68 +200,23 @@ def as_json(limits: xr.Dataset) -> dict[str, Any]:
 
 
 # --------------------------------------------------------------------------------------------------
-# The figure of limits: each against the first axis of conditions, and which cells are met.
-
-MAX_LINES = 6
-"""Lines of one panel; more conditions have rows in place of lines. Also the most maps."""
-
-CELLS = {Decision.met: 100.0, Decision.undecided: 50.0, Decision.not_met: 0.0}
-"""Decision -> its number in the map of cells."""
+# The figure of limits: against the first axis of conditions that has numbers.
 
 
-def limit_panels(limits: xr.Dataset) -> list[Panel]:
-    """Return the panels of limits, as `sweep.analysis.requirement_limits` returns them."""
+def limit_figure(limits: xr.Dataset) -> Figure:
+    """Return the figure of limits, as `sweep.analysis.requirement_limits` returns them."""
     along, dims = str(limits.attrs["along"]), dimensions(limits)
     varying = [name for name in dims if limits.sizes[name] > 1]
     limits = limits.isel({name: 0 for name in dims if name not in varying})
     axis = next((name for name in varying if limits[name].dtype.kind in "fiu"), None)
-    parts = list(_parts(limits, [name for name in varying if name != axis]))
-    label = axis_label(limits, along)
+    ordered = [*(name for name in varying if name != axis), *([axis] if axis else [])]
+    # At no value there is no limit, and no interval is drawn.
+    never = limits["reach"] == Reach.never
+    drawn = limits[["value", "low", "high"]].where(~never)
+    drawn = drawn.rename({"low": "value_low", "high": "value_high"}).assign_coords(limits.coords)
+    column = Column(axis_label(limits, along), "value")
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
-    if axis is None or len(parts) > MAX_LINES:
-        rows = _parts(limits, varying)
-        names = [name or "all" for name, _ in rows]
-        ends = (np.array([float(part[key]) for _, part in rows])
-                for key in ("value", "value", "low", "high"))
-        panels = [Panel(title, f"Limits along {label}, a row for each condition.",
-                        partial(draw_dots, names=names, dots=Series("", *ends), label=label),
-                        wide=True, height=rows_height(len(names)))]
-    else:
-        lines = [_line(name, part, axis) for name, part in parts]
-        panels = [Panel(
-            title, f"Limits along {label} against {axis_label(limits, axis)}.",
-            partial(draw_lines, series=lines, labels=(axis_label(limits, axis), label)))]
-    if axis is not None:
-        panels += [_cells(name, part, axis) for name, part in parts[:MAX_LINES]]
-    return panels
-
-
-def _parts(limits: xr.Dataset, others: Sequence[str]) -> list[tuple[str, xr.Dataset]]:
-    """Return the limits at each combination of some dimensions, and its name."""
-    return [
-        (", ".join(f"{name.removesuffix('_deg')} {coordinate(value)}"
-                   for name, value in at.items()), part)
-        for at, part in each_cell(limits, others)]
-
-
-def _line(name: str, part: xr.Dataset, axis: str) -> Series:
-    part = part.isel({axis: np.argsort(part[axis].values, kind="stable")})
-    value, low, high = (part[key].values for key in ("value", "low", "high"))
-    # At no value: the line has a gap, and no interval is drawn.
-    never = part["reach"].values == Reach.never
-    return Series(name, part[axis].values.astype(np.float64), value,
-                  np.where(never, np.nan, low), np.where(never, np.nan, high))
-
-
-def _cells(name: str, part: xr.Dataset, axis: str) -> Panel:
-    """Return the map of a grid's cells (along, axis): which are met."""
-    along = str(part.attrs["along"])
-    part = part.isel({each: np.argsort(part[each].values) for each in (axis, along)})
-    decision = part["decision"].transpose(along, axis).values
-    values = np.full(decision.shape, np.nan)
-    for flag, percent in CELLS.items():
-        values[decision == flag] = percent
-    rows, columns = (coordinates(part[each].values.tolist()) for each in (along, axis))
-    return map_panel(
-        f"100: met, 50: not decided, 0: not met{f'; {name}' if name else ''}", rows, columns,
-        values, (axis_label(part, axis), axis_label(part, along)), share=True, upwards=True)
+    return Figure(
+        "limit", title, "", table_of(drawn.drop_vars(along), title, ordered, [column], limits),
+        [column], axis_label(limits, axis) if axis else "",
+        axis_label(limits, ordered[-2]) if axis and len(ordered) > 1 else "")

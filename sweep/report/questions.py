@@ -31,25 +31,23 @@ from sweep.execution.progress import StageReport
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import byte_count, nearest, quoted
 from sweep.report import decisions
-from sweep.report.charts import write_figure
+from sweep.report.comparison import trade_lines
 from sweep.report.comparison_tables import (
+    gap_figures,
     gap_lines,
-    gap_panels,
-    gap_records,
     gap_table,
-    store_difference_json,
     store_difference_tables,
 )
 from sweep.report.error_model_file import check_error_model_file, written_error_models
-from sweep.report.formatting import plural
+from sweep.report.figure import write_figure
 from sweep.report.output_file import figure_file, is_standard_stream
 from sweep.report.report_data import read_report_data
-from sweep.report.table import UNDECIDED, Findings
-from sweep.report.tradeoff_figure import headlines, renderer_table, trade_panels, tradeoff_table
+from sweep.report.table import UNDECIDED, Findings, plural
+from sweep.report.tradeoff_figure import headlines, renderer_table, trade_figure, tradeoff_table
 from sweep.report.write_report import write_report
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff.measurement import measure_trade
-from sweep.tradeoff.pareto import CRITERIA, advice, budget_advice
+from sweep.tradeoff.pareto import CRITERIA
 
 # --------------------------------------------------------------------------------------------------
 # Whether requirements are met.
@@ -135,18 +133,17 @@ def tradeoff(
         question["budget_ms"] = budget_ms
     trade, renderers = measure_trade(store, per, limit_s, progress, question=question)
     if figure is not None:
-        write_figure(trade_panels(trade, criterion, budget_ms), figure)
-    budget = [] if budget_ms is None else budget_advice(trade, criterion, budget_ms)
-    found = advice(trade, criterion)
+        write_figure([trade_figure(trade, criterion)], figure)
+    found = trade_lines(read_report_data(store).in_memory(), trade, budget_ms)
     frames, sampled = trade.attrs["frames"], trade.attrs["sampled"]
     few = [] if frames >= sampled else [
         (f"costs are those of {frames:,} of {sampled:,} sampled images; more --seconds, or markers "
          "that are seen, give more")]
     return Findings(
         [*headlines(trade, criterion), tradeoff_table(trade, criterion),
-         *([] if renderers is None else [renderer_table(renderers)]), *few, *budget, *found],
-        trade.to_dict() | ({} if renderers is None else {"renderers": renderers.to_dict()})
-        | {"advice": found} | ({"budget": budget} if budget else {}),
+         *([] if renderers is None else [renderer_table(renderers)]), *few, *found],
+        trade.to_dict() | {"advice": found}
+        | ({} if renderers is None else {"renderers": renderers.to_dict()}),
         trade, 0, (f"sweep report {quoted(store)}", "with these costs and a figure of them"))
 
 
@@ -166,15 +163,18 @@ def compare(
             if value:
                 raise ArgumentError(name, "", "expected a store of photographs and a simulation")
         table = store_differences(one, other)
-        return Findings(store_difference_tables(table), {
-            "first": first, "second": second, **store_difference_json(table)}, table, 0, then)
+        tables = store_difference_tables(table)
+        return Findings([*tables.values()], {
+            "first": first, "second": second,
+            **{name: each.as_json()["rows"] for name, each in tables.items()}}, table, 0, then)
     gap = simulation_gap(one, other, bins).load()
     if figure is not None:
-        write_figure(gap_panels(one, other, bins), figure)
+        write_figure(gap_figures(one, other, bins), figure)
+    found = gap_table(gap)
     return Findings(
-        [gap_table(gap), *gap_lines(gap)],
+        [found, *gap_lines(gap)],
         {"photographs": first, "simulated": second, "paired": bool(gap.attrs["paired"]),
-         "rows": gap_records(gap)}, gap, 0, then)
+         **found.as_json()}, gap, 0, then)
 
 
 # --------------------------------------------------------------------------------------------------

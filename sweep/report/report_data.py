@@ -26,12 +26,12 @@ from sweep.analysis.requirements import (
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
 from sweep.experiment.axes import TRIAL, Axis, Distribution
-from sweep.experiment.parameters import WORLD, Stage
+from sweep.experiment.parameters import PARAMETERS, WORLD, Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
-from sweep.report.formatting import bin_text, coordinates
+from sweep.report.table import axis_label
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.store.outcome import outcome_of_finished
 from sweep.tradeoff.pareto import WRONG, configuration_label
@@ -41,14 +41,17 @@ from sweep.typing import Floats
 # Groups of poses that a figure compares, and the labels of groups.
 
 AREA = "marker_area_px"
-ANGLES = {"tilt_deg": "tilt", "view_angle_deg": "viewing angle"}
-"""Axes along which the marker is turned away, and their names in sentences."""
+ANGLES = ("tilt_deg", "view_angle_deg")
+"""Axes along which the marker is turned away."""
 
 IDS = "marker_id"
 CONFIGURATION = "configuration"
 """Dimension of tables that have a row for each configuration."""
 
 AREA_BINS = 24
+
+TARGET_SECTIONS = ("marker", "board", "target")
+"""Sections of a pipeline whose parameters tell targets apart."""
 
 DRAWN_BINS = 10
 """Bins of a drawn parameter."""
@@ -128,30 +131,6 @@ def is_numeric(axis: Axis) -> bool:
     return not axis.labelled and not isinstance(axis.values[0], bool)
 
 
-def axis_label(results: xr.Dataset, name: str) -> str:
-    """Return the name of a coordinate or variable in words, with its unit: ``distance, m``."""
-    names = {
-        AREA: "area of the marker", "side_px": "side of the marker",
-        "frame_u_percent": "from the left, %", "frame_v_percent": "from the top, %",
-    }
-    units = str(results[name].attrs.get("units", "")) if name in results.variables else ""
-    words = names.get(name, name)
-    for ending in ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s"):
-        if units and words == name and name.endswith(ending):
-            words = name.removesuffix(ending)
-    unit = {"px2": "px²", "degree": "deg"}.get(units, units)
-    words = words.replace("_", " ")
-    return f"{words}, {unit}" if unit else words
-
-
-def group_labels(table: xr.Dataset, name: str) -> list[str]:
-    """Return the values of a dimension as text; of bins their ends."""
-    if f"{name}_low" in table.coords:
-        ends = zip(table[f"{name}_low"].values, table[f"{name}_high"].values, strict=True)
-        return [bin_text(low, high) for low, high in ends]
-    return coordinates(table[name].values.tolist())
-
-
 def by_configuration(
     pipeline: Pipeline, table: xr.Dataset, dims: Sequence[str]
 ) -> tuple[list[str], xr.Dataset]:
@@ -207,6 +186,8 @@ class ReportData:
         What is required, as `sweep.analysis.check_requirements` takes it, and the conditions.
     command
         The command line that asked for the report; empty if none did.
+    made
+        What `once` has returned, by key.
     """
 
     store: str
@@ -218,7 +199,7 @@ class ReportData:
     require: tuple[str, ...] = ()
     per: tuple[str, ...] = ()
     command: str = ""
-    _made: dict[Any, Any] = field(default_factory=dict, repr=False)
+    made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Give a single pose, which has no axes, the one draw that it is."""
@@ -243,9 +224,9 @@ class ReportData:
         return next((name for name in ANGLES if self.length(name) > 1), None)
 
     @property
-    def angle(self) -> str:
-        """The name of that axis in sentences; empty without one."""
-        return ANGLES[self.angle_axis] if self.angle_axis else ""
+    def size_axes(self) -> list[str]:
+        """The axes of size and angle that there are."""
+        return [name for name in (self.size_axis, self.angle_axis) if name]
 
     @functools.cached_property
     def area_range(self) -> tuple[float, float]:
@@ -281,6 +262,15 @@ class ReportData:
         """Axes of the detector's and the estimator's settings that have several values."""
         stages = (Stage.detection, Stage.estimation)
         return tuple(axis.name for axis in self.pipeline.axes_of(*stages) if len(axis) > 1)
+
+    @property
+    def target_axes(self) -> tuple[Axis, ...]:
+        """Axes of the scene along which targets differ by more than a number."""
+        return tuple(
+            axis for axis in self.pipeline.axes
+            if axis.name in self.scene_axes and not is_numeric(axis) and any(
+                PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
+                if name in PARAMETERS))
 
     @property
     def scene_axes(self) -> tuple[str, ...]:
@@ -331,12 +321,6 @@ class ReportData:
             return bins_of(name, np.asarray(self.results[name].values, dtype=np.float64), most)
         return chosen_of(name, len(axis), most)
 
-    def by_angle(self, most: int = 6, *, binned: bool = True) -> Grouping:
-        """Return the grouping by tilt or viewing angle, if one is an axis."""
-        if not self.angle_axis:
-            return Grouping()
-        return self.along(self.angle_axis, most, binned=binned)
-
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
         names = [
@@ -380,16 +364,12 @@ class ReportData:
 
     def once(self, key: Any, make: Callable[[], T]) -> T:
         """Return what ``make`` returns, a dataset loaded; it is called once for each key."""
-        if key not in self._made:
+        if key not in self.made:
             with store_errors(self.store):
                 made = make()
-                self._made[key] = made.compute() if isinstance(made, xr.Dataset) else made
-        found: T = self._made[key]
+                self.made[key] = made.compute() if isinstance(made, xr.Dataset) else made
+        found: T = self.made[key]
         return found
-
-    def known(self, key: Any) -> Any:
-        """Return what `once` has returned for a key; None if it was not called."""
-        return self._made.get(key)
 
 
 def course_of(
@@ -478,15 +458,12 @@ def read_report_data(
 MAX_CONFIGURATIONS = 30
 """Configurations that a table or a figure of all of them compares."""
 
-MAX_LINES = 7
-"""Configurations that have a line of their own in a chart."""
-
 BOTH = (Stage.detection, Stage.estimation)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Combinations of the values of some axes of settings.
+    """Combinations of the values of some axes of settings and targets.
 
     Attributes
     ----------
@@ -511,20 +488,18 @@ class Settings:
 
 
 def settings_of(
-    data: ReportData, stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
-    most: int = MAX_CONFIGURATIONS, also: Sequence[str] = (),
+    data: ReportData, stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *,
+    targets: bool = True,
 ) -> Settings:
-    """Return the combinations of the settings of some stages, about ``most`` if there are more.
+    """Return the combinations of the settings of some stages, and of targets.
 
-    Then values of the longest axes are chosen, evenly spaced. ``without`` are axes that are left
-    out, since a figure is along them; ``also`` are further axes, as of targets.
+    If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
+    spaced. ``without`` are axes that are left out, since a figure is along them.
     """
-    lengths = {name: data.length(name) for name in also} | {
-        axis.name: len(axis) for axis in data.pipeline.axes_of(*stages)
-        if len(axis) > 1 and axis.name not in without
-    }
-    chosen = dict(lengths)
-    while math.prod(chosen.values()) > most and max(chosen.values()) > 2:
+    chosen = {axis.name: len(axis)
+              for axis in (*(data.target_axes if targets else ()), *data.pipeline.axes_of(*stages))
+              if len(axis) > 1 and axis.name not in without}
+    while math.prod(chosen.values()) > MAX_CONFIGURATIONS and max(chosen.values()) > 2:
         chosen[max(chosen, key=lambda name: chosen[name])] -= 1
     axes, grouping = {}, Grouping()
     for name, length in chosen.items():
@@ -553,7 +528,8 @@ class Configurations:
     summary
         `sweep.analysis.error_statistics` by configuration (n,).
     order
-        (n,) indices: right beliefs first, of these the smallest median rotation error first.
+        (n,) indices: right beliefs first, of these by detection and solved rate, then by the RMSE
+        of rotation and range.
     """
 
     settings: Settings
@@ -567,53 +543,45 @@ class Configurations:
         """Whether there is more than one."""
         return len(self.names) > 1
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences on values of settings that are not shown."""
-        return self.settings.grouping.notes
+
+def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
+    """Return the configurations of a store, in order, by targets, too, or with them pooled."""
+    return data.once(
+        ("configurations", targets), lambda: _configurations(data, targets=targets))
 
 
-def configurations(data: ReportData) -> Configurations:
-    """Return the configurations of a store, in order."""
-    return data.once("configurations", lambda: _configurations(data))
-
-
-def _configurations(data: ReportData) -> Configurations:
-    settings = settings_of(data)
+def _configurations(data: ReportData, *, targets: bool) -> Configurations:
+    settings = settings_of(data, targets=targets)
     names, summary = by_configuration(
         data.pipeline, data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
     axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
     flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
         [len(axis) for axis in axes])
-    wrong = flags[np.ix_(*settings.axes.values())].reshape(-1) if axes else flags.reshape(-1)
-    wrong = wrong[list(settings.kept)]
+    flags = flags[np.ix_(*(settings.axes[axis.name] for axis in axes))] if axes else flags
+    lengths = [len(some) for some in settings.axes.values()]  # those of targets stand first
+    wrong = np.broadcast_to(flags, lengths).reshape(-1)[list(settings.kept)]
     names = [name + WRONG * bool(flag) for name, flag in zip(names, wrong, strict=True)]
-    median = summary["rotation_median_deg"].values.astype(np.float64)
-    solved = np.nan_to_num(summary["solved_rate"].values.astype(np.float64))
-    order = np.lexsort((-solved, np.where(np.isnan(median), np.inf, median), wrong))
-    return Configurations(settings, names, wrong, summary, tuple(order.tolist()))
+
+    def column(name: str, missing: float) -> NDArray[np.float64]:
+        values = summary[name].values.astype(np.float64)
+        return np.where(np.isnan(values), missing, values)
+
+    order = np.lexsort((
+        column("range_rmse_percent", np.inf), column("rotation_rmse_deg", np.inf),
+        -column("solved_rate", -1.0), -column("detection_rate", -1.0), wrong))
+    return Configurations(
+        settings, names, wrong, summary.assign_coords({CONFIGURATION: names}),
+        tuple(order.tolist()))
 
 
-def most_exact_first(data: ReportData, settings: Settings) -> list[int]:
+def best_first(data: ReportData, settings: Settings) -> list[int]:
     """Return the combinations of some settings in the order of their best configurations."""
     known = configurations(data)
-    all_of_them = known.settings.combinations
+    ordered = [known.settings.combinations[k] for k in known.order]
 
     def rank_of(each: dict[str, int]) -> int:
-        return next((
-            rank for rank, k in enumerate(known.order)
-            if all(all_of_them[k].get(name, index) == index for name, index in each.items())
-        ), len(known.order))
+        return next((rank for rank, one in enumerate(ordered) if each.items() <= one.items()),
+                    len(ordered))
 
     ranks = [rank_of(each) for each in settings.combinations]
     return sorted(range(len(ranks)), key=lambda k: (ranks[k], k))
-
-
-def first_detector(data: ReportData) -> tuple[dict[str, int], str]:
-    """Return the detector's settings of the first configuration in order, and their label."""
-    known = configurations(data)
-    best = known.settings.combinations[known.order[0]]
-    names = {axis.name for axis in data.pipeline.axes_of(Stage.detection)}
-    index = {name: k for name, k in best.items() if name in names}
-    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
-    return index, configuration_label(used_settings(data.pipeline, values)) if index else ""

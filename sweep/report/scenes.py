@@ -23,9 +23,8 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES, Variable, variables_of
 from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
-from sweep.report.figure import uncapitalised
-from sweep.report.formatting import coordinate, degrees, number, plural
 from sweep.report.report_data import AREA, ReportData, store_errors
+from sweep.report.table import coordinate, number, plural
 
 # --------------------------------------------------------------------------------------------------
 # One scene as a picture, with the truth and the detections drawn on it.
@@ -455,7 +454,7 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
         flags = detection if isinstance(flag, DetectionStatus) else estimate
         if flag.name not in shown and (rows := largest(flags == flag, area)).size:
             shown.add(flag.name)
-            meaning = uncapitalised(flag.meaning).removesuffix(".")
+            meaning = f"{flag.meaning[:1].lower()}{flag.meaning[1:]}".removesuffix(".")
             kinds[f"{flag.name.replace('_', ' ')}: {meaning}"] = rows
     for title, rows in kinds.items():
         if rows.size:
@@ -533,7 +532,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
         # The store may be another machine's: as `sweep verify`, within the tolerances for those.
         difference = compare(inspected.values, stored, variables_of(data.pipeline),
-                             same_processor=False).difference
+                             same_processor=False)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
@@ -575,7 +574,7 @@ def _result_text_gallery(scene: SceneInspection) -> str:
     rotation = scene.errors["rotation_error_deg"]
     if math.isfinite(rotation):
         parts += [
-            f"rotation error {degrees(rotation)}",
+            f"rotation error {number(rotation)}\u00b0",
             f"position error {number(1000 * scene.errors['translation_error_m'])} mm",
             f"reprojection error {number(scene.errors['reprojection_error_px'])} px",
         ]

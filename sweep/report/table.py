@@ -1,21 +1,19 @@
-"""Tables: data frames of texts with units and intervals, and findings, with their printers."""
+"""Tables: data frames of values with units and intervals, and findings, with their printers."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from sweep.messages import columns, plain, to_json
-from sweep.report.formatting import interval_text, number
-from sweep.report.report_data import axis_label, group_labels
-from sweep.tradeoff.pareto import interval
 
 MAX_ROWS = 300
 """Rows of a table that a page shows."""
@@ -23,24 +21,220 @@ MAX_ROWS = 300
 MAX_WIDTH, GAP = 140, "  "
 """Characters of a line of plain text, and between columns."""
 
-Columns = dict[str, tuple[str, float]]
-"""Heading -> variable of an analysis, and the factor by which it is multiplied."""
-
 MAX_LINE_CHARS = 28
 """Characters of a cell that stand in one line."""
+
+MAX_SHORT = 5
+"""Characters of a number that needs no rounding to be short."""
+
+# --------------------------------------------------------------------------------------------------
+# Numbers, coordinates and units as text.
+
+
+def number(value: float) -> str:
+    """Return a number with three significant digits and typographic signs; a dash for NaN.
+
+    >>> number(0.31), number(-1234.0), number(float("inf")), number(float("nan"))
+    ('0.310', '\u22121230', '\u221e', '\u2013')
+    """
+    if math.isnan(value):
+        return "\u2013"
+    rounded = float(f"{value:.2e}")
+    whole = rounded == 0 or 1e3 <= abs(rounded) < 1e6
+    text = f"{rounded:.0f}" if whole else f"{rounded:#.3g}".rstrip(".")
+    return text.replace("inf", "\u221e").replace("-", "\u2212")
+
+
+def interval_text(low: float, high: float, unit: str = "") -> str:
+    """Return the ends of an interval: ``0.5 to 1.5``.
+
+    >>> interval_text(1.0, float("inf"), "\u00b0")
+    '1.00 to \u221e\u00b0'
+    """
+    return f"{number(low)} to {number(high)}{unit}"
+
+
+def coordinate(value: Any) -> str:
+    """Return a coordinate as text: of a number at most six significant digits.
+
+    >>> coordinate(0.30000000000000004), coordinate("exact")
+    ('0.3', 'exact')
+    """
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def coordinates(values: Sequence[Any]) -> list[str]:
+    """Return coordinates as text: long numbers with as few digits as keep them distinct.
+
+    >>> coordinates([0.15, 0.208424, 1.5]), coordinates([12.25, 12.5])
+    (['0.15', '0.208', '1.5'], ['12.25', '12.5'])
+    """
+    texts = [coordinate(value) for value in values]
+    short = max(map(len, texts), default=0) <= MAX_SHORT
+    if short or not all(isinstance(value, float) for value in values):
+        return texts
+    rounded = ([f"{value:.{figures}g}" for value in values] for figures in range(3, 6))
+    return next((each for each in rounded if len(set(each)) == len(each)), texts)
+
+
+def plural(count: int, noun: str, plural_noun: str = "") -> str:
+    """Return a count with its noun.
+
+    >>> plural(1, "pose"), plural(2000, "pose"), plural(2, "axis", "axes")
+    ('1 pose', '2,000 poses', '2 axes')
+    """
+    return f"{count:,} {noun if count == 1 else plural_noun or f'{noun}s'}"
+
+
+WORDS = {
+    "marker_area_px": "area of the marker", "side_px": "side of the marker",
+    "frame_u_percent": "from the left, %", "frame_v_percent": "from the top, %",
+}
+"""Coordinates whose names are no words."""
+
+ENDINGS = ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s")
+UNITS = {"px2": "px\u00b2", "degree": "deg", "percent": "%", "1": ""}
+"""Unit of an attribute -> as headings have it."""
+
+
+def axis_label(results: xr.Dataset, name: str) -> str:
+    """Return the name of a coordinate or variable in words, with its unit: ``distance, m``."""
+    units = str(results[name].attrs.get("units", "")) if name in results.variables else ""
+    words = WORDS.get(name, name)
+    if units and words == name:
+        words = next((name.removesuffix(end) for end in ENDINGS if name.endswith(end)), name)
+    unit = UNITS.get(units, units)
+    return f"{words.replace('_', ' ')}, {unit}" if unit else words.replace("_", " ")
+
+
+# --------------------------------------------------------------------------------------------------
+# The cells of tables that are more than a word or a number.
+
+
+class Value(NamedTuple):
+    """A number with the ends of its interval, NaN without one."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    def __str__(self) -> str:
+        interval = "" if math.isnan(self.low) and math.isnan(self.high) else (
+            f" ({interval_text(self.low, self.high)})")
+        return number(self.value) + interval
+
+
+class Bin(NamedTuple):
+    """The ends of a bin of an axis."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return "\u2013".join(
+            f"{end:.3g}" if abs(end) < 1000 else f"{end:.0f}" for end in self)
+
+    @property
+    def middle(self) -> float:
+        """The geometric mean of the ends if both are positive, else the arithmetic one."""
+        return math.sqrt(self.low * self.high) if self.low > 0 else (self.low + self.high) / 2
+
+
+class Column(NamedTuple):
+    """A variable of an analysis, as a column of tables and on the axis of figures.
+
+    Attributes
+    ----------
+    heading
+        Words, with the unit behind a comma.
+    variable
+        Its name; the ends of its interval are ``NAME_low`` and ``NAME_high``.
+    scale
+        Factor by which it is multiplied; 100 for shares, which are drawn from 0 to 100 %.
+    level
+        Where a figure has a dashed line, such as at 0 for a bias; None for none.
+    """
+
+    heading: str
+    variable: str
+    scale: float = 1.0
+    level: float | None = None
+
+    @property
+    def share(self) -> bool:
+        """Whether it is a share."""
+        return self.scale == 100
+
+    def cells(self, summary: xr.Dataset) -> list[Any]:
+        """Return the cells of all values of a dataset, in its order."""
+        values = np.ravel(summary[self.variable]).tolist()
+        if summary[self.variable].dtype.kind != "f":
+            return values
+        ends = (np.ravel(summary[name]).tolist() if name in summary else [math.nan] * len(values)
+                for name in (f"{self.variable}_low", f"{self.variable}_high"))
+        return [Value(*(self.scale * end for end in each))
+                for each in zip(values, *ends, strict=True)]
+
+
+def cell_text(cell: Any) -> str:
+    """Return a cell of a table as text.
+
+    >>> cell_text(1200), cell_text(True), cell_text(Value(0.5, 0.25, math.inf)), cell_text(None)
+    ('1,200', 'yes', '0.500 (0.250 to \u221e)', '')
+    """
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, int):
+        return f"{cell:,}"
+    return number(cell) if isinstance(cell, float) else str(cell)
+
+
+def group_cells(table: xr.Dataset, name: str) -> list[Any]:
+    """Return the groups along a dimension: words, coordinates as numbers, or bins."""
+    if f"{name}_low" in table.coords:
+        ends = (table[f"{name}_{end}"].to_numpy().tolist() for end in ("low", "high"))
+        return [Bin(*each) for each in zip(*ends, strict=True)]
+    values: list[Any] = table[name].to_numpy().tolist()
+    if any(isinstance(value, bool) for value in values):
+        return list(map(str, values))
+    return [Coordinate(value, text) if isinstance(value, int | float) else text
+            for value, text in zip(values, coordinates(values), strict=True)]
+
+
+class Coordinate(NamedTuple):
+    """A value of an axis, as text that tells it from the others."""
+
+    value: float
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def json_cell(cell: Any) -> Any:
+    """Return a cell as JSON has it: an object with the ends of an interval, a number, or text."""
+    if isinstance(cell, Coordinate):
+        return cell.value
+    return cell._asdict() if isinstance(cell, Value | Bin) else cell
+
+
+# --------------------------------------------------------------------------------------------------
+# The table, and what an answer consists of.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """A table of text, and its printers: plain text, Markdown, JSON; a template makes HTML.
+    """A table, and its printers: plain text, Markdown, JSON; a template makes HTML.
 
     Attributes
     ----------
     caption
         Subject of the table.
     frame
-        Texts of the cells; the columns' names are headings with units, values have their intervals
-        behind them.
+        Cells: words, numbers, `Value`, `Coordinate`, `Bin`, or None; the columns' names are
+        headings with units.
     stub
         Number of leading columns that name a row.
     words
@@ -54,23 +248,29 @@ class Table:
 
     @classmethod
     def of(
-        cls, caption: str, headings: Sequence[str], rows: Sequence[Sequence[str]], *,
+        cls, caption: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], *,
         stub: int = 1, words: bool = False,
     ) -> Table:
         """Return a table of rows."""
-        return cls(caption, pd.DataFrame(
-            [list(row) for row in rows], columns=list(headings), dtype=object), stub, words)
+        frame = pd.DataFrame(index=range(len(rows)), columns=list(headings), dtype=object)
+        for column, cells in enumerate(zip(*rows, strict=True)):
+            frame.isetitem(column, pd.Series(_boxed(cells), dtype=object))
+        return cls(caption, frame, stub, words)
 
     @property
     def headings(self) -> list[str]:
         """The columns' headings."""
         return list(map(str, self.frame.columns))
 
+    def column(self, heading: str) -> list[Any]:
+        """Return the cells of a column."""
+        cells: list[Any] = self.frame[heading].tolist()
+        return cells
+
     @property
     def rows(self) -> list[list[str]]:
         """The texts of all rows."""
-        rows: list[list[str]] = self.frame.to_numpy().tolist()
-        return rows
+        return [list(map(cell_text, row)) for row in self.frame.to_numpy().tolist()]
 
     @property
     def shown_rows(self) -> list[list[str]]:
@@ -87,8 +287,9 @@ class Table:
     @property
     def column_classes(self) -> list[str]:
         """CSS class of each column: ``n`` numbers, ``text`` long words, empty for others."""
+        rows = self.shown_rows
         return ["" if k < self.stub else "n" if not self.words else
-                "text" if any(len(row[k]) > MAX_LINE_CHARS for row in self.rows) else ""
+                "text" if any(len(row[k]) > MAX_LINE_CHARS for row in rows) else ""
                 for k in range(len(self.headings))]
 
     def text(self) -> str:
@@ -116,22 +317,32 @@ class Table:
     def markdown(self) -> str:
         """Return it as a Markdown table behind its caption."""
         lines = [
-            [_markdown_cell(text) for text in self.headings],
+            [markdown_text(text) or " " for text in self.headings],
             ["---:" if name == "n" else "---" for name in self.column_classes],
-            *([_markdown_cell(text) for text in row] for row in self.shown_rows),
+            *([markdown_text(text) or " " for text in row] for row in self.shown_rows),
         ]
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{markdown_text(self.full_caption)}\n\n{table}"
 
     def html(self) -> str:
-        """Return it as an HTML table."""
-        table: str = self.frame.to_html(index=False, border=0, max_rows=MAX_ROWS)
+        """Return it as an HTML table, for a notebook."""
+        table: str = self.frame.map(cell_text).to_html(index=False, border=0, max_rows=MAX_ROWS)
         return f"<p>{escape(self.full_caption)}</p>{table}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return caption, headings and rows, with the minus sign of ASCII."""
-        return {"caption": self.caption, "headings": self.headings,
-                "rows": [[cell.replace("\u2212", "-") for cell in row] for row in self.rows]}
+        """Return its caption, and its rows by heading as numbers."""
+        headings = self.headings
+        return {"caption": self.caption, "rows": [
+            dict(zip(headings, map(json_cell, row), strict=True))
+            for row in self.frame.to_numpy().tolist()]}
+
+
+def _boxed(cells: Sequence[Any]) -> np.ndarray[Any, Any]:
+    """Return cells (n,) as objects, tuples too."""
+    boxed = np.empty(len(cells), dtype=object)
+    for k, cell in enumerate(cells):
+        boxed[k] = cell
+    return boxed
 
 
 UNDECIDED = 3
@@ -192,13 +403,9 @@ def markdown_text(text: str) -> str:
     return "".join(f"\\{c}" if c in "\\`*_[]#|$~" else c for c in escaped)
 
 
-def _markdown_cell(text: str) -> str:
-    return markdown_text(text) or " "
-
-
 def table_of(
-    summary: xr.Dataset, caption: str, dims: Sequence[str],
-    wanted: Columns, sources: xr.Dataset | None = None,
+    summary: xr.Dataset, caption: str, dims: Sequence[str], wanted: Sequence[Column],
+    sources: xr.Dataset | None = None, *, counted: str = "",
 ) -> Table:
     """Return a table with a row for each combination of ``dims``.
 
@@ -211,17 +418,22 @@ def table_of(
     dims
         Dimensions of ``summary``, all of them.
     wanted
-        Heading -> variable and the factor that it is multiplied by; a variable that ``summary``
-        lacks is left out.
+        The columns; one whose variable ``summary`` lacks is left out.
     sources
         A dataset with the units of ``dims``, if ``summary`` has none.
+    counted
+        Variable of ``summary`` without which, where it is 0, there is no row.
     """
-    labels = [group_labels(summary, dim) for dim in dims]
-    names = list(itertools.product(*labels))
-    texts = column_texts(summary.transpose(*dims, ...), wanted)
-    headings = [axis_label(sources if sources is not None else summary, dim) for dim in dims]
-    rows = [[*name, *values] for name, *values in zip(names, *texts.values(), strict=True)]
-    return Table.of(caption, [*headings, *texts], rows, stub=len(dims))
+    wanted = [each for each in wanted if each.variable in summary]
+    ordered = summary.transpose(*dims, ...)
+    cells = zip(*(each.cells(ordered) for each in wanted), strict=True)
+    names = itertools.product(*(group_cells(summary, dim) for dim in dims))
+    used = np.ravel(ordered[counted]) > 0 if counted in summary and dims else itertools.repeat(True)
+    units = sources if sources is not None else summary
+    return Table.of(
+        caption, [*(axis_label(units, dim) for dim in dims), *(each.heading for each in wanted)],
+        [[*name, *row] for name, row, shown in zip(names, cells, used, strict=False) if shown],
+        stub=len(dims))
 
 
 def each_cell(
@@ -231,28 +443,3 @@ def each_cell(
     for index in np.ndindex(*(dataset.sizes[dim] for dim in dims)):
         cell = dataset.isel(dict(zip(dims, index, strict=True)))
         yield {dim: cell[dim].item() for dim in dims}, cell
-
-
-def column_texts(summary: xr.Dataset, wanted: Columns) -> dict[str, list[str]]:
-    """Return the cells of columns by heading, without variables that ``summary`` lacks."""
-    return {heading: cells(summary, name, scale)
-            for heading, (name, scale) in wanted.items() if name in summary}
-
-
-def cells(summary: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
-    """Return a variable's values as text, each with the ends of its interval if it has one."""
-    values = summary[name]
-    if values.dtype.kind == "b":
-        return ["yes" if value else "no" for value in np.ravel(values)]
-    if values.dtype.kind in "OU":
-        return [str(value) for value in np.ravel(values)]
-    if values.dtype.kind in "iu":
-        return [f"{value:,}" for value in np.ravel(values).tolist()]
-    low, high = interval(summary, name)
-    texts = []
-    for value, a, b in zip(np.ravel(values), np.ravel(low), np.ravel(high), strict=True):
-        text = number(scale * value)
-        if not (np.isnan(a) and np.isnan(b)):
-            text += f" ({interval_text(scale * a, scale * b)})"
-        texts.append(text)
-    return texts

@@ -1,157 +1,113 @@
-"""Cost and accuracy of every configuration: the panels, and tables."""
+"""Cost and accuracy of every configuration: the table and its figure, and the renderers' table."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sweep.report.charts import Panel, Series, draw_points
-from sweep.report.table import Columns, Table, column_texts, each_cell
+from sweep.report.figure import Figure
+from sweep.report.table import Column, Table, each_cell
 from sweep.tradeoff.pareto import (
     CRITERIA,
     UNITS,
-    advice,
-    budget_advice,
-    by_condition,
+    conditions_of,
     configuration_label,
-    digits,
-    heading_of,
-    interval,
     mark_front,
 )
 
-# --------------------------------------------------------------------------------------------------
-# The chart of cost against error of every configuration, with a panel for each condition.
+STATISTICS = ("bias", "rmse", "rmse_unflipped", "median", "p95", "p99")
+"""Statistics in the names of the variables of rotation and range."""
 
-def trade_panels(
-    trade: xr.Dataset, criterion: str = "", budget_ms: float | None = None
-) -> list[Panel]:
-    """Return charts of cost, ms a frame, against an error, both logarithmic, one a condition.
+CRITERION = "rotation_p95_deg"
+OTHER_CRITERION = "rotation_median_deg"
+"""Used if the first is infinite or NaN for every configuration of some condition."""
 
-    Points have the numbers of `tradeoff_table`; those of the Pareto front are filled, named and
-    joined by steps. The accuracy bound is dashed, the budget dotted.
+MS = "ms a frame"
 
-    Parameters
-    ----------
-    trade
-        As measured by `sweep.tradeoff`.
-    criterion, budget_ms
-        An error of ``trade``, and the most milliseconds a frame (default: those asked for when it
-        was measured).
+
+def heading_of(name: str) -> str:
+    """Return a variable's name in words, its unit behind a comma: ``range RMSE, %``."""
+    words, _, unit = name.rpartition("_")
+    words = words.replace("_", " ").replace("rmse", "RMSE")
+    return f"{words}, {'%' if unit == 'percent' else unit}"
+
+
+def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[Column]]:
+    """Return a trade with its front and covariances as columns, and the columns of its table."""
+    columns = [
+        Column(MS, "cost_ms"), Column("x baseline", "cost_ratio"),
+        Column("detected, %", "detection_rate", 100), Column("flips, %", "flip_rate", 100),
+        Column(heading_of(criterion), criterion)]
+    for quantity, unit in UNITS.items():
+        names = (f"{quantity}_{statistic}_{unit}" for statistic in STATISTICS)
+        columns += [Column(heading_of(name), name) for name in names if name != criterion]
+        columns.append(Column(f"{quantity} efficiency", f"{quantity}_efficiency"))
+    columns.append(Column("NEES", "nees_mean"))
+    marked = mark_front(trade, criterion)
+    for level in marked["level"].values.tolist() if "covariance_coverage" in marked else ():
+        name = f"covered_{level:g}"
+        marked[name] = marked["covariance_coverage"].sel(level=level, drop=True)
+        columns.append(Column(f"in {100 * level:g} % ellipsoid, %", name, 100))
+    if "covariance_trusted" in marked:
+        marked["trusted"] = marked["covariance_trusted"].astype(object).where(
+            marked["nees_count"] > 0, None)
+        columns.append(Column("covariance trusted", "trusted"))
+    return marked, [each for each in columns if each.variable in marked]
+
+
+def tradeoff_table(trade: xr.Dataset, criterion: str) -> Table:
+    """Return a row for each condition and configuration, the cheapest first.
+
+    Times are in ms a frame, rotations in degrees, ranges in percent; values have their 95 %
+    intervals. Columns whose variables ``trade`` lacks are left out.
 
     Raises
     ------
     KeyError
         If ``trade`` lacks ``cost_ms`` or the criterion.
     """
-    criterion = criterion or trade_criterion(trade)
-    budget_ms = budget_ms if budget_ms is not None else trade.attrs.get("budget_ms")
-    names = [str(name) for name in trade["treatment"].values]
-    panels = []
-    for label, condition in by_condition(mark_front(trade, criterion), criterion):
-        cost, error = (
-            Series("", values, values, *interval(condition, name))
-            for name in ("cost_ms", criterion)
-            for values in [condition[name].to_numpy().astype(np.float64)])
-        panels.append(Panel(
-            label or "Cost and accuracy",
-            f"Cost in milliseconds a frame against {heading_of(criterion)}"
-            f"{f', {label}' if label else ''}.",
-            partial(draw_points, names=names, x=cost, y=error,
-                    labels=("cost, ms a frame", heading_of(criterion)),
-                    marked=condition["on_front"].to_numpy(), level=_bound(condition, criterion),
-                    limit=budget_ms),
-            wide=trade[criterion].ndim == 1))
-    return panels
-
-
-def _bound(condition: xr.Dataset, criterion: str) -> float | None:
-    """Return the bound of the criterion's quantity, in its unit; None without a bound."""
-    quantity = criterion.partition("_")[0]
-    values = np.ravel(condition.get(f"bound_{quantity}_{UNITS[quantity]}", np.empty(0)))
-    return float(values.min()) if (values := values[np.isfinite(values)]).size else None
-
-
-# --------------------------------------------------------------------------------------------------
-# Tables of cost and accuracy of every configuration, and of the renderers' cost.
-
-STATISTICS = ("bias", "rmse", "rmse_unflipped", "median", "p95", "p99")
-"""Statistics in the names of the variables of rotation and range."""
-
-COSTS: Columns = {
-    "ms a frame": ("cost_ms", 1.0), "x baseline": ("cost_ratio", 1.0),
-    "detected, %": ("detection_rate", 100.0), "flips, %": ("flip_rate", 100.0)}
-
-FEW: Columns = COSTS | {
-    "rotation median, deg": ("rotation_median_deg", 1.0),
-    "rotation p95, deg": ("rotation_p95_deg", 1.0),
-    "range RMSE, %": ("range_rmse_percent", 1.0),
-}
-"""Columns of a report's table."""
-
-CRITERION = "rotation_p95_deg"
-OTHER_CRITERION = "rotation_median_deg"
-"""Used if the first is infinite or NaN for every configuration of some condition."""
-
-
-def tradeoff_table(trade: xr.Dataset, criterion: str, columns: Columns | None = None) -> Table:
-    """Return a row for each condition and configuration, the cheapest first.
-
-    Times are in ms a frame, rotations in degrees, ranges in percent; values have their 95 %
-    intervals. Columns, by default all, whose variables ``trade`` lacks are left out.
-
-    Raises
-    ------
-    KeyError
-        If ``trade`` lacks ``cost_ms``, ``cost_ratio`` or the criterion.
-    """
-    found: dict[str, list[str]] = {}
-    stub = ["configuration", "condition", "number", "on the front"]
-    for label, condition in by_condition(mark_front(trade, criterion), criterion):
-        order = np.argsort(condition["cost_ms"].to_numpy(), kind="stable")
-        ordered = condition.isel(treatment=order)
-        texts = {
-            "configuration": [str(name) for name in ordered["treatment"].values],
-            "condition": [label] * len(order), "number": [str(k + 1) for k in order],
-            "on the front": ["yes" if front else "" for front in ordered["on_front"].values],
-        } | column_texts(ordered, columns or _all_columns(criterion))
-        if columns is None:
-            texts |= _covariance_columns(ordered)
-        for heading, values in texts.items():
-            found.setdefault(heading, []).extend(values)
-    if not any(found["condition"]):
-        del found["condition"]
-        stub.remove("condition")
+    marked, columns = trade_columns(trade, criterion)
+    rows: list[list[Any]] = []
+    for label, at, part in conditions_of(marked):
+        ordered = part.isel(treatment=np.argsort(part["cost_ms"].to_numpy(), kind="stable"))
+        cells = zip(*(each.cells(ordered) for each in columns), strict=True)
+        rows += [[*([label] if at else []), str(name), bool(front), *values]
+                 for name, front, values in zip(
+                     ordered["treatment"].values, ordered["on_front"].values, cells, strict=True)]
+    several = ["condition"] if trade["cost_ms"].ndim > 1 else []
     return Table.of(
-        "Cost and accuracy, the cheapest first, with 95 % intervals", list(found),
-        list(zip(*found.values(), strict=True)), stub=len(stub))
+        "Cost and accuracy, the cheapest first, with 95 % intervals",
+        [*several, "configuration", "on the front", *(each.heading for each in columns)], rows,
+        stub=len(several) + 2)
 
 
-def _all_columns(criterion: str) -> Columns:
-    columns = COSTS | {heading_of(criterion): (criterion, 1.0)}
-    for quantity, unit in UNITS.items():
-        names = [f"{quantity}_{statistic}_{unit}" for statistic in STATISTICS]
-        columns |= {heading_of(name): (name, 1.0) for name in names}
-        columns[f"{quantity} efficiency"] = f"{quantity}_efficiency", 1.0
-    return columns | {"NEES": ("nees_mean", 1.0)}
+def trade_figure(
+    trade: xr.Dataset, criterion: str = "", lines: Sequence[str] = ()
+) -> Figure:
+    """Return cost, ms a frame, against an error, a panel for each condition.
 
-
-def _covariance_columns(condition: xr.Dataset) -> dict[str, list[str]]:
-    """Return how much each level of the predicted covariance covers, and whether to trust it."""
-    found = {}
-    if "covariance_coverage" in condition:
-        for level in condition["level"].to_numpy().tolist():
-            covered = 100 * condition["covariance_coverage"].sel(level=level)
-            found[f"in {100 * level:g} % ellipsoid, %"] = list(map(digits, covered.to_numpy()))
-    if "covariance_trusted" in condition:
-        found["covariance"] = [
-            ("trusted" if trusted else "not trusted") if count else "-" for trusted, count in zip(
-                condition["covariance_trusted"].to_numpy(), condition["nees_count"].to_numpy(),
-                strict=True)]
-    return found
+    Parameters
+    ----------
+    trade
+        As measured by `sweep.tradeoff`.
+    criterion
+        An error of ``trade`` (default: the one asked for when it was measured).
+    lines
+        What is recommended.
+    """
+    criterion = criterion or trade_criterion(trade)
+    heading = heading_of(criterion)
+    return Figure(
+        "trade", "Cost and accuracy", (
+            f"Cost of detection and estimation, ms a frame, against {heading}, of each "
+            f"configuration on the same {trade.attrs.get('poses', 0):,} images, with 95 % "
+            "intervals. Joined are those on the Pareto front: no other configuration is both "
+            f"cheaper and better. {' '.join(f'{line}.' for line in lines)}").strip(),
+        tradeoff_table(trade, criterion), [Column(heading, criterion)], MS, "on the front",
+        labels="configuration")
 
 
 def trade_criterion(trade: xr.Dataset) -> str:
@@ -162,20 +118,7 @@ def trade_criterion(trade: xr.Dataset) -> str:
     return next(
         (name for name in names
          if np.isfinite(trade[name].values).any(axis=trade[name].dims.index("treatment")).all()),
-        names[0],
-    )
-
-
-def trade_table_and_text(trade: xr.Dataset) -> tuple[Table, str]:
-    """Return the table of a report's figure, and its caption."""
-    criterion, budget_ms = trade_criterion(trade), trade.attrs.get("budget_ms")
-    lines = [*([] if budget_ms is None else budget_advice(trade, criterion, budget_ms)),
-             *advice(trade, criterion)]
-    return tradeoff_table(trade, criterion, FEW), (
-        f"Cost of detection and estimation, ms a frame, against {heading_of(criterion)}, of each "
-        f"configuration on the same {trade.attrs.get('poses', 0):,} images, with 95 % intervals. "
-        "Points have the numbers of the table; filled ones are on the Pareto front: no other "
-        f"configuration is both cheaper and better. {'. '.join(lines)}.")
+        names[0])
 
 
 WINDOWS = {
@@ -198,15 +141,13 @@ def headlines(trade: xr.Dataset, criterion: str) -> list[str]:
     ]
 
 
-IMAGES = {"ms an image": "render_ms", "x exact": "render_ratio", "grey RMS": "grey_rms",
-          "grey max": "grey_max"}
-CHANGES = {
-    "detection differs, %": ("detection_disagreement", 100.0),
-    "corner RMS px": ("corner_shift_rms_px", 1.0),
-    "range bias %": ("range_bias_percent", 1.0),
-    "rotation RMS deg": ("rotation_shift_deg", 1.0),
-}
-"""Heading -> variable of the images; heading -> variable of a configuration, and its factor."""
+IMAGES = (Column("ms an image", "render_ms"), Column("x exact", "render_ratio"),
+          Column("grey RMS", "grey_rms"), Column("grey max", "grey_max"))
+CHANGES = (
+    Column("detection differs, %", "detection_disagreement", 100),
+    Column("corner RMS px", "corner_shift_rms_px"), Column("range bias %", "range_bias_percent"),
+    Column("rotation RMS deg", "rotation_shift_deg"))
+"""Columns of the images, and of a configuration."""
 
 
 def renderer_table(renderers: xr.Dataset) -> Table:
@@ -217,18 +158,19 @@ def renderer_table(renderers: xr.Dataset) -> Table:
     of corners, range and rotation, paired on the scenes that both solve.
     """
     return Table.of(
-        "Other renderers against exact images", ["renderer", *IMAGES, "configuration", *CHANGES],
-        list(_renderer_rows(renderers)), words=True)
+        "Other renderers against exact images",
+        ["renderer", "configuration", *(each.heading for each in (*IMAGES, *CHANGES))],
+        list(_renderer_rows(renderers)), stub=2)
 
 
-def _renderer_rows(renderers: xr.Dataset) -> Iterator[list[str]]:
+def _renderer_rows(renderers: xr.Dataset) -> Iterator[list[Any]]:
     settings = [str(dim) for dim in renderers["range_bias_percent"].dims if dim != "renderer"]
     for name in renderers["renderer"].values.tolist():
         one = renderers.sel(renderer=name)
-        images = [digits(float(one[variable])) for variable in IMAGES.values()]
+        images = [cell for each in IMAGES for cell in each.cells(one)]
         if name == renderers.attrs["reference"]:
-            yield [name, *images, "", *[""] * len(CHANGES)]
+            yield [name, None, *images, *[None] * len(CHANGES)]
             continue
         for at, cell in each_cell(one, settings):
-            yield [name, *images, configuration_label(at), *(
-                digits(float(cell[variable]) * factor) for variable, factor in CHANGES.values())]
+            yield [name, configuration_label(at), *images,
+                   *(value for each in CHANGES for value in each.cells(cell))]

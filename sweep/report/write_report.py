@@ -24,10 +24,8 @@ from sweep.experiment.facts import camera_facts, camera_notes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label
 from sweep.report.answer import Answer, answer
-from sweep.report.charts import css_variables, panel_svg, panels_file
-from sweep.report.figure import Figure
+from sweep.report.figure import Figure, css_variables, panel_svg, panels_file
 from sweep.report.figures import figures_of
-from sweep.report.formatting import coordinates
 from sweep.report.output_file import (
     check_output_file,
     write_errors_explained,
@@ -42,7 +40,7 @@ from sweep.report.scenes import (
     pipeline_file,
     scenes_of,
 )
-from sweep.report.table import Table, markdown_text
+from sweep.report.table import Table, coordinates, markdown_text
 from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store, is_remote
 
@@ -135,7 +133,7 @@ def _per(data: ReportData) -> str:
 def _axes(data: ReportData) -> Table | None:
     if not data.pipeline.axes:
         return None
-    rows = [[axis.name, f"{len(axis):,}", _values(axis), axis.unit, _meaning(axis)]
+    rows = [[axis.name, len(axis), _values(axis), axis.unit, _meaning(axis)]
             for axis in data.pipeline.axes]
     return Table.of(
         "Axes of the grid", ["axis", "values", "which", "unit", "meaning"], rows, words=True)

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
@@ -142,6 +143,20 @@ def test_the_package_runs_as_a_module():
 @pytest.mark.parametrize("guide", sorted({*GUIDES, *(command.guide for command in COMMANDS)}))
 def test_every_guide_that_a_help_names_exists(guide):
     assert (TOP / guide).is_file()
+
+
+def test_the_example_is_the_pipeline_of_the_guides_and_is_packaged():
+    example = TOP / "sweep" / "examples" / "smoke.toml"
+    assert example.read_bytes() == (TOP / "pipelines" / "smoke.toml").read_bytes()
+    project = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "examples/*.toml" in project["tool"]["setuptools"]["package-data"]["sweep"]
+
+
+@pytest.mark.parametrize("arguments", [[], ["some.toml", "--example", "smoke"]])
+def test_a_run_is_of_a_file_or_of_an_example(arguments, capsys):
+    code, out, err = told(capsys, "run", *arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--example smoke" in err
 
 
 # Messages.

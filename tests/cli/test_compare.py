@@ -14,8 +14,8 @@ from support.photograph_results import results_of, twins
 from sweep import cli
 from sweep.analysis import simulation_gap
 from sweep.messages import to_json
-from sweep.report.charts import panels_file
-from sweep.report.comparison_tables import gap_lines, gap_panels, gap_records, gap_table
+from sweep.report.comparison_tables import gap_figures, gap_lines, gap_table
+from sweep.report.figure import panels_file
 
 
 def told(capsys, *arguments):
@@ -29,37 +29,41 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
     gap = simulation_gap(first, second, bins={"side_px": [20, 40, 70]})
     table = gap_table(gap)
     assert list(table.headings) == [
-        "", "cornerRefinementMethod", "side_px", "photographs", "simulated", "gap"]
+        "statistic", "cornerRefinementMethod", "side_px", "photographs", "simulated",
+        "compared by", "gap"]
     assert len(table.rows) == 7 * 2 * 2
-    row = next(row for row in table.rows if row[:3] == ["range bias, %", "subpix", "20\u201340"])
+    row = next(row for row in table.rows
+               if row[:3] == ["range bias, %", "subpix", "20\u201340"])
     at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=0)
     assert float(row[3].replace("\u2212", "-")) == pytest.approx(
         at.range_bias_percent.values[0], rel=0.01)
-    assert "to" in row[5]
+    assert "to" in row[6]
     ratio = next(row for row in table.rows if row[0].startswith("rotation error, 90 %"))
-    assert ratio[5].startswith("\u00d7")
+    assert ratio[5] == "ratio"
     assert gap_lines(gap) == ["12 photographs and their twins, pairs of markers"]
 
 
 def test_json_has_the_same_numbers_and_null_where_there_is_none():
     rng = np.random.default_rng(2)
     gap = simulation_gap(results_of(rng, 3), twins(rng))
-    records = json.loads(to_json({"rows": gap_records(gap)}))["rows"]
-    median = next(each for each in records if each["statistic"] == "rotation_median_deg")
-    assert median["compared_by"] == "ratio"
+    records = json.loads(to_json(gap_table(gap).as_json()))["rows"]
+    median = next(each for each in records
+                  if each["statistic"].startswith("rotation error, median"))
+    assert median["compared by"] == "ratio"
     assert median["cornerRefinementMethod"] == "none"
-    assert median["gap"][1:] == [None, None]
-    assert math.isfinite(median["gap"][0])
+    assert (median["gap"]["low"], median["gap"]["high"]) == (None, None)
+    assert math.isfinite(median["gap"]["value"])
     assert gap_lines(gap)[-1] == "fewer than 5 photographs: errors without intervals"
 
 
 def test_the_figure_has_the_distributions_of_both_sources():
     rng = np.random.default_rng(3)
     first, second = results_of(rng), twins(rng, scale=0.5)
-    panels = gap_panels(first, second)
+    figures = gap_figures(first, second)
+    assert [figure.name for figure in figures] == ["rotation", "depth"]
+    panels = figures[0].panels
     assert [panel.title for panel in panels] == [
-        "cornerRefinementMethod none", "cornerRefinementMethod none",
-        "cornerRefinementMethod subpix", "cornerRefinementMethod subpix"]
+        f"Share of solved poses, cornerRefinementMethod {name}" for name in ("none", "subpix")]
     axes = Figure().add_subplot()
     panels[0].draw(axes)
     solved = first.sel(cornerRefinementMethod="none").rotation_error_rad.values.reshape(-1, 3)
@@ -101,9 +105,10 @@ def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
     said = json.loads(out)
     assert said["fingerprint"] == []
     (one,) = said["detection"]
-    assert (one["detections_compared"], one["detections_differing"]) == (2, 0)
-    assert one["corners_compared"] == 8
-    assert one["corner_shift_px"] == {"median": None, "p99": None, "worst": None}
+    assert (one["compared"], one["another flag"]) == (2, 0)
+    (one,) = said["corners"]
+    assert one["compared"] == 8
+    assert one["worst, px"]["value"] is None
     code, out, _ = told(capsys, "compare", stores / "a.zarr", stores / "b.zarr")
     assert code == 0
     assert "next: sweep report" in out
@@ -139,10 +144,10 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys)
         code, out, _ = told(
             capsys, "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
         (median,) = (each for each in json.loads(out)["rows"]
-                     if each["statistic"] == "rotation_median_deg"
+                     if each["statistic"].startswith("rotation error, median")
                      and each["cornerRefinementMethod"] == "subpix")
         # The photographs were rendered with this scene, but for the board around each marker.
-        assert 0.5 < median["gap"][0] < 2
+        assert 0.5 < median["gap"]["value"] < 2
         simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
         assert simulated.sizes["trial"] == len(POSES)
         scene.write_text("[scene]\nblur_px = 3\n")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import sweep.cli
 from sweep.analysis import calibration_summary
 from sweep.messages import to_json
-from sweep.report.comparison_tables import calibration_records
+from sweep.report.comparison_tables import calibration_table
 
 HERE = Path(sweep.cli.__file__).parent
 
@@ -88,9 +88,10 @@ def test_calibrations_are_numbers_with_units_in_the_keys():
         "intrinsic_error": (("views", "set", "intrinsic"), [[[-1.0, 0.1], [-3.0, 0.3]]]),
         "intrinsic_std": (("views", "set", "intrinsic"), [[[1.0, 0.0], [1.0, 0.0]]]),
         "position_error_m": (("views", "set", "direction", "xyz"), np.full((1, 2, 1, 3), -0.01)),
-    }, {"views": [6], "intrinsic": intrinsics, "direction": ["centre"], "xyz": list("xyz")}))
-    (row,) = strict(to_json({"rows": calibration_records(summary)}))["rows"]
-    assert (row["views"], row["tried"], row["calibrated"]) == (6, 2, 2)
-    assert row["depth_rmse_m"] == {"centre": pytest.approx(0.01)}
-    assert row["numbers"]["fx_px"]["bias"] == -2.0
-    assert row["numbers"]["k1"]["coverage"] is None  # it was not estimated
+    }, {"views": [6], "intrinsic": intrinsics, "direction": ["centre"], "xyz": list("xyz")},
+        {"points": "chessboard", "target_m": 3.0}))
+    rows = strict(to_json(calibration_table(summary).as_json()))["rows"]
+    assert [row["number"] for row in rows] == ["fx_px"]  # k1 was not estimated
+    assert (rows[0]["views"], rows[0]["tried"], rows[0]["calibrated"]) == (6, 2, 2)
+    assert rows[0]["z in the centre, mm"]["value"] == pytest.approx(10)
+    assert rows[0]["bias"]["value"] == -2.0

@@ -11,22 +11,11 @@ from matplotlib.figure import Figure
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report.answer import Answer, Tile
-from sweep.report.charts import (
-    COLOURS,
-    OUTCOME_COLOURS,
-    THEME,
-    Panel,
-    Series,
-    below_floor,
-    css_variables,
-    draw_lines,
-    draw_stack,
-    value_scale,
-)
+from sweep.report.figure import COLOURS, THEME, Series, css_variables, draw_lines, value_scale
 from sweep.report.figure import Figure as ReportFigure
-from sweep.report.figure import interval_sentence
+from sweep.report.figures import interval_sentence
 from sweep.report.scenes import FAILURES, Scene
-from sweep.report.table import MAX_ROWS, Findings, Table
+from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
 from sweep.report.write_report import Provenance, page
 
 HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
@@ -38,8 +27,8 @@ def hostile_table():
 
 def hostile_page():
     figure = ReportFigure(
-        "name", HOSTILE, HOSTILE, hostile_table(),
-        [Panel(HOSTILE, HOSTILE, lambda axes: axes.set_xlabel(HOSTILE), wide=True)])
+        "name", HOSTILE, HOSTILE, Table.of(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.0]]),
+        [Column("n", "n")])
     scenes = [Scene((HOSTILE,), HOSTILE, HOSTILE, HOSTILE, HOSTILE, picture, problem=HOSTILE)
               for picture in (b"png", None)]
     origin = Provenance({"Store": HOSTILE, "Report": HOSTILE}, (HOSTILE,), hostile_table(),
@@ -77,22 +66,6 @@ def test_every_flag_of_a_counted_pose_that_is_not_solved_is_a_kind_of_scene():
     ]
 
 
-def test_an_outcome_without_a_colour_of_its_own_is_hatched():
-    axes = Figure().add_subplot()
-    share = np.array([0.25])
-    draw_stack(axes, ["all"], {"solved": share, "blinded": share, "tired": share}, "all poses")
-    solved, blinded, tired = (bars.patches[0] for bars in axes.containers)
-    assert solved.get_hatch() is None
-    assert blinded.get_hatch()
-    assert blinded.get_facecolor() != tired.get_facecolor()
-
-
-def test_every_counted_outcome_of_today_has_a_colour_of_its_own():
-    hatched = {"too_few_points"}  # of boards alone
-    assert {flag.name for flag in FAILURES} - hatched | {"solved"} == set(OUTCOME_COLOURS)
-    assert len(set(OUTCOME_COLOURS.values())) == len(OUTCOME_COLOURS)
-
-
 # Tables.
 
 def test_a_long_table_is_cut_and_says_so():
@@ -112,12 +85,62 @@ def test_every_printer_keeps_hostile_text_in_its_cell():
     lines = table.text().splitlines()
     assert len(lines) == 5
     assert all(line.isprintable() for line in lines)
-    assert table.as_json()["rows"][0] == [nasty, "1"]
+    assert table.as_json()["rows"][0] == {nasty: nasty, "n": "1"}
     found = Findings([table, nasty, Table.of("none", ["n"], [])], {"share": float("inf")})
     assert "<i>" not in found._repr_html_() + found.markdown()
     assert str(found).startswith(table.text())
     assert "none" not in str(found)
     assert '"share_flag": "infinite"' in found.to_json()
+
+
+def test_a_cell_is_the_same_number_in_text_and_json():
+    table = Table.of("Cells", ["x, m", "bin", "rate", "n", "yes", "none"], [
+        [Coordinate(0.5, "0.5"), Bin(1.0, 4.0), Value(0.25, 0.125, np.inf), 1200, True, None]])
+    assert table.rows == [["0.5", "1\u20134", "0.250 (0.125 to \u221e)", "1,200", "yes", ""]]
+    assert table.as_json()["rows"] == [{
+        "x, m": 0.5, "bin": {"low": 1.0, "high": 4.0}, "n": 1200, "yes": True, "none": None,
+        "rate": {"value": 0.25, "low": 0.125, "high": np.inf}}]
+
+
+# Figures.
+
+RATE = Column("rate, %", "rate", 100)
+
+
+def drawn(table, x="", by="", **options):
+    """Return the axes of each panel of a figure of the rate."""
+    shown = ReportFigure("f", "F", "", table, [RATE], x, by, **options)
+    axes = [Figure().subplots() for _ in shown.panels]
+    for panel, each in zip(shown.panels, axes, strict=True):
+        panel.draw(each)
+    return [panel.title for panel in shown.panels], axes
+
+
+def test_numbers_are_lines_with_a_panel_for_what_is_neither_x_nor_line():
+    table = Table.of("Rates", ["configuration", "tilt, deg", "side, px", RATE.heading], [
+        [name, Coordinate(tilt, str(tilt)), Bin(side, 2 * side), Value(side, side - 1, side + 1)]
+        for name in ("none", "subpix") for tilt in (0, 60) for side in (40, 10, 20)], stub=3)
+    titles, panels = drawn(table, "side, px", "configuration")
+    assert titles == ["Rate, tilt 0\u00b0", "Rate, tilt 60\u00b0"]
+    for axes in panels:
+        lines = [line for line in axes.lines if len(line.get_xdata())]
+        assert [line.get_label() for line in lines] == ["none", "subpix"]
+        assert lines[0].get_xdata().tolist() == [np.sqrt(2) * side for side in (10, 20, 40)]
+        assert lines[0].get_ydata().tolist() == [10, 20, 40]
+        assert axes.get_ylim() == (-3, 103)
+
+
+def test_names_are_rows_of_dots_never_joined_and_marked_ones_are_diamonds():
+    table = Table.of("Rates", ["target", RATE.heading, "weak"], [
+        ["a", Value(10), False], ["b", Value(np.nan), False], ["c", Value(30), True]])
+    for x in ("", "target"):
+        (title,), (axes,) = drawn(table, x, marked="weak")
+        assert title == "Rate"
+        assert [text.get_text() for text in axes.get_yticklabels()] == ["a", "b", "c"]
+        dots = [line for line in axes.lines if len(line.get_xdata())]
+        assert {line.get_linestyle() for line in dots} == {"None"}
+        assert [(line.get_marker(), line.get_xdata().tolist()) for line in dots] == [
+            ("o", [10.0]), ("D", [30.0])]
 
 
 @pytest.mark.parametrize(("values", "scale"), [
@@ -134,14 +157,12 @@ def test_values_that_grow_by_factors_are_on_a_logarithmic_axis(values, scale):
 
 def test_errors_of_rounding_do_not_compress_the_others():
     none = np.full(4, np.nan)
-    y = np.array([1e-14, 0.02, 0.5, 3.0])
-    assert below_floor(y)
-    assert not below_floor(y[1:])
-    logarithmic, (low, high) = value_scale([Series("", np.arange(4.0), y, none, none)], share=False)
+    y = Series("", np.arange(4.0), np.array([1e-14, 0.02, 0.5, 3.0]), none, none)
+    logarithmic, (low, high) = value_scale([y], share=False)
     assert logarithmic
     assert 1e-3 < low < 0.02
     assert 3 < high < 10
-    assert not value_scale([Series("", np.arange(4.0), y, none, none)], share=False, level=0.0)[0]
+    assert not value_scale([y], share=False, level=0.0)[0]
 
 
 def test_intervals_are_said_to_be_over_what_was_drawn():

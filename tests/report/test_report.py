@@ -26,9 +26,9 @@ from sweep.analysis import (
 from sweep.errors import StoreError
 from sweep.measure.flags import EstimateStatus
 from sweep.report.figures import figures_of
-from sweep.report.formatting import number
 from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.scenes import scenes_of
+from sweep.report.table import number
 from sweep.report.write_report import write_report
 from sweep.store.lifecycle import open_dataset, open_store, write_group
 
@@ -215,12 +215,12 @@ def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
     shares = failure_composition(
         results.sel(cornerRefinementMethod="none", solver="photometric"), per=("side_px",)
     ).compute()
-    rows = tables["Shares in percent, with 95 % intervals"]
-    column = rows[0].index("solved, %")
-    for row in rows[1:]:
-        if row[0] != "none \u00b7 photometric":
-            continue
-        share = 100 * float(shares["share"].sel(side_px=float(row[1]), outcome="solved"))
+    rows = tables["Outcomes, with 95 % intervals"]
+    column = rows[0].index("share, %")
+    chosen = [row for row in rows[1:] if row[0] == "none \u00b7 photometric"]
+    assert {"solved"} < {row[1] for row in chosen}
+    for row in chosen:
+        share = 100 * float(shares["share"].sel(side_px=float(row[2]), outcome=row[1]))
         assert row[column].split(" (")[0] == number(share)
 
 
@@ -294,7 +294,7 @@ def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
     assert 'id="trade"' in text
     assert f"sweep tradeoff {url} --per side_px" in text
     rows = Page(text).tables["Cost and accuracy, the cheapest first, with 95 % intervals"]
-    assert [row[0] for row in rows[1:3]] == small_trade()["treatment"].values.tolist()
+    assert [row[1] for row in rows[1:3]] == small_trade()["treatment"].values.tolist()
 
 
 @pytest.mark.long

@@ -22,8 +22,8 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
 from sweep.report.figures import figures_of
-from sweep.report.formatting import number
-from sweep.report.report_data import ReportData, read_report_data
+from sweep.report.report_data import Configurations, ReportData, read_report_data
+from sweep.report.table import number
 from sweep.store.lifecycle import open_dataset
 
 GUIDE = (Path(__file__).parents[2] / "pipelines" / "README.md").read_text(encoding="utf-8")
@@ -101,8 +101,8 @@ def configurations_of(results, name):
 
 
 def value_of(cell):
-    """Return the number that a cell begins with."""
-    return cell.split(" ")[0]
+    """Return the number of a cell of a table's JSON, infinite where it is flagged."""
+    return math.inf if cell.get("value_flag") == "infinite" else cell["value"]
 
 
 def test_line_table_and_json_are_what_plain_numpy_finds(store):
@@ -112,27 +112,27 @@ def test_line_table_and_json_are_what_plain_numpy_finds(store):
              for label, one in configurations_of(open_dataset(url).load(), name).items()}
     table = next(each for each in shown["tables"]
                  if each["caption"].startswith("Configurations, with"))
-    rows = {row[0]: dict(zip(table["headings"], row, strict=True)) for row in table["rows"]}
+    rows = {row["configuration"]: row for row in table["rows"]}
     assert set(rows) == set(parts)
     for label, one in parts.items():
         row = rows[label]
-        assert row["n"] == f"{one.count:,}"
+        assert row["n"] == one.count
         for heading, value in (
             ("detected, %", one.detected), ("solved, %", 100 * one.solved.mean()),
             ("rotation median, deg", one.median),
             ("rotation RMSE, deg", math.sqrt(np.nanmean(one.rotation))),
             ("range RMSE, %", 100 * math.sqrt(np.nanmean(one.depth))),
             ("flips, %", 100 * one.flipped.sum() / one.solved.sum())):
-            assert value_of(row[heading]) == number(value)
+            assert value_of(row[heading]) == pytest.approx(value, rel=1e-6)
     assert f'<p class="verdict">{shown["answer"]}</p>' in page
     named = shown["configuration"] or "as set"
-    tiles = {each["name"]: each["text"] for each in shown["numbers"]}
-    assert tiles["detected"] == f"{number(parts[named].detected)} %"
-    assert tiles["rotation error, RMSE"] == f"{value_of(rows[named]['rotation RMSE, deg'])}\u00b0"
-    assert tiles["range error, RMSE"] == f"{value_of(rows[named]['range RMSE, %'])} %"
+    tiles = {each["name"]: each for each in shown["numbers"]}
+    assert tiles["detected"]["text"] == f"{number(parts[named].detected)} %"
+    for heading, unit in (("rotation RMSE", "deg"), ("range RMSE", "%")):
+        assert tiles[heading]["value"] == rows[named][f"{heading}, {unit}"]["value"]
     if len(parts) == 1:
         assert shown["comparison"] == []
-        assert shown["answer"].startswith(f"Detected in {tiles['detected']}")
+        assert shown["answer"].startswith(f"Detected in {tiles['detected']['text']}")
         return
     (other,) = set(parts) - {named}
     (found,) = shown["comparison"]
@@ -152,9 +152,9 @@ def test_line_table_and_json_are_what_plain_numpy_finds(store):
     for each in found["differences"]:
         kind = each["quantity"].split()[0]
         assert each["value"] == pytest.approx(expected[kind], rel=1e-6, abs=1e-12)
-        cell = next(text for heading, text in rows[other].items()
+        cell = next(cell for heading, cell in rows[other].items()
                     if heading.startswith(kind) and ("difference" in heading or "ratio" in heading))
-        assert value_of(cell) == number(each["value"]).replace("\u2212", "-")
+        assert cell["value"] == each["value"]
         equal = 0 if "difference" in each["quantity"] else 1
         assert (each["verdict"] == "not decided") == (each["low"] <= equal <= each["high"])
         if each["verdict"] != "not decided":
@@ -183,20 +183,17 @@ def test_no_configuration_is_named_that_another_one_is_better_than_if_there_is_o
     matrix[np.triu_indices(count, 1)] = flat
     matrix -= matrix.T
 
-    def against(_, __, best, ___):
+    def against(_, __, best):
         return [() if k == best else (comparisons.Difference("d", 0, 0, 0, "", verdict),)
                 for k, verdict in enumerate(matrix[best].tolist())]
 
     names = [f"c{k}" for k in range(count)]
-    summary = xr.Dataset({name: ("configuration", np.zeros(count)) for name in (
-        "range_rmse_percent", "rotation_rmse_deg", "solved_rate", "detection_rate")})
-    known = SimpleNamespace(
-        settings=SimpleNamespace(combinations=[{}] * count, grouping=None), names=names,
-        wrong=np.zeros(count, bool), summary=summary)
+    known = Configurations(
+        SimpleNamespace(combinations=[{}] * count, grouping=None), names,
+        np.zeros(count, bool), None, tuple(range(count)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparisons, "_against_each", against)
-        patch.setattr(comparisons, "configurations", lambda _: known)
-        patch.setattr(comparisons, "target_axes", lambda _: ())
+        patch.setattr(comparisons, "configurations", lambda *_, **__: known)
         found = comparisons._comparison(None, None)
     worse = (matrix < 0).sum(axis=1)
     assert worse[found.best] == worse.min()
@@ -259,7 +256,7 @@ def test_what_is_required_is_decided_with_how_far_and_the_configuration(
     assert shown.headline.startswith(f"detection >= 0.9: {words} at ")
     together, by_angle = shown.tables[:2]
     assert together.frame["cornerRefinementMethod"].tolist() == ["none", "subpix"]
-    assert set(together.frame["decided"]) <= {"yes", "no"}
+    assert set(together.frame["decided"]) <= {True, False}
     assert len(by_angle.frame) == 4
 
 

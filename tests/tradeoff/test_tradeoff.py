@@ -440,7 +440,7 @@ def test_budget_is_told_by_the_command_and_checked(store):
     text = told(store, "--seconds", "0.2", "--budget-ms", "1e-6")
     assert "nothing fits 1e-06 ms a frame; the nearest is " in text
     content = json.loads(told(store, "--seconds", "0.2", "--budget-ms", "1e9", "--json"))
-    assert content["budget"][0].startswith("within 1e+09 ms a frame take ")
+    assert content["advice"][0].startswith("within 1e+09 ms a frame: ")
     code, out, err = command(store, "--budget-ms", "0")
     assert (code, out, err) == (2, "", "--budget-ms 0.0: expected a finite number above 0\n")
 

@@ -163,7 +163,6 @@ def limit(
     per: Sequence[str] | None = None,
     at_all: Sequence[str] | None = None,
     max_trials: int | None = None,
-    coarse_trials: int | None = None,
     store: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     client: Client | Cluster | None = None,
@@ -182,8 +181,8 @@ def limit(
     pipeline
         As `run` takes it; a store of equally many trials everywhere is analysed as it is.
     require
-        What must hold, such as "detection >= 0.9", all together (default: that of the pipeline's
-        section [limit], else [require]).
+        What must hold, such as "detection >= 0.9", all together (default: those of the
+        pipeline's section [require]).
     along
         The axis of the scene that is searched, such as ``distance_m``.
     per
@@ -191,9 +190,7 @@ def limit(
     at_all
         Axes at all of whose values the requirements must hold.
     max_trials
-        The most trials of a cell (default: that of [limit], else 2,400).
-    coarse_trials
-        Trials of every cell in the coarse scan (default: as many as make 40 draws of a value).
+        The most trials of a cell (default: that of [search], else 2,400).
     store
         Path or URL of the store (default: ``runs/NAME-limit-AXIS.zarr``).
     workers, client, scheduler, reuse, overwrite, yes, progress
@@ -225,9 +222,8 @@ def limit(
         source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
         limits, summary = library.limit_search.search_limits(
             source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
-            coarse_trials=coarse_trials, store=store, workers=workers, client=client,
-            scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=report,
-            child=child)
+            store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
+            overwrite=overwrite, yes=yes, progress=report, child=child)
     for line in summary.warnings if summary is not None else ():
         notice(line)
     return limits
@@ -471,7 +467,7 @@ def size(
     Parameters
     ----------
     pipeline
-        As for :func:`run`, with the sections [require] and [choose].
+        As for :func:`run`, with the sections [require] and [search].
     store, workers, reuse, overwrite, yes, progress
         As for :func:`run`.
     limit_s
@@ -493,7 +489,7 @@ def size(
     >>> found = sweep.size({
     ...     "pose": {"jitter_px": 0.5}, "axes": {"side_px": [4, 40]},
     ...     "require": {"all": ["detection >= 0.5"]},
-    ...     "choose": {"smallest": "side_px", "max_trials": 60},
+    ...     "search": {"smallest": "side_px", "max_trials": 60},
     ... }, store=folder / "smallest.zarr", workers=1)
     >>> found.answers[found.best].value, found.answers[found.best].next
     (40.0, 4.0)

@@ -26,14 +26,14 @@ from sweep.analysis.requirements import (
 )
 from sweep.experiment.axes import TRIAL
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import CHOOSE, ChoiceRule
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.messages import shown
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # What is wrong with a choice before anything is computed, a line each.
 
-def choice_faults(pipeline: Pipeline, rule: ChoiceRule, shares: ErrorShares) -> list[str]:
+def choice_faults(pipeline: Pipeline, rule: StoppingRule, shares: ErrorShares) -> list[str]:
     """Return what makes a choice impossible.
 
     Those are requirements that cannot be, and those that ``max_trials`` cannot show to be met even
@@ -41,14 +41,15 @@ def choice_faults(pipeline: Pipeline, rule: ChoiceRule, shares: ErrorShares) -> 
     """
     required, faults = read_requirements(rule.requirements)
     lines = [f"require.all = {shown(text)}: {problem}" for text, problem in faults]
-    kept = {TRIAL, rule.along, *rule.among, *rule.per}
+    kept = {TRIAL, rule.along, *rule.among, *rule.at_all}
     pooled = math.prod(len(axis) for axis in pipeline.axes if axis.name not in kept)
     for each in required:
         least = math.ceil(least_draws(each, shares.met) / pooled)
         if least > rule.max_trials:
             lines.append(
-                f"{CHOOSE}.max_trials = {rule.max_trials}: expected at least {least:,}: fewer "
-                f"cannot show {each.text} with this confidence, even if all meet it")
+                f"{SEARCH}.max_trials = {rule.max_trials}: expected at least {least:,}: fewer "
+                f"cannot show {each.text} with {100 * CONFIDENCE:g} % confidence, even if all "
+                "meet it")
     return lines
 
 
@@ -93,6 +94,9 @@ def least_draws(requirement: Requirement, share: float) -> int:
 # a decision is made, and of alternatives do (Bonferroni).
 
 Decisions = NDArray[np.uint8]
+
+CONFIDENCE = 0.95
+"""Probability with which an answer meets the requirements."""
 
 
 def error_shares(
@@ -199,7 +203,7 @@ def walk(decision: Decisions, keeps: Masks) -> Walk:
 # --------------------------------------------------------------------------------------------------
 # The choice that meets requirements at all conditions: of a size, and among other settings.
 #
-# What a choice is stands in `sweep.experiment.sampling`, when one is answered in
+# What a choice is stands in `sweep.experiment.stopping`, when one is answered in
 # `sweep.analysis.choices`. Every alternative, a combination of the values of the axes ``among``,
 # has its own answer.
 
@@ -328,19 +332,19 @@ class ChoiceCells:
         return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
 
 
-def choice_shares(pipeline: Pipeline, rule: ChoiceRule, waves: int) -> ErrorShares:
+def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
     """Return the shares of the error probability that each decision of a search may spend."""
     def size(names: Sequence[str]) -> int:
         axes = [axis for name in names if (axis := pipeline.axis(name)) is not None]
         return math.prod(map(len, axes))
 
     return error_shares(
-        rule.confidence, waves=waves, alternatives=size(rule.among),
-        values=size([rule.along] if rule.along else []), conditions=size(rule.per),
+        CONFIDENCE, waves=len(rule.ends), alternatives=size(rule.among),
+        values=size([rule.along] if rule.along else []), conditions=size(rule.at_all),
         requirements=len(rule.requirements))
 
 
-def choice_cells(results: xr.Dataset, rule: ChoiceRule, shares: ErrorShares) -> ChoiceCells:
+def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> ChoiceCells:
     """Return the decisions of a dataset, of a whole store or of some of its alternatives.
 
     Raises
@@ -349,14 +353,14 @@ def choice_cells(results: xr.Dataset, rule: ChoiceRule, shares: ErrorShares) -> 
         As `sweep.analysis.check_requirements`.
     """
     required = parse_requirements(rule.requirements)
-    kept = [*rule.among, *([rule.along] if rule.along else []), *rule.per]
+    kept = [*rule.among, *([rule.along] if rule.along else []), *rule.at_all]
     table = decide(results, required, kept, shares=shares)
     table = table.transpose(*kept, "requirement", missing_dims="ignore")
     if rule.along:
         values = table[rule.along].to_numpy()
         order = np.argsort(values, kind="stable")
         table = table.isel({rule.along: order if rule.largest else order[::-1]})
-    conditions = math.prod(table.sizes[name] for name in rule.per)
+    conditions = math.prod(table.sizes[name] for name in rule.at_all)
     shape = (-1, table.sizes[rule.along] if rule.along else 1, conditions, len(required))
 
     def cells(name: str) -> NDArray[Any]:
@@ -377,7 +381,7 @@ def choice_cells(results: xr.Dataset, rule: ChoiceRule, shares: ErrorShares) -> 
     keeps = cells("keeps") | (each == Decision.not_applicable)
     return ChoiceCells(
         table, decision, np.asarray(keeps.all(-1)), each, excess,
-        hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.per)
+        hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.at_all)
 
 
 def answers(cells: ChoiceCells, along: str) -> list[Answer]:

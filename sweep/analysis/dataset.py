@@ -16,9 +16,8 @@ from sweep.analysis.poses import AXIS, DETECTION_INPUTS, REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.reader import StoppingRule
-from sweep.experiment.sampling import STOPPING_SECTIONS
 from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.experiment.toml_text import read_document
 from sweep.messages import shown
 from sweep.plugins.declared import recorded_plugins
@@ -104,7 +103,7 @@ def stopping_rule(results: xr.Dataset) -> StoppingRule | None:
     """Return the rule by which a dataset's sampling was stopped; None if it was not."""
     try:
         # To read a pipeline takes milliseconds.
-        if not any(name in pipeline_text(results) for name in STOPPING_SECTIONS):
+        if SEARCH not in pipeline_text(results):
             return None
         return stored_pipeline(results).stopping
     except (KeyError, SweepError):
@@ -268,14 +267,13 @@ def with_sampling(table: xr.Dataset, *datasets: xr.Dataset) -> xr.Dataset:
 def sampling_text(results: xr.Dataset) -> str:
     """Return the rule by which a dataset's sampling was stopped; empty if it was not.
 
-    That is ``stopped by [precision]: detection_rate = 0.02, max_trials = 2400``.
+    That is ``stopped by [search]: along = distance_m, max_trials = 240``.
     """
     if not is_sampling_stopped(results):
         return ""
-    document = read_document(pipeline_text(results))
-    name = next(each for each in STOPPING_SECTIONS if each in document)
-    keys = ", ".join(f"{key} = {shown(value)}" for key, value in document[name].items())
-    return f"stopped by [{name}]: {keys}"
+    table = read_document(pipeline_text(results))[SEARCH]
+    keys = ", ".join(f"{key} = {shown(value)}" for key, value in table.items())
+    return f"stopped by [{SEARCH}]: {keys}"
 
 
 # --------------------------------------------------------------------------------------------------

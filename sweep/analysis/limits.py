@@ -32,7 +32,6 @@ from sweep.analysis.requirements import (
     parse_requirements,
 )
 from sweep.errors import ArgumentError, DatasetError
-from sweep.experiment.sampling import LimitRule
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 
@@ -386,13 +385,13 @@ def requirement_limits(
     (20.0, 20.0, 40.0)
     """
     rule = stopping_rule(results)
-    rule = rule if isinstance(rule, LimitRule) else None
+    rule = rule if rule is not None and rule.kind == "along" else None
     require = [require] if isinstance(require, str) and require else require
     if not require or not along:
         if rule is None:
             raise ArgumentError("require" if not require else "along", along,
                                 "this store was not made by sweep limit, so that nothing says it")
-        require, along = require or rule.require, along or rule.along
+        require, along = require or rule.requirements, along or rule.along
     if rule is not None and along == rule.along:
         per = rule.per if per is None else per
         at_all = rule.at_all if at_all is None else at_all

@@ -28,7 +28,6 @@ from sweep.analysis.rates import LOOKED_FOR
 from sweep.analysis.requirements import Requirable, named, requirable_arrays, requirables
 from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
-from sweep.experiment.sampling import PrecisionRule
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 
@@ -239,9 +238,9 @@ def precision_reached(
     wanted
         Half-widths of intervals by the name of the quantity, such as ``{"detection_rate": 0.02}``:
         of rates as they are, of a bias relative to the root mean square error, of all else
-        relative to the value. By default those of the pipeline's [precision].
+        relative to the value. By default those of the pipeline's [search].
     per
-        Dimensions whose values are conditions; by default those of the pipeline's [precision].
+        Dimensions whose values are conditions; by default those of the pipeline's [search].
         Detector and estimator are always kept.
 
     Returns
@@ -276,14 +275,13 @@ def precision_reached(
     ['reached', 'not_reached', 'reached']
     """
     rule = stopping_rule(results)
-    rule = rule if isinstance(rule, PrecisionRule) else None
     if wanted is None:
-        if rule is None:
-            raise ArgumentError("wanted", None, "this store's pipeline has no [precision]; give "
-                                'half-widths, such as {"detection_rate": 0.02}')
-        wanted = dict(rule.wanted)
+        if rule is None or not rule.precision:
+            raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
+                                'give half-widths, such as {"detection_rate": 0.02}')
+        wanted = dict(rule.precision)
     if per is None:
-        per = rule.per if rule is not None else ()
+        per = rule.per if rule is not None and rule.precision else ()
     try:
         precisions = wanted_precisions(wanted)
     except ValueError as error:

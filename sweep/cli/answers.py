@@ -75,14 +75,14 @@ def require(options: argparse.Namespace) -> int:
     "pipelines/sizes/README.md", {
         "sweep size pipelines/sizes/smallest_marker.toml":
             "how large a marker must be, and by which condition the next smaller one fails",
-        "sweep size pipelines/sizes/smallest_marker.toml --set choose.max_trials=2000 "
+        "sweep size pipelines/sizes/smallest_marker.toml --set search.max_trials=2000 "
         "--store runs/quick.zarr --markdown":
             "with fewer trials of a condition at most; prints Markdown"},
     argument(
         "pipeline", metavar="PIPELINE",
-        help="TOML file with the sections [require] and [choose], or the store of a search"),
+        help="TOML file with the sections [require] and [search], or the store of a search"),
     settings_argument(
-        "replace a value of the file by this TOML value, such as choose.max_trials=2000"),
+        "replace a value of the file by this TOML value, such as search.max_trials=2000"),
     *new_store(), *LARGE_RUN, seconds(20, "time limit of the measurement of costs"), FORM)
 def size(options: argparse.Namespace) -> int:
     """Find the smallest or cheapest choice that will do."""
@@ -109,7 +109,7 @@ def size(options: argparse.Namespace) -> int:
     argument(
         "--require", action="append", metavar="REQUIREMENT",
         help="what must hold, in quotes: 'detection >= 0.9'; may be repeated, all hold together "
-        "(default: the section [limit], else [require], of the file)"),
+        "(default: the section [require] of the file)"),
     argument(
         "--along", default="", metavar="AXIS",
         help="the axis of the scene that is searched, such as distance_m"),
@@ -122,11 +122,7 @@ def size(options: argparse.Namespace) -> int:
         help="axes at all of whose values the requirements must hold"),
     argument(
         "--max-trials", type=int, metavar="N",
-        help="the most trials of a cell (default: that of [limit], else 2400)"),
-    argument(
-        "--coarse-trials", type=int, metavar="N",
-        help="trials of every cell in the coarse scan (default: as many as make 40 draws of a "
-        "value)"),
+        help="the most trials of a cell (default: that of [search], else 2400)"),
     *new_store("runs/NAME-limit-AXIS.zarr"), *LARGE_RUN, SCHEDULER,
     figure_argument("draw the limits"), FORM)
 def limit(options: argparse.Namespace) -> int:
@@ -138,10 +134,10 @@ def limit(options: argparse.Namespace) -> int:
         limits, summary = library.limit_search.search_limits(
             options.pipeline, require=options.require, along=options.along,
             per=names_of(options.per), at_all=names_of(options.at_all),
-            max_trials=options.max_trials, coarse_trials=options.coarse_trials,
-            settings=options.settings, store=options.store, begin=announce_compilation,
-            workers=options.workers, scheduler=options.scheduler, reuse=options.reuse,
-            overwrite=options.overwrite, yes=options.yes, progress=display, child=child)
+            max_trials=options.max_trials, settings=options.settings,
+            store=options.store, begin=announce_compilation, workers=options.workers,
+            scheduler=options.scheduler, reuse=options.reuse, overwrite=options.overwrite,
+            yes=options.yes, progress=display, child=child)
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if output is not None:

@@ -232,9 +232,9 @@ def precision_settings(precision: Sequence[str], max_trials: int | None) -> list
     Examples
     --------
     >>> precision_settings(["detection_rate = 2 %"], 2400)
-    ['precision.detection_rate="2 %"', 'precision.max_trials=2400']
+    ['search.precision={ detection_rate = "2 %" }', 'search.max_trials=2400']
     """
-    settings = []
+    widths = []
     for text in precision:
         name, equals, width = (part.strip() for part in text.partition("="))
         if not equals or not name.isidentifier() or not width:
@@ -244,9 +244,10 @@ def precision_settings(precision: Sequence[str], max_trials: int | None) -> list
                 "'detection_rate = 0.02'",
             )
         quoted = width if not width.endswith("%") else f'"{width}"'
-        settings.append(f"precision.{name}={quoted}")
+        widths.append(f"{name} = {quoted}")
+    settings = [f"search.precision={{ {', '.join(widths)} }}"] if widths else []
     if max_trials is not None:
-        settings.append(f"precision.max_trials={max_trials}")
+        settings.append(f"search.max_trials={max_trials}")
     return settings
 
 

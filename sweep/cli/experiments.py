@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
-    from sweep.experiment.reader import StoppingRule
+    from sweep.experiment.stopping import StoppingRule
     from sweep.integrity.reproduction import Reproduction
     from sweep.isolation.child_process import Child
 
@@ -263,9 +263,9 @@ def plan(options: argparse.Namespace) -> int:
 
 def _rule_lines(rule: StoppingRule) -> list[str]:
     """Return what a section by which sampling stops says."""
-    lines = [f"in waves until [{rule.section}] is fulfilled, at most {rule.max_trials:,}"]
-    if isinstance(rule, library.sampling.PrecisionRule):
-        lines += [f"{name} to {width:g}" for name, width in rule.wanted]
+    lines = [f"in waves until [search] is answered, at most {rule.max_trials:,}"]
+    if rule.precision:
+        lines += [f"{name} to {width:g}" for name, width in rule.precision]
         lines.append(f"at each {', '.join(rule.per)}" if rule.per else "of all poses together")
     return lines
 

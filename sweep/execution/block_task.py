@@ -24,9 +24,9 @@ from sweep.experiment.grid import Block, block_indices, scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.plugins import lacking_plugins
-from sweep.experiment.reader import StoppingRule
 from sweep.experiment.rules import file_digest
 from sweep.experiment.schema import Variable
+from sweep.experiment.stopping import StoppingRule
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.processor import processor

@@ -1,4 +1,4 @@
-"""A search for limits: a run under the section [limit], or a store that has the answer."""
+"""A search for limits: a run along an axis, or a store that has the answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import Summary
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import LIMIT, LimitRule, limit_settings, texts_in
+from sweep.experiment.sampling import search_settings, texts_in
+from sweep.experiment.stopping import SEARCH
 from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.model.image_file import read_regular
 from sweep.store.lifecycle import (
@@ -33,7 +34,7 @@ MAX_TRIALS = 2400
 def search_limits(
     source: Pipeline | str | os.PathLike[str], *, require: Sequence[str] = (), along: str = "",
     per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
-    max_trials: int | None = None, coarse_trials: int | None = None,
+    max_trials: int | None = None,
     settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
     begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
 ) -> tuple[xr.Dataset, Summary | None]:
@@ -44,7 +45,7 @@ def search_limits(
     source
         A pipeline, its file, or a store: one of a search is continued, and one of equally many
         trials everywhere is analysed as it is.
-    require, along, per, at_all, max_trials, coarse_trials, store
+    require, along, per, at_all, max_trials, store
         As `sweep.limit` has them.
     settings
         As ``--set`` takes them.
@@ -58,7 +59,7 @@ def search_limits(
     PipelineError, StoreError, RunError, ArgumentError
         As `sweep.limit`.
     """
-    chosen = limit_settings(require, along, per, at_all, coarse_trials, max_trials)
+    chosen = search_settings(require, along, per, at_all, max_trials)
     if not isinstance(source, Pipeline) and names_store(source):
         stored = open_store(os.fspath(source))
         if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
@@ -71,7 +72,7 @@ def search_limits(
             store = source
     pipeline = _with_search(source, settings, chosen)
     rule = pipeline.stopping
-    assert isinstance(rule, LimitRule)  # noqa: S101  (read from the section [limit])
+    assert rule is not None  # noqa: S101  (the section [search] has been read)
     begin(pipeline)
     if store is None:
         store = Path("runs") / f"{pipeline.name}-limit-{rule.along}.zarr"
@@ -83,23 +84,17 @@ def search_limits(
 def _with_search(
     source: Pipeline | str | os.PathLike[str], settings: Sequence[str], chosen: Sequence[str]
 ) -> Pipeline:
-    """Return a pipeline with the section [limit] of its document and of what is chosen.
-
-    What the section does not require, [require] does.
-    """
+    """Return a pipeline with the section [search] of its document and of what is chosen."""
     document = _document(source)
     if document is None and not isinstance(source, Pipeline):
         return read_pipeline(source, settings)  # it says why
     document = document or {}
-    own = document.get(LIMIT, {})
+    own = document.get(SEARCH, {})
     given = {*(own if isinstance(own, dict) else ()), *(
         each.partition("=")[0].partition(".")[2] for each in chosen)}
-    more = [] if "max_trials" in given else limit_settings(max_trials=MAX_TRIALS)
-    if "require" not in given:
-        if not (texts := texts_in(document)):
-            raise ArgumentError("require", "", "expected what must hold, such as "
-                                "'detection >= 0.9'")
-        more += limit_settings(texts)
+    more = [] if "max_trials" in given else search_settings(max_trials=MAX_TRIALS)
+    if "all" not in given and not texts_in(document):
+        raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
     if "along" not in given:
         raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
     settings = [*settings, *chosen, *more]

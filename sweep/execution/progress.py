@@ -23,8 +23,7 @@ from sweep.execution.limits import MAX_FAILED_BLOCKS
 from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.reader import StoppingRule
-from sweep.experiment.sampling import PrecisionRule, digest_of
+from sweep.experiment.stopping import StoppingRule, digest_of
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import duration, notice
 from sweep.sampling.rules import Decider, Decision, Stopping, Waves, condition_axes
@@ -569,7 +568,8 @@ def sampled_conditions(store: RunStore, needed: Mapping[int, int]) -> SampledCon
 
 def _reached(store: RunStore, index: Mapping[str, int]) -> str:
     """Return what was reached at a condition, of the quantity that is farthest from its wish."""
-    if not isinstance(store.pipeline.stopping, PrecisionRule):
+    rule = store.pipeline.stopping
+    if rule is None or not rule.precision:
         return ""
     from sweep.analysis.precision import (  # noqa: PLC0415  (SciPy: only where conditions are told)
         Reached,

@@ -49,6 +49,7 @@ from sweep.experiment.facts import notes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import MAX_TRIALS
+from sweep.experiment.stopping import SEARCH
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.isolation.machine import default_workers
@@ -97,26 +98,28 @@ def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
     r"""Return a pipeline's text with the section by which sampling stops from another pipeline.
 
     >>> begun, ours = (Pipeline.from_text(
-    ...     "[pose]\nside_px = 20\njitter_px = 1\n[precision]\n"
-    ...     f"max_trials = 90\ndetection_rate = {width}") for width in (0.1, 0.05))
+    ...     "[pose]\nside_px = 20\njitter_px = 1\n[search]\n"
+    ...     f"max_trials = 90\nprecision = {{ detection_rate = {width} }}")
+    ...     for width in (0.1, 0.05))
     >>> print(tightened_text(begun, ours), end="")
     [pose]
     side_px = 20
     jitter_px = 1
-    [precision]
-    detection_rate = 0.05
+    [search]
     max_trials = 90
+    precision = {detection_rate = 0.05}
     """
     if ours.stopping is None:
         raise TypeError(ours.stopping)
-    section = ours.stopping.section
-    wanted = dict(tomllib.loads(ours.text)[section]) | {MAX_TRIALS: ours.stopping.max_trials}
+    wanted = dict(tomllib.loads(ours.text)[SEARCH]) | {MAX_TRIALS: ours.stopping.max_trials}
     document = tomlkit.parse(begun.text)
-    table = document[section]
+    table = document[SEARCH]
     for key in list(table):  # in its place, whatever it looks like
         del table[key]
     for key in sorted(wanted):
-        table[key] = wanted[key]
+        table[key] = tomlkit.inline_table() if isinstance(wanted[key], dict) else wanted[key]
+        if isinstance(wanted[key], dict):
+            table[key].update(wanted[key])
     return tomlkit.dumps(document)
 
 

@@ -15,7 +15,6 @@ from sweep.evaluation.block import bound_notes
 from sweep.execution.progress import InWaves, condition_count, sampled_conditions
 from sweep.experiment.axes import Axis
 from sweep.experiment.parameters import Stage
-from sweep.experiment.sampling import PrecisionRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus, looked_for
 from sweep.processor import differing_processors
 from sweep.sampling.rules import make_rule
@@ -336,7 +335,7 @@ def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
     A search says itself what it does not know.
     """
     count, rule = sampled.get("unsettled"), store.pipeline.stopping
-    if not count or not isinstance(rule, PrecisionRule):
+    if not count or rule is None or not rule.precision:
         return []
     of = f"{count:,} of {sampled['conditions']:,}"
     lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]

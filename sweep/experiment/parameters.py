@@ -71,8 +71,11 @@ PARAMETERS: dict[str, Parameter] = _gather()
 REMOVED = {
     "environment": "to compare versions of OpenCV, run `sweep run` in each virtual environment, "
     "then `sweep compare A.zarr B.zarr`",
+    "limit": "write [search] along = AXIS, and [require] all",
+    "choose": "write [search] smallest = AXIS, largest = AXIS or cheapest = true",
+    "precision": "write [search] precision = { detection_rate = 0.02 }",
 }
-"""Parameters of earlier versions -> what to do instead."""
+"""Parameters and sections of earlier versions -> what to do instead."""
 
 
 # --------------------------------------------------------------------------------------------------

@@ -27,7 +27,6 @@ from sweep.experiment.reader import (
     HEADER,
     REQUIRE,
     Reading,
-    StoppingRule,
     read_keys,
     removed,
     section_of,
@@ -36,10 +35,10 @@ from sweep.experiment.rules import check_rules
 from sweep.experiment.sampling import (
     MAX_TRIALS,
     REQUIRE_KEYS,
-    STOPPING_SECTIONS,
     read_required,
     read_stopping,
 )
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.experiment.toml_text import (
     MAX_BYTES,
     document_text,
@@ -96,12 +95,12 @@ def parse_settings(
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
         home = section_of(name, parameters)
-        if (section == REQUIRE and name in REQUIRE_KEYS) or section in STOPPING_SECTIONS:
+        if (section == REQUIRE and name in REQUIRE_KEYS) or section == SEARCH:
             chosen[f"{section}.{name}"] = value
         elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-            faults.append(f"{start}unknown parameter{removed(name) or hint}")
+            faults.append(f"{start}unknown parameter{removed(section) or removed(name) or hint}")
         elif is_zip(value) and section in ("", "axes"):
             chosen[name] = value
         elif home and section not in ("", home, "axes"):
@@ -220,7 +219,7 @@ class Pipeline(Grid):
         What is required of the results, as texts, and the axes whose values are conditions: the
         section [require]. No part of an experiment's identity.
     stopping
-        When sampling stops, as a section such as [precision] says; None if every trial is computed.
+        When sampling stops, as [search] says; None if every trial is computed.
     budget_ms
         The most milliseconds of a frame, if [require] has a budget.
     source
@@ -422,7 +421,7 @@ class Pipeline(Grid):
             One line for each fault, beginning with ``source``.
         """
         document = _document(self.text, source)
-        for section in (REQUIRE, *STOPPING_SECTIONS):  # one pose fulfils or fails nothing
+        for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
             document.pop(section, None)
         axes = document.get("axes", {})
         for name in [name for name, value in axes.items() if name == TRIAL or is_zip(value)]:
@@ -476,7 +475,7 @@ def _checked(
 
     ``text`` is its text without the ``chosen`` values, which the document has.
     """
-    read_keys(reading, STOPPING_SECTIONS)
+    read_keys(reading)
     read_stopping(reading)
     read_camera_file(reading)
     resolve_sensor(reading)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 from sweep.declaration import Declaration, Declared, TablesError
 from sweep.experiment.axes import (
@@ -28,6 +28,7 @@ from sweep.experiment.parameters import (
     places,
 )
 from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, read_plugins, section_of_settings
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -41,35 +42,6 @@ HEADER = ("title", "seed", "sampling", EFFECTS_KEY)
 
 REQUIRE = "require"
 """The section of what the results must fulfil (`sweep.experiment.sampling`)."""
-
-
-class StoppingRule(Protocol):
-    """What a section says: a frozen dataclass of plain values.
-
-    Attributes
-    ----------
-    section
-        The section's name.
-    max_trials
-        The most trials of a condition; the length of the axis ``trial``.
-    """
-
-    section: ClassVar[str]
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    def __hash__(self) -> int:
-        """Return the hash of a frozen dataclass."""
-
-    @property
-    def max_trials(self) -> int:
-        """The most trials of a condition."""
-
-    def looser(self, begun: Any) -> str:
-        """Return why a store that was begun under another rule of the section cannot be continued.
-
-        Empty if this rule asks for at least as much of every condition, so that nothing that was
-        computed is in vain.
-        """
 
 
 @dataclass(slots=True)
@@ -214,15 +186,15 @@ def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> s
     return parameters[name].section if name in parameters else ""
 
 
-def read_keys(reading: Reading, others: Collection[str] = ()) -> None:
+def read_keys(reading: Reading) -> None:
     """Read the keys of a document, each checked on its own.
 
-    ``others`` are the names of sections that are read elsewhere.
+    The sections of requirements and of a search are read elsewhere.
     """
     _read_header(reading)
-    known = [*HEADER, *SECTIONS, "axes", REQUIRE, *others]
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
     for key, value in reading.document.items():
-        if key in HEADER or key == REQUIRE or key in others:
+        if key in (*HEADER, REQUIRE, SEARCH):
             continue
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):

@@ -26,8 +26,8 @@ from sweep.experiment.parameters import (
 )
 from sweep.experiment.photographs import PhotographRecord, read_record
 from sweep.experiment.reader import HEADER, Reading
-from sweep.experiment.sampling import STOPPING_SECTIONS
 from sweep.experiment.schema import LABELS, VARIABLES
+from sweep.experiment.stopping import SEARCH
 from sweep.measure.detectors import OPENCV, DetectorSetting
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import plain, shown
@@ -124,9 +124,8 @@ def photographs_alone(reading: Reading) -> None:
         "believed", "truth, for photographs", lambda name: name == "calibration")
     if reading.sampling != SAMPLINGS[0]:
         reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
-    for name in STOPPING_SECTIONS:
-        if name in reading.document:
-            reading.fault(name, reading.document[name], "no such section: photographs are given")
+    if SEARCH in reading.document:
+        reading.fault(SEARCH, reading.document[SEARCH], "no such section: photographs are given")
     if reading.known_files is not None:
         reading.files.update(reading.known_files)
         return

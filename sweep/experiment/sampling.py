@@ -1,31 +1,20 @@
-"""The sections that control sampling: [require], [precision], [limit], [choose]."""
+"""The sections that control sampling: what is required of results, and what is searched."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
-from typing import Any, ClassVar
+from typing import Any
 
-from sweep.experiment.axes import MAX_VALUES, TRIAL, parse_trial
+from sweep.experiment.axes import TRIAL, Axis, parse_trial
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.parameters import Stage
-from sweep.experiment.reader import REQUIRE, Reading, StoppingRule
-from sweep.experiment.section_keys import (
-    axis_at,
-    conditions,
-    difference,
-    number,
-    ordered_axis,
-    scene_axes,
-    texts,
-    unknown_keys,
-)
+from sweep.experiment.reader import REQUIRE, Reading
+from sweep.experiment.stopping import CHOICES, KINDS, SEARCH, StoppingRule
 from sweep.messages import shown
 
 # --------------------------------------------------------------------------------------------------
@@ -90,229 +79,95 @@ def read_requirement(text: object) -> RequirementText:
 
 
 # --------------------------------------------------------------------------------------------------
-# Numbers of trials at which waves end: after each, it is decided what else is needed.
+# Keys of the sections: lists of texts, names of axes of the scene.
 
-GROWTH = 4
-"""A wave has about one trial for so many of those before it, at least one unit."""
-
-
-def wave_ends(max_trials: int, unit: int) -> tuple[int, ...]:
-    """Return the numbers of trials at which waves end: multiples of a unit, and ``max_trials``.
-
-    Examples
-    --------
-    >>> wave_ends(600, 50)
-    (50, 100, 150, 200, 250, 350, 450, 600)
-    >>> wave_ends(30, 50), wave_ends(120, 50)
-    ((30,), (50, 100, 120))
-    """
-    ends: list[int] = []
-    end = unit
-    while end < max_trials:
-        ends.append(end)
-        end += unit * max(1, math.ceil(end / unit / GROWTH))
-    return (*ends, max_trials)
+def unknown_keys(
+    reading: Reading, section: str, table: Mapping[str, Any], known: Sequence[str]
+) -> None:
+    """Note the keys that a section does not have."""
+    for key in table:
+        if key not in known:
+            reading.unknown_key(section, str(key), known, f"; expected {', '.join(known)}")
 
 
-# --------------------------------------------------------------------------------------------------
-# The section [precision]: how well each quantity is to be known at each condition.
-#
-# Names of quantities are known to the analysis alone; the rule that samples
-# (`sweep.sampling.precision`) checks them.
-
-_PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
-
-OWN = ("per", "max_trials")
-"""Keys of the section that are no quantities."""
-
-
-@dataclass(frozen=True, slots=True)
-class PrecisionRule:
-    """Trials come in waves until intervals are as narrow as is wanted.
-
-    Attributes
-    ----------
-    wanted
-        Name of each quantity, and the half-width of its interval: of a rate as it is, else
-        relative to the value.
-    per
-        The scene axes of which every combination of values is a condition; the others are pooled.
-    max_trials
-        The most trials of a condition; the length of the axis ``trial``.
-    """
-
-    wanted: tuple[tuple[str, float], ...]
-    per: tuple[str, ...]
-    max_trials: int
-    section: ClassVar[str] = "precision"
-
-    def looser(self, begun: PrecisionRule) -> str:
-        """Return why a store begun under another precision is not continued; empty if it is."""
-        if problem := difference(self.section, self, begun, ("max_trials", "per")):
-            return problem
-        ours = dict(self.wanted)
-        for name, width in begun.wanted:
-            if ours.get(name, float("inf")) > width:
-                own = f"{ours[name]:g}" if name in ours else "none"
-                return f"precision.{name}: the store has {width:g}, this run {own}, which is looser"
-        return ""
-
-
-def read_precision(reading: Reading, table: Mapping[str, Any]) -> PrecisionRule | None:
-    """Return what a table [precision] says; None if it has faults, which are noted."""
-    known = len(reading.faults)
-    for name in table.keys() & reading.parameters.keys():
-        reading.unknown_key("precision", name, OWN)
-    wanted = tuple(sorted(
-        (str(name), width) for name, value in table.items()
-        if name not in OWN and name not in reading.parameters
-        and (width := _half_width(reading, str(name), value)) is not None
-    ))
-    if not wanted and len(reading.faults) == known:
-        reading.fault(
-            "precision", dict(table),
-            "how well a quantity is to be known, such as detection_rate = 0.02",
-        )
-    per = conditions(reading, "precision", table, "per") if "per" in table else tuple(
-        axis.name for axis in scene_axes(reading))
-    if TRIAL not in reading.axes:
-        return None  # a fault that is noted
-    return PrecisionRule(wanted, per, len(reading.axes[TRIAL]))
-
-
-def _half_width(reading: Reading, name: str, value: Any) -> float | None:
-    """Return the half-width that a value says, or note why it is none."""
-    percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
-    number = float(percent[1]) / 100 if percent else value
-    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0 < number < 1:
-        reading.fault(
-            f"precision.{name}", value,
-            'the half-width of an interval, such as 0.02 or "5 %", above 0 and below 1',
-        )
-        return None
-    return float(number)
-
-
-# --------------------------------------------------------------------------------------------------
-# The section [limit]: how far along an axis requirements are met.
-#
-# What a requirement may be of is known to the analysis alone; the rule that samples
-# (`sweep.sampling.searches`) checks the names.
-
-LIMIT = "limit"
-
-COARSE_DRAWS = 40
-"""Draws of a value in the coarse scan, about: all pooled cells together."""
-
-LIMIT_KEYS = ("require", "along", "per", "at_all", "coarse_trials", "max_trials")
-"""The keys of the section."""
-
-
-@dataclass(frozen=True, slots=True)
-class LimitRule:
-    """Trials come in waves where they decide how far requirements are met.
-
-    Attributes
-    ----------
-    require
-        The requirements, as texts.
-    along
-        The scene axis that is searched.
-    per
-        The scene axes of which every combination of values has a limit of its own.
-    at_all
-        The scene axes at all of whose values the requirements must hold. The others are pooled.
-    coarse_trials
-        Trials of every cell in the first wave.
-    max_trials
-        The most trials of a cell; the length of the axis ``trial``.
-    """
-
-    require: tuple[str, ...]
-    along: str
-    per: tuple[str, ...]
-    at_all: tuple[str, ...]
-    coarse_trials: int
-    max_trials: int
-    section: ClassVar[str] = LIMIT
-
-    @property
-    def ends(self) -> tuple[int, ...]:
-        """Numbers of trials at which waves end, and decisions are made."""
-        return wave_ends(self.max_trials, self.coarse_trials)
-
-    def looser(self, begun: LimitRule) -> str:
-        """Return why a store begun under another search is not continued; empty if it is."""
-        return difference(LIMIT, self, begun, LIMIT_KEYS)
-
-
-def read_limit(reading: Reading, table: Mapping[str, Any]) -> LimitRule | None:
-    """Return what a table [limit] says; None if it has faults, which are noted."""
-    known = len(reading.faults)
-    unknown_keys(reading, LIMIT, table, LIMIT_KEYS)
-    require = _requirements(reading, table)
-    along = ordered_axis(reading, f"{LIMIT}.along", table.get("along", ""))
-    at_all = conditions(reading, LIMIT, table, "at_all", along)
-    axes = {axis.name: len(axis) for axis in scene_axes(reading) if axis.name != along}
-    per = conditions(reading, LIMIT, table, "per", along) if "per" in table else tuple(
-        name for name in axes if name not in at_all)
-    for name in sorted({*per} & {*at_all}):
-        reading.fault(f"{LIMIT}.at_all", name, f"{name} in per or in at_all, not in both")
-    pooled = math.prod(length for name, length in axes.items() if name not in (*per, *at_all))
-    usual = max(2, math.ceil(COARSE_DRAWS / pooled))
-    coarse = number(reading, LIMIT, table, "coarse_trials", usual, 2, MAX_VALUES)
-    if TRIAL in reading.axes and "coarse_trials" in table and 1 < len(reading.axes[TRIAL]) < coarse:
-        reading.fault(f"{LIMIT}.coarse_trials", coarse,
-                      f"at most max_trials, {len(reading.axes[TRIAL]):,}")
-    if TRIAL not in reading.axes or len(reading.faults) > known:
-        return None
-    count = len(reading.axes[TRIAL])
-    return LimitRule(require, along, per, at_all, min(coarse, count), count)
-
-
-def _requirements(reading: Reading, table: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the texts of what is required, noting what has not the form of such."""
-    required = texts(reading, LIMIT, table, "require", '["detection >= 0.9"]', needed=True)
-    for text in required:
-        try:
-            parts = read_requirement(text)
-        except ValueError as error:
-            reading.faults.append(f"{reading.source}: {LIMIT}.require = {shown(text)}: {error}")
-            continue
-        if parts.name == "budget_ms":
-            reading.faults.append(
-                f"{reading.source}: {LIMIT}.require = {shown(text)}: the cost is that of a "
-                "configuration, wherever the marker is; ask sweep size or sweep tradeoff for it")
-    return tuple(required)
-
-
-def limit_settings(
-    require: Sequence[str] = (), along: str = "", per: Sequence[str] | None = None,
-    at_all: Sequence[str] | None = None, coarse_trials: int | None = None,
-    max_trials: int | None = None,
+def texts(
+    reading: Reading, section: str, table: Mapping[str, Any], key: str, example: str,
+    *, needed: bool = False,
 ) -> list[str]:
-    """Return what is given as settings of the section, as ``--set`` takes them.
+    """Return a key's list of texts, which is not empty if it is ``needed``, or note a fault."""
+    value = table.get(key, [])
+    if isinstance(value, list) and all(isinstance(text, str) for text in value) and (
+            value or not needed):
+        return [str(text) for text in value]
+    reading.fault(f"{section}.{key}", value, f"a list of texts, such as {example}")
+    return []
 
-    >>> limit_settings(["detection >= 0.9"], "distance_m", max_trials=600)
-    ['limit.require=["detection >= 0.9"]', 'limit.along="distance_m"', 'limit.max_trials=600']
+
+def scene_axes(reading: Reading) -> list[Axis]:
+    """Return the axes of the scene without ``trial``: those whose values can be conditions."""
+    return [axis for axis in reading.axes.values()
+            if axis.stage is Stage.scene and axis.name != TRIAL]
+
+
+def axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> Axis | None:
+    """Return an axis, of the scene or any but ``trial``, by name, or note why there is none."""
+    axis, together = reading.axes.get(name), reading.axis_of(name)
+    if name == TRIAL:
+        problem = "trials are what is counted"
+    elif axis is not None and scene and axis.stage is not Stage.scene:
+        problem = "each configuration has its own answer"
+    elif axis is not None:
+        return axis
+    elif together is not None:
+        problem = f"it goes with others along the axis {together.name}"
+    elif name in reading.distributions:
+        problem = f"it is drawn for each trial: give {name} values under [axes]"
+    elif reading.names_axis(name):
+        return None  # its own fault says why it is none
+    elif name in reading.parameters:
+        problem = f"it has one value: list the values of {name} under [axes]"
+    else:
+        known = scene_axes(reading) if scene else reading.axes.values()
+        reading.unknown(path, f"{name}: no such axis", name, [axis.name for axis in known])
+        return None
+    where = "of the scene" if scene else "of the grid"
+    reading.unknown(path, f"{name}: {problem}; expected an axis {where}", name, ())
+    return None
+
+
+def ordered_axis(reading: Reading, path: str, name: Any) -> str:
+    """Return the name of a scene axis of several numbers; "" with a fault noted if it is none."""
+    if not isinstance(name, str) or not name:
+        reading.fault(path, name, "the axis that is searched, such as distance_m")
+        return ""
+    if (axis := axis_at(reading, path, name)) is None:
+        return ""
+    if axis.labelled or isinstance(axis.values[0], bool):
+        reading.fault(path, name, f"an axis of numbers; {name} has no order")
+    elif len(axis) < 2:
+        reading.fault(path, name, f"an axis of several values, from easy to hard; {name} has one")
+    else:
+        return name
+    return ""
+
+
+def conditions(
+    reading: Reading, table: Mapping[str, Any], along: str
+) -> tuple[str, ...]:
+    """Return the scene axes that ``per`` lists, in the grid's order; the others' faults are noted.
+
+    All but the axis ``along`` by default. A fixed parameter is a condition of one value.
     """
-    given = {
-        "require": _listed(require) or None, "along": along or None,
-        "per": None if per is None else _listed(per),
-        "at_all": None if at_all is None else _listed(at_all),
-        "coarse_trials": coarse_trials, "max_trials": max_trials,
-    }
-    return [f"{LIMIT}.{key}={json.dumps(value, ensure_ascii=False, default=_whole)}"
-            for key, value in given.items() if value is not None]
-
-
-def _listed(texts: Sequence[str]) -> list[str]:
-    return [texts] if isinstance(texts, str) else list(texts)
-
-
-def _whole(value: Any) -> int | str:
-    """Return a whole number of NumPy's; of anything else its text, which is refused as such."""
-    return operator.index(value) if hasattr(value, "__index__") else str(value)
+    path, axes = f"{SEARCH}.per", [axis.name for axis in scene_axes(reading)]
+    if "per" not in table:
+        return tuple(name for name in axes if name != along)
+    names = dict.fromkeys(texts(reading, SEARCH, table, "per", '["distance_m"]'))
+    for name in names:
+        if along and name == along:
+            reading.fault(path, name, f"other axes than {along}, which is searched along")
+        elif name not in reading.fixed or reading.parameters[name].stage is not Stage.scene:
+            axis_at(reading, path, name)
+    return tuple(name for name in axes if name in names and name != along)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -356,9 +211,10 @@ def _read_budget(reading: Reading, given: RequirementText) -> None:
     """Note the budget, if a requirement is one; ValueError says what is wrong with it."""
     if given.name != BUDGET:
         return
-    if "choose" not in reading.document:
-        raise ValueError("is the time of a choice: give [choose], or use `sweep tradeoff "
-                         "--budget-ms`")
+    search = reading.document.get(SEARCH)
+    if not isinstance(search, dict) or not any(key in search for key in CHOICES):
+        raise ValueError("is the time of a choice: give [search] smallest, largest or cheapest, "
+                         "or use `sweep tradeoff --budget-ms`")
     if given.relation not in ("<=", "<") or given.limit <= 0.0 or given.unit:
         raise ValueError(f"expected milliseconds of a frame: {BUDGET} <= 2")
     if reading.budget_ms is not None:
@@ -408,84 +264,163 @@ def texts_in(document: Mapping[str, Any]) -> list[str]:
 
 
 # --------------------------------------------------------------------------------------------------
-# The section [choose]: what is chosen so that the section [require] is met at all conditions.
+# The section [search]: trials come in waves until it is known
 #
-# [require] has what must hold at each condition, such as "detection >= 0.99" and a budget_ms;
-# [choose] has `smallest` or `largest` with an axis, or neither for the cheapest, `among` with
-# further choices, `max_trials` and `confidence`.
+# - how far `along` an axis the section [require] is met, for each combination of `per`,
+# - the `smallest` or `largest` value of an axis, or the `cheapest` configuration, that meets it at
+#   all conditions, `among` further choices, or
+# - a `precision`: the half-width of the intervals of quantities, at each combination of `per`.
+#
+# Conditions at all of which requirements must hold are [require] per. Names of quantities are known
+# to the analysis alone; the rules that sample (`sweep.sampling.searches`) check them.
 
-CHOOSE = "choose"
-WISHES = ("smallest", "largest")
-CHOOSE_KEYS = (*WISHES, "among", "max_trials", "confidence")
+MAX_TRIALS = "max_trials"
+"""The key with the most trials, the length of the axis ``trial``."""
 
-CONFIDENCE = 0.95
-"""Confidence if none is given."""
+SEARCH_KEYS = (*KINDS, "per", "among", MAX_TRIALS)
 
+MIN_TRIALS = 2
+"""The fewest that make an interval."""
 
-@dataclass(frozen=True, slots=True)
-class ChoiceRule:
-    """Trials come in waves until the choice is known.
+NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
+"""What is expected where nothing says how many trials there are at most."""
 
-    Attributes
-    ----------
-    along
-        The axis whose smallest or largest value is sought; empty if the cheapest choice is.
-    largest
-        Whether the largest is.
-    among
-        The axes of which every combination of values, an alternative, is a choice of its own.
-    requirements
-        What must hold, as texts; without a budget, which no trial decides.
-    per
-        The scene axes of which every combination of values is a condition; others are pooled.
-    max_trials
-        The most trials of a condition; the length of the axis ``trial``.
-    confidence
-        Probability with which an answer meets the requirements.
-    """
+FIRST_DRAWS = 50
+"""Draws of a condition in the first wave, about: all pooled cells together."""
 
-    along: str
-    largest: bool
-    among: tuple[str, ...]
-    requirements: tuple[str, ...]
-    per: tuple[str, ...]
-    max_trials: int
-    confidence: float
-    section: ClassVar[str] = CHOOSE
+COARSE_DRAWS = 40
+"""The same of a value of the axis along which a limit is searched."""
 
-    def looser(self, begun: ChoiceRule) -> str:
-        """Return why a store begun for another choice is not continued; empty if it is."""
-        return difference(CHOOSE, self, begun)
+_PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
-def read_choice(reading: Reading, table: Mapping[str, Any]) -> ChoiceRule | None:
-    """Return what a table [choose] says; None if it has faults, which are noted."""
+def read_stopping(reading: Reading) -> None:
+    """Read the section, if there is one, and make the axis ``trial``; the axes have been read."""
+    table = reading.document.get(SEARCH)
+    if table is None:
+        return
+    if not isinstance(table, dict):
+        reading.fault(SEARCH, table, f"a table: [{SEARCH}]")
+        return
+    _read_trials(reading, table)
+    if reading.sampling != SAMPLINGS[0]:
+        reading.fault(
+            "sampling", reading.sampling,
+            f"{SAMPLINGS[0]} beside [{SEARCH}]: points that are spread evenly over all trials say "
+            "nothing of the first ones",
+        )
+    if TRIAL in reading.axes and len(reading.axes[TRIAL]) < MIN_TRIALS:
+        reading.fault(f"{SEARCH}.{MAX_TRIALS}", len(reading.axes[TRIAL]),
+                      f"at least {MIN_TRIALS}: intervals are over the draws")
+    reading.stopping = _read_search(reading, table)
+
+
+def _read_trials(reading: Reading, table: Mapping[str, Any]) -> None:
+    """Make the axis of trials from ``max_trials``, or take the one that is given."""
+    given = reading.axes.get(TRIAL)
+    if MAX_TRIALS not in table:
+        if given is None and not reading.names_axis(TRIAL):
+            reading.fault(SEARCH, dict(table), NO_TRIALS)
+        return
+    try:
+        axis = parse_trial(table[MAX_TRIALS])
+    except ValueError as error:
+        reading.fault(f"{SEARCH}.{MAX_TRIALS}", table[MAX_TRIALS], str(error))
+        return
+    if given is None:
+        reading.axes[TRIAL] = axis
+    elif len(given) != len(axis):
+        reading.fault(
+            f"{SEARCH}.{MAX_TRIALS}", table[MAX_TRIALS],
+            f"{len(given)}, which axes.trial has, or axes.trial to be left out",
+        )
+
+
+def _read_search(reading: Reading, table: Mapping[str, Any]) -> StoppingRule | None:
+    """Return what is searched; None if the section has faults, which are noted."""
     known = len(reading.faults)
-    unknown_keys(reading, CHOOSE, table, CHOOSE_KEYS)
-    wishes = [key for key in WISHES if key in table]
-    if len(wishes) > 1:
-        reading.fault(f"{CHOOSE}.largest", table["largest"], "smallest or largest, not both")
-    along = "" if len(wishes) != 1 else ordered_axis(
-        reading, f"{CHOOSE}.{wishes[0]}", table[wishes[0]])
-    among = _among(reading, table, along)
-    if not wishes and math.prod(len(reading.axes[name]) for name in among) < 2:
-        reading.fault(CHOOSE, dict(table), (
-            'something to choose: smallest = "size_m", with its values under [axes], or '
-            'among = ["solver"], of which the cheapest is chosen'))
-    confidence = number(reading, CHOOSE, table, "confidence", CONFIDENCE, 0.5, 0.9999)
-    chosen = {*among, *([along] if along else [])}
-    requirements, per = _required(reading, chosen)
+    unknown_keys(reading, SEARCH, table, SEARCH_KEYS)
+    kinds = [kind for kind in KINDS if kind in table]
+    if len(kinds) != 1:
+        found = f", not {' and '.join(kinds)}" if kinds else ""
+        reading.fault(SEARCH, dict(table), f"one of {', '.join(KINDS)}{found}")
+        return None
+    kind, = kinds
+    precision = _precision(reading, table["precision"]) if kind == "precision" else ()
+    along = ordered_axis(reading, f"{SEARCH}.{kind}", table[kind]) if kind in (
+        "along", "smallest", "largest") else ""
+    axes = {axis.name: len(axis) for axis in scene_axes(reading)}
+    if kind == "cheapest" and table[kind] is not True:
+        reading.fault(f"{SEARCH}.{kind}", table[kind], "true")
+    if kind in CHOICES:
+        among = _among(reading, table, along)
+        if not along and math.prod(len(reading.axes[name]) for name in among) < 2:
+            reading.fault(SEARCH, dict(table), (
+                'something to choose: smallest = "size_m", with its values under [axes], or '
+                'among = ["solver"], of which the cheapest is chosen'))
+        if "per" in table:
+            reading.fault(f"{SEARCH}.per", table["per"],
+                          f"conditions under [{REQUIRE}] per, where something is chosen")
+        per: tuple[str, ...] = ()
+    else:
+        among = ()
+        if "among" in table:
+            reading.fault(f"{SEARCH}.among", table["among"],
+                          f"it beside {', '.join(CHOICES)} alone")
+        per = conditions(reading, table, along)
+    requirements: tuple[str, ...] = ()
+    at_all: tuple[str, ...] = ()
+    if kind != "precision":
+        requirements, wanted = _required(reading, {*among, along} if kind in CHOICES else set())
+        if kind in CHOICES:
+            at_all = tuple(name for name in axes if name not in (*among, along) and (
+                wanted is None or name in wanted))
+        else:
+            given = per if "per" in table else ()
+            at_all = tuple(name for name in axes if name in (wanted or ())
+                           and name not in (*given, along))
+            per = tuple(name for name in per if name not in at_all)
     if len(reading.faults) > known or TRIAL not in reading.axes:
         return None
-    return ChoiceRule(
-        along, "largest" in table, among, requirements, per,
-        len(reading.axes[TRIAL]), confidence)
+    pooled = math.prod(length for name, length in axes.items()
+                       if name not in (*per, *at_all, *among, along))
+    trials = len(reading.axes[TRIAL])
+    draws = COARSE_DRAWS if kind == "along" else FIRST_DRAWS
+    return StoppingRule(kind, trials, min(max(2, math.ceil(draws / pooled)), trials), along, among,
+                        per, at_all, requirements, precision)
+
+
+def _precision(reading: Reading, value: Any) -> tuple[tuple[str, float], ...]:
+    """Return the half-widths of quantities, or note why they are none."""
+    path = f"{SEARCH}.precision"
+    if not isinstance(value, dict) or not value:
+        reading.fault(path, value,
+                      "how well quantities are to be known, such as { detection_rate = 0.02 }")
+        return ()
+    for name in value.keys() & reading.parameters.keys():
+        reading.unknown_key(path, name, ())
+    return tuple(sorted(
+        (str(name), width) for name, written in value.items() if name not in reading.parameters
+        and (width := _half_width(reading, f"{path}.{name}", written)) is not None))
+
+
+def _half_width(reading: Reading, path: str, value: Any) -> float | None:
+    """Return the half-width that a value says, or note why it is none."""
+    percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
+    number = float(percent[1]) / 100 if percent else value
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0 < number < 1:
+        reading.fault(
+            path, value,
+            'the half-width of an interval, such as 0.02 or "5 %", above 0 and below 1',
+        )
+        return None
+    return float(number)
 
 
 def _among(reading: Reading, table: Mapping[str, Any], along: str) -> tuple[str, ...]:
     """Return the axes of alternatives, those of configurations among them, in the grid's order."""
-    path = f"{CHOOSE}.among"
-    names = texts(reading, CHOOSE, table, "among", '["dictionary", "solver"]')
+    path = f"{SEARCH}.among"
+    names = texts(reading, SEARCH, table, "among", '["dictionary", "solver"]')
     if along and along in names:
         reading.fault(path, names, f"{along} once: it is sought along already")
     chosen = {axis.name for name in names
@@ -494,117 +429,48 @@ def _among(reading: Reading, table: Mapping[str, Any], along: str) -> tuple[str,
         axis.name in chosen or axis.stage is not Stage.scene))
 
 
-def _required(reading: Reading, chosen: set[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the requirements and the conditions; faults of the section are noted elsewhere."""
+def _required(
+    reading: Reading, chosen: set[str]
+) -> tuple[tuple[str, ...], list[str] | None]:
+    """Return the requirements and the conditions (None without); others note their faults."""
     table = reading.document.get(REQUIRE)
     table = table if isinstance(table, dict) else {}
     required, per = texts_in(reading.document), table.get("per")
     if not required:
         reading.faults.append(
-            f"{reading.source}: {CHOOSE}: expected what must be met: [{REQUIRE}] "
+            f"{reading.source}: {SEARCH}: expected what must be met: [{REQUIRE}] "
             'all = ["detection >= 0.99"]')
-    axes = [axis.name for axis in scene_axes(reading)]
     if not isinstance(per, list):
-        return tuple(required), tuple(name for name in axes if name not in chosen)
-    for name in chosen.intersection(each for each in per if isinstance(each, str)):
-        reading.fault(f"{REQUIRE}.per", per, f"conditions; {name} is what [{CHOOSE}] chooses")
-    return tuple(required), tuple(name for name in axes if name in per)
+        return tuple(required), None
+    names = [name for name in per if isinstance(name, str)]
+    for name in chosen.intersection(names):
+        reading.fault(f"{REQUIRE}.per", per, f"conditions; {name} is what [{SEARCH}] chooses")
+    return tuple(required), names
 
 
-# --------------------------------------------------------------------------------------------------
-# When sampling stops: the sections of a pipeline by which trials come in waves until all is
-# known.
-#
-# At most one of them stands in a pipeline. None is part of the identity of a cell: the draws of a
-# trial depend on its number alone, and a section decides only which trials are computed.
+def search_settings(
+    require: Sequence[str] = (), along: str = "", per: Sequence[str] | None = None,
+    at_all: Sequence[str] | None = None, max_trials: int | None = None,
+) -> list[str]:
+    """Return a search along an axis as settings of the sections, as ``--set`` takes them.
 
-MAX_TRIALS = "max_trials"
-"""The key of every section: the most trials, the length of the axis ``trial``."""
-
-MIN_TRIALS = 2
-"""The fewest that make an interval."""
-
-NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
-"""What is expected where nothing says how many trials there are at most."""
-
-
-STOPPING_SECTIONS: Mapping[str, Callable[[Reading, dict[str, Any]], StoppingRule | None]] = {
-    "limit": read_limit,
-    "precision": read_precision,
-    "choose": read_choice,
-}
-"""Section -> the function that reads its table and notes faults: the one entry of a rule here.
-
-Its results are sampled by the entry of the rule's class in `sweep.sampling.rules.RULES`.
-"""
-
-
-def read_stopping(reading: Reading) -> None:
-    """Read the section by which sampling stops, if there is one; the axes have been read.
-
-    It makes the axis ``trial``.
+    >>> search_settings(["detection >= 0.9"], "distance_m", max_trials=600)
+    ['require.all=["detection >= 0.9"]', 'search.along="distance_m"', 'search.max_trials=600']
     """
-    present = [name for name in STOPPING_SECTIONS if name in reading.document]
-    for name in present[1:]:
-        reading.fault(name, reading.document[name], f"[{present[0]}] or [{name}], not both")
-    if not present:
-        return
-    name = present[0]
-    table = reading.document[name]
-    if not isinstance(table, dict):
-        reading.fault(name, table, f"a table: [{name}]")
-        return
-    _read_trials(reading, name, table)
-    if reading.sampling != SAMPLINGS[0]:
-        reading.fault(
-            "sampling", reading.sampling,
-            f"{SAMPLINGS[0]} beside [{name}]: points that are spread evenly over all trials say "
-            "nothing of the first ones",
-        )
-    if TRIAL in reading.axes and len(reading.axes[TRIAL]) < MIN_TRIALS:
-        reading.fault(f"{name}.{MAX_TRIALS}", len(reading.axes[TRIAL]),
-                      f"at least {MIN_TRIALS}: intervals are over the draws")
-    reading.stopping = STOPPING_SECTIONS[name](reading, table)
+    given = {
+        f"{REQUIRE}.all": _listed(require) or None, f"{SEARCH}.along": along or None,
+        f"{SEARCH}.per": None if per is None else _listed(per),
+        f"{REQUIRE}.per": None if at_all is None else _listed(at_all),
+        f"{SEARCH}.{MAX_TRIALS}": max_trials,
+    }
+    return [f"{key}={json.dumps(value, ensure_ascii=False, default=_whole)}"
+            for key, value in given.items() if value is not None]
 
 
-def _read_trials(reading: Reading, name: str, table: Mapping[str, Any]) -> None:
-    """Make the axis of trials from ``max_trials``, or take the one that is given."""
-    given = reading.axes.get(TRIAL)
-    if MAX_TRIALS not in table:
-        if given is None and not reading.names_axis(TRIAL):
-            reading.fault(name, dict(table), NO_TRIALS)
-        return
-    try:
-        axis = parse_trial(table[MAX_TRIALS])
-    except ValueError as error:
-        reading.fault(f"{name}.{MAX_TRIALS}", table[MAX_TRIALS], str(error))
-        return
-    if given is None:
-        reading.axes[TRIAL] = axis
-    elif len(given) != len(axis):
-        reading.fault(
-            f"{name}.{MAX_TRIALS}", table[MAX_TRIALS],
-            f"{len(given)}, which axes.trial has, or axes.trial to be left out",
-        )
+def _listed(texts: Sequence[str]) -> list[str]:
+    return [texts] if isinstance(texts, str) else list(texts)
 
 
-def digest_of(rule: StoppingRule) -> str:
-    """Return what tells a rule from others: receipts hold it.
-
-    >>> from sweep.experiment.sampling import PrecisionRule
-    >>> digest_of(PrecisionRule((("detection_rate", 0.02),), ("tilt_deg",), 2400))
-    'd5d0ebe8'
-    """
-    content = {"section": rule.section, **dataclasses.asdict(rule)}
-    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
-
-
-def not_continued(ours: StoppingRule | None, begun: StoppingRule | None) -> str:
-    """Return why a run cannot continue a store begun under another rule; empty if it can."""
-    if ours == begun:
-        return ""
-    if ours is None or begun is None or ours.section != begun.section:
-        names = [f"[{rule.section}]" if rule is not None else "a fixed number of trials"
-                 for rule in (begun, ours)]
-        return f"trials: the store has {names[0]}, this run {names[1]}"
-    return ours.looser(begun)
+def _whole(value: Any) -> int | str:
+    """Return a whole number of NumPy's; of anything else its text, which is refused as such."""
+    return operator.index(value) if hasattr(value, "__index__") else str(value)

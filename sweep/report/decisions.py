@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.choices import CONFIDENCE
 from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes
 from sweep.analysis.draws import is_replicated
 from sweep.analysis.requirements import Decision, Verdict, described
@@ -179,7 +180,7 @@ def headline(choice: Choice) -> str:
     rule = choice.rule
     wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
     what = (f"{plural(len(rule.requirements), 'requirement')} at "
-            f"{plural(choice.conditions, 'condition')}, with {100 * rule.confidence:g} % "
+            f"{plural(choice.conditions, 'condition')}, with {100 * CONFIDENCE:g} % "
             "confidence")
     if choice.best is not None:
         answer, cost = choice.answers[choice.best], choice.costs[choice.best]
@@ -227,7 +228,7 @@ def _name(choice: Choice, answer: Answer, value: float | None) -> str:
 def reason(cause: Cause) -> str:
     """Return why a choice fails: the requirement, its value with interval, the condition."""
     at = f" at {described(cause.condition)}" if cause.condition else ""
-    draws = f"; {text}: raise choose.max_trials" if (text := needs(cause)) else ""
+    draws = f"; {text}: raise search.max_trials" if (text := needs(cause)) else ""
     return (f"{cause.requirement} is {WORDS[cause.decision]}: "
             f"{valued(cause.value, cause.low, cause.high, cause.units)}{at}{draws}")
 
@@ -289,7 +290,7 @@ def as_json(choice: Choice) -> dict[str, Any]:
         "sentences": [headline(choice), *filter(None, (
             _why(choice, k) for k in range(len(choice.answers))))],
         "best": choice.best, "next": choice.next, "along": choice.rule.along,
-        "confidence": choice.rule.confidence, "conditions": choice.conditions,
+        "confidence": CONFIDENCE, "conditions": choice.conditions,
         "budget_ms": choice.budget_ms, "alternatives": listed,
         "poses": choice.poses, "grid_poses": choice.grid_poses,
         "most_trials": choice.most_trials, "store": choice.store,

@@ -31,7 +31,6 @@ from sweep.analysis.summaries import error_headings
 from sweep.experiment.experiment import target_word
 from sweep.experiment.parameters import Stage
 from sweep.experiment.same_meaning import used_settings
-from sweep.experiment.sampling import PrecisionRule
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.report.comparison import trade_lines
@@ -659,7 +658,8 @@ def errors_table(errors: xr.Dataset, name: str) -> Table:
 
 def precision_tables(data: ReportData) -> list[Table]:
     """Return what a run to a wanted precision reached, by quantity and configuration."""
-    if not isinstance(data.pipeline.stopping, PrecisionRule):
+    rule = data.pipeline.stopping
+    if rule is None or not rule.precision:
         return []
     return [precision_table(data.once(
         "precision_reached", lambda: precision_reached(data.results)))]

@@ -20,9 +20,8 @@ from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Block, Blocks, scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.reader import StoppingRule
-from sweep.experiment.sampling import ChoiceRule, LimitRule, PrecisionRule
 from sweep.experiment.schema import VARIABLES, Variable
+from sweep.experiment.stopping import CHOICES, StoppingRule
 from sweep.measure.flags import DetectionStatus
 from sweep.store.blocks import RunStore, region
 from sweep.typing import Masks
@@ -37,21 +36,6 @@ from sweep.typing import Masks
 # A group is what is decided together: all cells along the ``coupled`` axes, and for the sake of
 # speed some values of the others, which must not influence each other. A part of a group of which
 # no cell is needed in a wave is settled for good.
-
-FIRST_DRAWS = 50
-"""Draws of a condition in the first wave, about: all pooled cells together."""
-
-
-def unit_of(pooled: int) -> int:
-    """Return the trials in the unit of waves where a condition pools so many cells.
-
-    At least two: a single one does not tell how far results are chance.
-
-    >>> unit_of(1), unit_of(12), unit_of(500)
-    (50, 5, 2)
-    """
-    return max(2, math.ceil(FIRST_DRAWS / pooled))
-
 
 def block_unit(ends: Sequence[int]) -> int:
     """Return the largest number of trials that divides the ends of all waves but the last.
@@ -230,16 +214,15 @@ class Waves:
 # --------------------------------------------------------------------------------------------------
 # The rule that samples, by what the pipeline says.
 
-RULES: Mapping[type, str] = {
-    ChoiceRule: "sweep.sampling.searches:choice_sampling",
-    LimitRule: "sweep.sampling.searches:limit_sampling",
-    PrecisionRule: "sweep.sampling.precision:precision_sampling",
+RULES: Mapping[str, str] = {
+    "along": "limit_sampling",
+    **dict.fromkeys(CHOICES, "choice_sampling"),
+    "precision": "precision_sampling",
 }
-"""Class of what a section says -> module and function that make its rule, of a pipeline and that.
+"""Kind of search -> function of `sweep.sampling.searches` that makes its rule of a pipeline.
 
-The sections are in `sweep.experiment.sampling.SECTIONS`. The function raises PipelineError with a
-line for each name that it does not know. Its module is imported on use: runs of fixed trials
-need none.
+The function raises PipelineError with a line for each name that it does not know. Its module is
+imported on use: runs of fixed trials need none.
 """
 
 
@@ -253,8 +236,8 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
     """
     if pipeline.stopping is None:
         return None
-    module, _, name = RULES[type(pipeline.stopping)].partition(":")
-    make = getattr(importlib.import_module(module), name)
+    searches = importlib.import_module("sweep.sampling.searches")
+    make = getattr(searches, RULES[pipeline.stopping.kind])
     return cast("Stopping", make(pipeline, pipeline.stopping))
 
 

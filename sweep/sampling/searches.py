@@ -1,4 +1,4 @@
-"""Searches: of limits along an axis, and of a choice."""
+"""Searches: of limits along an axis, of a choice, and for a precision."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from sweep.analysis.binning import sides_of
 from sweep.analysis.choices import ChoiceCells, choice_cells, choice_faults, choice_shares
 from sweep.analysis.limits import easier_first, error_shares, met_run, smaller_upwards
 from sweep.analysis.poses import ESTIMATE_INPUTS, REQUIRED_VARIABLES
+from sweep.analysis.precision import WantedPrecision, precision_table, wanted_precisions
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
     Decision,
@@ -31,10 +32,10 @@ from sweep.errors import DatasetError
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import ChoiceRule, LimitRule, wave_ends
 from sweep.experiment.schema import LABELS, VARIABLES, Variable
+from sweep.experiment.stopping import StoppingRule
 from sweep.messages import refusal
-from sweep.sampling.rules import GroupResults, condition_axes, unit_of
+from sweep.sampling.rules import GroupResults, condition_axes
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -153,7 +154,7 @@ def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Ma
 
 
 # --------------------------------------------------------------------------------------------------
-# The rule of [limit]: trials come where they decide how far requirements are met.
+# The rule of a search along an axis: trials come where they decide how far requirements are met.
 
 @dataclass(frozen=True, slots=True)
 class LimitSampling:
@@ -170,7 +171,7 @@ class LimitSampling:
     ends: tuple[int, ...]
     variables: tuple[str, ...]
     coupled: tuple[str, ...]
-    rule: LimitRule
+    rule: StoppingRule
     required: tuple[Requirement, ...]
     shares: ErrorShares
     upwards: bool | None
@@ -247,16 +248,16 @@ class LimitSampling:
         return np.asarray(open_ & values & (all_keep | ~keep))
 
 
-def limit_sampling(pipeline: Pipeline, rule: LimitRule) -> LimitSampling:
-    """Return the rule of a pipeline's section [limit].
+def limit_sampling(pipeline: Pipeline, rule: StoppingRule) -> LimitSampling:
+    """Return the rule of a search along an axis.
 
     Raises
     ------
     PipelineError
         One line for each requirement that is none, and for those that contradict each other.
     """
-    check_required(rule.require, pipeline.source, key="limit.require")
-    required = parse_requirements(rule.require)
+    check_required(rule.requirements, pipeline.source)
+    required = parse_requirements(rule.requirements)
     axes = condition_axes(pipeline)
     count = len(required) * math.prod(
         len(axis) for axis in axes if axis.name in (rule.along, *rule.at_all))
@@ -296,7 +297,7 @@ def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
 
 
 # --------------------------------------------------------------------------------------------------
-# The rule of [choose]: trials where they decide what the smallest, or the cheapest, choice is.
+# The rule of a choice: trials where they decide what the smallest, or the cheapest, choice is.
 
 @dataclass(frozen=True, slots=True)
 class ChoiceSampling:
@@ -308,7 +309,7 @@ class ChoiceSampling:
         What is sought, and the shares of the error probability that a decision may spend.
     """
 
-    rule: ChoiceRule
+    rule: StoppingRule
     shares: ErrorShares
     ends: tuple[int, ...]
     variables: tuple[str, ...]
@@ -329,34 +330,80 @@ class ChoiceSampling:
         return np.broadcast_to(np.expand_dims(along, pooled), results.shape)
 
 
-def choice_sampling(pipeline: Pipeline, rule: ChoiceRule) -> ChoiceSampling:
-    """Return the rule of a pipeline's section [choose].
+def choice_sampling(pipeline: Pipeline, rule: StoppingRule) -> ChoiceSampling:
+    """Return the rule of a choice.
 
     Raises
     ------
     PipelineError
         One line for each requirement that cannot be judged, or not within ``max_trials``.
     """
-    ends = choice_ends(pipeline, rule)
-    shares = choice_shares(pipeline, rule, len(ends))
+    shares = choice_shares(pipeline, rule)
     if faults := choice_faults(pipeline, rule, shares):
         raise refusal([f"{pipeline.source}: {line}" for line in faults])
     read = [name for each in parse_requirements(rule.requirements)
             for name in each.requirable.variables]
     coupled = tuple(axis.name for axis in condition_axes(pipeline) if axis.name not in rule.among)
     return ChoiceSampling(
-        rule, shares, ends, tuple(dict.fromkeys((*ESTIMATE_INPUTS, *read))), coupled)
+        rule, shares, rule.ends, tuple(dict.fromkeys((*ESTIMATE_INPUTS, *read))), coupled)
 
 
-def choice_ends(pipeline: Pipeline, rule: ChoiceRule) -> tuple[int, ...]:
-    """Return the numbers of trials at which waves end, and decisions are made."""
-    kept = {*rule.among, rule.along, *rule.per}
-    pooled = math.prod(
-        len(axis) for axis in condition_axes(pipeline) if axis.name not in kept)
-    return wave_ends(rule.max_trials, unit_of(pooled))
-
-
-def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: ChoiceRule) -> ChoiceCells:
+def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> ChoiceCells:
     """Return the decisions of a store's whole dataset, as the search made the last ones."""
-    ends = choice_ends(pipeline, rule)
-    return choice_cells(results, rule, choice_shares(pipeline, rule, len(ends)))
+    return choice_cells(results, rule, choice_shares(pipeline, rule))
+
+
+# --------------------------------------------------------------------------------------------------
+# The rule of a precision: a condition needs trials until every interval is narrow enough.
+#
+# A condition is judged by the intervals that the analysis shows of it. It is settled when every
+# quantity of every configuration has an interval as narrow as is wanted, or cannot have one: no
+# pose was looked for, or so few have the number that all trials would not give enough
+# (`sweep.analysis.precision.Reached`).
+
+@dataclass(frozen=True, slots=True)
+class PrecisionSampling:
+    """Attributes as `sweep.sampling.rules.Stopping` has them, and what is wanted."""
+
+    ends: tuple[int, ...]
+    variables: tuple[str, ...]
+    coupled: tuple[str, ...]
+    wanted: tuple[WantedPrecision, ...]
+
+    def needed(self, results: GroupResults) -> Masks:
+        """Return the scenes whose condition has a configuration that is not known well enough."""
+        names = [axis.name for axis in condition_axes(results.pipeline)]
+        dataset = group_dataset(results)
+        per = [name for name in names if name not in self.coupled]
+        table = precision_table(dataset, self.wanted, per, trials=self.ends[-1])
+        needs = (~table["settled"]).expand_dims({
+            name: dataset.sizes[name] for name in self.coupled})
+        return np.asarray(needs.transpose(*names).values)
+
+
+def precision_sampling(pipeline: Pipeline, rule: StoppingRule) -> PrecisionSampling:
+    """Return the rule of a search for a precision.
+
+    Raises
+    ------
+    PipelineError
+        One line for each name that no quantity has, or each whose interval cannot be as narrow
+        within ``max_trials``.
+    """
+    try:
+        wanted = wanted_precisions(dict(rule.precision))
+    except ValueError as error:
+        raise refusal([f"{pipeline.source}: search.precision.{line}"
+                       for line in str(error).splitlines()]) from None
+    axes = condition_axes(pipeline)
+    coupled = tuple(axis.name for axis in axes if axis.name not in rule.per)
+    pooled = math.prod(len(axis) for axis in axes if axis.name in coupled)
+    if too_few := [
+        f"{pipeline.source}: search.max_trials = {rule.max_trials}: expected at least "
+        f"{least:,}: with fewer no interval of {each.name} has a half-width of {each.half_width:g}"
+        for each in wanted
+        if rule.max_trials < (least := math.ceil(each.fewest_draws / pooled))
+    ]:
+        raise refusal(too_few)
+    variables = with_flags(name for each in wanted for name in each.variables)
+    return PrecisionSampling(rule.ends, variables, coupled, wanted)

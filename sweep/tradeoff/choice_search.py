@@ -19,7 +19,7 @@ from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import CHOOSE, ChoiceRule
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
 from sweep.sampling.searches import store_cells
@@ -53,7 +53,7 @@ class Cost:
 
 
 def choice_costs(
-    pipeline: Pipeline, rule: ChoiceRule, found: Sequence[Answer], limit_s: float,
+    pipeline: Pipeline, rule: StoppingRule, found: Sequence[Answer], limit_s: float,
     report: StageReport,
 ) -> list[Cost | None]:
     """Return the cost of each alternative, at its answer; None for one without an answer.
@@ -121,9 +121,9 @@ def _position(values: Sequence[Any], value: Any) -> int:
     return next(k for k, each in enumerate(values) if each == value)
 
 
-def _conditions(pipeline: Pipeline, rule: ChoiceRule) -> list[dict[str, int]]:
+def _conditions(pipeline: Pipeline, rule: StoppingRule) -> list[dict[str, int]]:
     """Return the indices along the axes of conditions, of all, or of some from all over them."""
-    lengths = {axis.name: len(axis) for axis in pipeline.axes if axis.name in rule.per}
+    lengths = {axis.name: len(axis) for axis in pipeline.axes if axis.name in rule.at_all}
     total = math.prod(lengths.values())
     count = min(total, MAX_CONDITIONS)
     numbers = (k * (total - 1) // max(count - 1, 1) for k in range(count))
@@ -133,7 +133,7 @@ def _conditions(pipeline: Pipeline, rule: ChoiceRule) -> list[dict[str, int]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# A requirement in, a decision out: the search for the choice of a pipeline's section [choose].
+# A requirement in, a decision out: the search for the choice of a pipeline's section [search].
 
 SECONDS = 20.0
 """Time limit of the measurement of costs, in seconds."""
@@ -167,7 +167,7 @@ class Choice:
     """
 
     store: str
-    rule: ChoiceRule
+    rule: StoppingRule
     budget_ms: float | None
     conditions: int
     answers: tuple[Answer, ...]
@@ -221,12 +221,12 @@ def search_choice(
     limit_s: float = SECONDS, progress: ProgressReport | None = None,
     stage: StageReport | None = None, child: Child | None = None, **options: Any,
 ) -> Choice:
-    """Search the choice of a pipeline's section [choose], and measure what alternatives cost.
+    """Search the choice of a pipeline's section [search], and measure what alternatives cost.
 
     Parameters
     ----------
     pipeline
-        With the sections [require] and [choose].
+        With the sections [require] and [search].
     store
         Of the search (default: ``runs/NAME.zarr``); one that is finished answers at once.
     limit_s
@@ -240,7 +240,7 @@ def search_choice(
     Raises
     ------
     PipelineError
-        If the pipeline has no section [choose].
+        If the pipeline has no section [search].
     SweepError
         As `sweep.execution.runner.execute` and `sweep.analysis.check_requirements`.
     """
@@ -264,23 +264,23 @@ def search_choice(
         tuple(summary.warnings))
 
 
-def chosen_by(pipeline: Pipeline) -> ChoiceRule:
-    """Return what a pipeline chooses; PipelineError if it has no section [choose]."""
+def chosen_by(pipeline: Pipeline) -> StoppingRule:
+    """Return what a pipeline chooses; PipelineError if it has no section [search]."""
     rule = pipeline.stopping
-    if isinstance(rule, ChoiceRule):
+    if rule is not None and rule.is_choice:
         return rule
     example = 'smallest = "size_m", max_trials = 5000'
-    raise refusal([f"{pipeline.source}: expected what is chosen: [{CHOOSE}] {example}"])
+    raise refusal([f"{pipeline.source}: expected what is chosen: [{SEARCH}] {example}"])
 
 
-def _rank(value: float | None, cost: Cost | None, rule: ChoiceRule) -> tuple[float, float]:
+def _rank(value: float | None, cost: Cost | None, rule: StoppingRule) -> tuple[float, float]:
     """Return what is smaller for a better answer: the value that is sought, then the cost."""
     value = 0.0 if value is None else -value if rule.largest else value
     return value, math.inf if cost is None else cost.ms
 
 
 def _next(
-    found: Sequence[Answer], costs: Sequence[Cost | None], rule: ChoiceRule, best: int | None
+    found: Sequence[Answer], costs: Sequence[Cost | None], rule: StoppingRule, best: int | None
 ) -> int | None:
     """Return the alternative whose next value fails, or is undecided, nearest to the answer."""
     if best is None:
@@ -294,7 +294,7 @@ def _next(
 
 
 def _front(
-    found: Sequence[Answer], costs: Sequence[Cost | None], rule: ChoiceRule
+    found: Sequence[Answer], costs: Sequence[Cost | None], rule: StoppingRule
 ) -> tuple[int, ...]:
     """Return the alternatives than which no other is as good and cheaper."""
     known = [(k, cost) for k, cost in enumerate(costs) if found[k].met and cost is not None]

@@ -30,7 +30,7 @@ PIPELINE = """
 seed = 1
 marker = { size_m = 0.05 }
 pose = { jitter_px = 0.5 }
-precision = { detection_rate = 0.08, max_trials = 200 }
+search = { precision = { detection_rate = 0.08 }, max_trials = 200 }
 axes = { side_px = [10, 20, 30], solver = ["ippe", "iterative"] }
 """
 
@@ -109,7 +109,7 @@ def test_what_is_pooled_is_pooled_over_the_trials_that_all_have(stopped, full):
 
 
 def test_tables_say_which_rule_stopped_the_sampling(stopped, full):
-    expected = "stopped by [precision]: detection_rate = 0.08, max_trials = 200"
+    expected = "stopped by [search]: precision = {detection_rate = 0.08}, max_trials = 200"
     for table in (detection_rate(stopped, ["side_px"]), error_statistics(stopped),
                   precision_reached(stopped), compare(full, stopped), marker_ranking(
                       stopped.expand_dims(marker_id=[1, 2]))):
@@ -184,7 +184,7 @@ def test_what_was_reached_is_told_by_condition(stopped):
 
 
 def test_wishes_that_cannot_be_are_refused(stopped, full):
-    with pytest.raises(ArgumentError, match=r"no \[precision\]"):
+    with pytest.raises(ArgumentError, match="searches no precision"):
         precision_reached(full)
     with pytest.raises(ArgumentError, match="above 0 and below 1"):
         precision_reached(stopped, {"detection_rate": 2.0})

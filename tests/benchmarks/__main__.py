@@ -35,8 +35,8 @@ QUICK = {
         "compared = lambda name, folder: bool(searched(name, folder))"]),  # without the grid
     "stopping": (["--workers", "1"], [
         "CASES = {'paper_fig4': (['distance_m=[0.1, 0.3]', 'tilt_deg=[0]'], 'detection_rate')}",
-        "CASES['paper_fig4'][0].append('precision.detection_rate=0.2')",
-        "CASES['paper_fig4'][0].append('precision.max_trials=40')"]),
+        "CASES['paper_fig4'][0].append('search.precision={ detection_rate = 0.2 }')",
+        "CASES['paper_fig4'][0].append('search.max_trials=40')"]),
     "verify": ([], ["GRID = GRID.replace('0, 50', '0, 2').replace('200 }', '4 }')",
                     "EXTENTS, ROUNDS = (1, 4, 50), 1"]),
     "extremes": ([str(TOP / "pipelines" / "extremes" / "tilt_zero.toml")], []),

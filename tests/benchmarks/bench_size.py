@@ -38,7 +38,7 @@ def searched(name, folder):
 def brute_force(name, choice, folder):
     """Return the results of a grid with ten times the poses of a search, and its seconds."""
     document = tomllib.loads((SIZES / f"{name}.toml").read_text())
-    del document["choose"], document["require"]
+    del document["search"], document["require"]
     document["seed"] += 1000
     document["axes"]["trial"] = math.ceil(TIMES * choice.poses / choice.cells)
     started = time.perf_counter()

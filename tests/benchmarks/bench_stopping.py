@@ -28,13 +28,13 @@ from sweep.experiment.pipeline import Pipeline
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 CASES = {
     "paper_fig4": (
-        ["distance_m={ linspace = [0.1, 0.5, 11] }", "precision.detection_rate=0.02",
-         'precision.per=["tilt_deg", "distance_m"]', "precision.max_trials=320"],
+        ["distance_m={ linspace = [0.1, 0.5, 11] }", "search.precision={ detection_rate = 0.02 }",
+         'search.per=["tilt_deg", "distance_m"]', "search.max_trials=320"],
         "detection_rate"),
     "tradeoff": (
         ["noise_grey=2", 'window="auto"', 'bound="none"',
          'cornerRefinementMethod=["none", "subpix"]', 'solver=["ippe_square", "sqpnp"]',
-         "precision.range_rmse_percent=0.05", "precision.max_trials=6000"],
+         "search.precision={ range_rmse_percent = 0.05 }", "search.max_trials=6000"],
         "range_rmse_percent"),
 }
 WHOLE = {
@@ -42,7 +42,7 @@ WHOLE = {
     "tradeoff": (
         ['window="auto"', 'bound="none"', 'cornerRefinementMethod=["none", "subpix", "contour"]',
          'solver=["ippe_square", "ippe", "iterative", "sqpnp", "ap3p"]',
-         "precision.range_rmse_percent=0.05", "precision.max_trials=40000"],
+         "search.precision={ range_rmse_percent = 0.05 }", "search.max_trials=40000"],
         "range_rmse_percent"),
 }
 

@@ -168,6 +168,6 @@ def test_the_farthest_of_several_boards_is_a_choice_among_them(tmp_path):
         {key: value for key, value in document.items() if key != "estimator"} | {
             "axes": {key: value for key, value in document["axes"].items() if key != "trial"},
             "require": {"all": ["detection >= 0.5"]},
-            "choose": {"largest": "distance_m", "among": ["target"], "max_trials": 100},
+            "search": {"largest": "distance_m", "among": ["target"], "max_trials": 100},
         }, store=tmp_path / "farthest.zarr", workers=1, limit_s=3)
     assert choice.best is not None

@@ -105,7 +105,7 @@ def test_a_removed_command_or_flag_says_in_one_line_what_to_do_instead(line, ins
          "sweep run small.toml --set trial=5 --store runs/small-2.zarr --reuse runs/small.zarr"),
         ("run few.toml --precision 'detection_rate = 0.1'",
          "--max-trials: expected max_trials, too: the most trials of a condition, such as 2400"),
-        ("limit small.toml --require 'detektion >= 0.1' --along side_px", "limit.require"),
+        ("limit small.toml --require 'detektion >= 0.1' --along side_px", "require.all"),
         ("run small.toml --set seed=5", "holds another experiment; choose another store"),
     ],
 )

@@ -16,7 +16,7 @@ tilt_deg = [0, 40]
 solver = ["ippe", "iterative"]
 [require]
 all = ["detection >= 0.5"{more}]
-[choose]
+[search]
 {choose}
 max_trials = {trials}
 """
@@ -82,7 +82,7 @@ def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
 @pytest.mark.long
 def test_the_cheapest_is_found_where_nothing_has_an_order(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = written(tmp_path, choose='among = ["solver", "side_px"]')
+    path = written(tmp_path, choose='cheapest = true\namong = ["solver", "side_px"]')
     with calls_here():
         found = sweep.size(path, limit_s=0.5)
     best = found.answers[found.best]
@@ -96,19 +96,20 @@ def test_a_pipeline_without_a_choice_is_told_what_to_write(tmp_path, capsys):
     path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = 5\n")
     status, _, err = told([path], capsys)
     assert (status, err.count("\n")) == (2, 1)
-    assert 'expected what is chosen: [choose] smallest = "size_m", max_trials = 5000' in err
+    assert 'expected what is chosen: [search] smallest = "size_m", max_trials = 5000' in err
 
 
 @pytest.mark.parametrize(("choose", "more", "line"), [
-    ('smallest = "solver"', "", "choose.smallest"),
+    ('smallest = "solver"', "", "search.smallest"),
     ('smallest = "side_px"', ', "budget_ms >= 2"', "expected milliseconds of a frame"),
     ('smallest = "side_px"', ', "detection <= 0.2"', "no result can be both"),
     ('smallest = "side_px"', ', "detektion >= 0.2"', "did you mean detection_rate"),
-    ("", "", "something to choose"),
+    ("cheapest = true", "", "something to choose"),
+    ("", "", "expected one of along, smallest"),
 ])
 def test_what_cannot_be_searched_is_a_line_and_status_2(choose, more, line, tmp_path, capsys):
     path = written(tmp_path, choose, more)
-    if not choose:
+    if "cheapest" in choose:
         path.write_text(path.read_text().replace('["ippe", "iterative"]', '["ippe"]'))
     status, _, err = told([path], capsys)
     assert status == 2
@@ -125,7 +126,7 @@ def test_too_few_trials_are_refused_before_anything_runs(tmp_path, capsys):
     path = written(tmp_path, more=', "solved >= 0.999"')
     status, _, err = told([path], capsys)
     assert status == 2
-    assert "choose.max_trials = 100: expected at least" in err
+    assert "search.max_trials = 100: expected at least" in err
     assert not (tmp_path / "runs").exists()
 
 

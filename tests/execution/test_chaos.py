@@ -50,19 +50,20 @@ SHORT_TRIALS, LONG_TRIALS = 250, 1500
 
 IN_WAVES = {
     "precision": """
-[precision]
-detection_rate = 0.03
+[search]
+precision = { detection_rate = 0.03 }
 per = ["distance_m", "tilt_deg"]
 """,
     "limit": """
-[limit]
-require = ["detection >= 0.9"]
+[require]
+all = ["detection >= 0.9"]
+[search]
 along = "distance_m"
 """,
     "choose": """
 [require]
 all = ["detection >= 0.9"]
-[choose]
+[search]
 largest = "distance_m"
 """,
 }

@@ -11,8 +11,8 @@ import sweep
 from support.here import calls_here
 from support.lengths import first_of, lengths
 from sweep.errors import PipelineError
-from sweep.evaluation.variables import GEOMETRY
 from sweep.evaluation.search import visibility_flags
+from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD

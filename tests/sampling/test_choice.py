@@ -23,7 +23,7 @@ DOCUMENT = {
     "axes": {"size_m": [0.02, 0.08, 0.04], "tilt_deg": [0, 60],
              "dictionary": ["DICT_4X4_50", "DICT_6X6_50"], "solver": ["ippe", "iterative"]},
     "require": {"all": ["detection >= 0.9"]},
-    "choose": {"smallest": "size_m", "among": ["dictionary"], "max_trials": 400},
+    "search": {"smallest": "size_m", "among": ["dictionary"], "max_trials": 400},
 }
 
 
@@ -41,29 +41,29 @@ def changed(**sections):
 
 
 FAULTS = [
-    ({"choose": {"smallest": "solver"}}, "choose.smallest: solver: each configuration has its own"),
-    ({"choose": {"smallest": "dictionary", "among": []}}, "of numbers; dictionary has no order"),
-    ({"choose": {"smallest": "distance_m"}}, "list the values of distance_m under [axes]"),
-    ({"choose": {"smallest": "trial"}}, "trials are what is counted"),
-    ({"choose": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
-    ({"choose": {"largest": "size_m"}}, "smallest or largest, not both"),
-    ({"choose": {"among": ["size_m"]}}, "size_m once: it is sought along already"),
-    ({"choose": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
-    ({"choose": {"confidence": 95}}, "choose.confidence = 95: expected a number from 0.5 to"),
-    ({"choose": {"max_trials": 0}}, "choose.max_trials = 0: expected"),
-    ({"choose": {"max_trials": 30}}, "choose.max_trials = 30: expected at least "),
-    ({"choose": {"smalest": 1}}, "choose.smalest: unknown key; expected smallest, largest"),
+    ({"search": {"smallest": "solver"}}, "search.smallest: solver: each configuration has its own"),
+    ({"search": {"smallest": "dictionary", "among": []}}, "of numbers; dictionary has no order"),
+    ({"search": {"smallest": "distance_m"}}, "list the values of distance_m under [axes]"),
+    ({"search": {"smallest": "trial"}}, "trials are what is counted"),
+    ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
+    ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
+    ({"search": {"among": ["size_m"]}}, "size_m once: it is sought along already"),
+    ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
+    ({"search": {"max_trials": 0}}, "search.max_trials = 0: expected"),
+    ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
+    ({"search": {"smalest": 1}}, "search.smalest: unknown key; expected along, smallest"),
     ({"axes": {"size_m": [0.02]}}, "axis of several values, from easy to hard; size_m has one"),
-    ({"choose": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
+    ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
      "it is drawn for each trial: give distance_m values under [axes]"),
     ({"require": None}, 'expected what must be met: [require] all = ["detection >= 0.99"]'),
-    ({"require": {"per": ["size_m"]}}, "expected conditions; size_m is what [choose] chooses"),
+    ({"require": {"per": ["size_m"]}}, "expected conditions; size_m is what [search] chooses"),
     ({"require": {"all": ["detection >= 0.9", "detection <= 0.8"]}}, "contradicts"),
     ({"require": {"all": ["budget_ms <= 2"]}}, "expected what must be met"),
     ({"require": {"all": ["detection >= 0.9", "budget_ms >= 2"]}}, "milliseconds of a frame: budg"),
     ({"require": {"all": ["detection >= 0.9", "budget_ms <= 2", "budget_ms <= 1"]}},
      "there is another budget; delete one"),
-    ({"choose": {"smallest": None, "among": []}, "axes": {"solver": ["ippe"]}},
+    ({"search": {"smallest": None, "cheapest": True, "among": []},
+      "axes": {"solver": ["ippe"]}},
      "something to choose: smallest = "),
 ]
 
@@ -79,7 +79,7 @@ def test_sobol_points_are_refused_in_one_line_that_names_no_other_number_of_tria
     with pytest.raises(PipelineError) as caught:
         Pipeline.from_dict({**DOCUMENT, "sampling": "sobol"})
     line, = caught.value.faults
-    assert "expected independent beside [choose]" in line
+    assert "expected independent beside [search]" in line
 
 
 def test_values_that_are_no_axis_are_one_fault():
@@ -90,9 +90,9 @@ def test_values_that_are_no_axis_are_one_fault():
 
 
 @pytest.mark.parametrize("section", [
-    {"choose": DOCUMENT["choose"], "require": DOCUMENT["require"]},
-    {"precision": {"detection_rate": 0.1}},
-    {"limit": {"along": "size_m", "require": ["detection >= 0.9"]}},
+    {"search": DOCUMENT["search"], "require": DOCUMENT["require"]},
+    {"search": {"precision": {"detection_rate": 0.1}}},
+    {"require": {"all": ["detection >= 0.9"]}, "search": {"along": "size_m"}},
 ])
 def test_axes_that_are_no_table_are_a_fault_beside_every_rule(section):
     with pytest.raises(PipelineError, match=r"axes = 3: expected a table: \[axes\]"):
@@ -101,12 +101,12 @@ def test_axes_that_are_no_table_are_a_fault_beside_every_rule(section):
 
 def test_a_budget_needs_a_choice():
     with pytest.raises(PipelineError, match="is the time of a choice"):
-        Pipeline.from_dict(changed(choose=None, require={"all": ["budget_ms <= 2"]}))
+        Pipeline.from_dict(changed(search=None, require={"all": ["budget_ms <= 2"]}))
 
 
 def test_all_faults_come_at_once():
     with pytest.raises(PipelineError) as caught:
-        Pipeline.from_dict(changed(choose={"smallest": "solver", "confidence": 2, "other": 1}))
+        Pipeline.from_dict(changed(search={"smallest": "solver", "per": ["size_m"], "other": 1}))
     assert len(caught.value.faults) == 3
 
 
@@ -125,9 +125,10 @@ def group(pipeline, rates, trials, generator):
 
 @pytest.mark.parametrize("section", [
     {"require": {"all": ["detection >= 0.5"], "per": []},
-     "choose": {"smallest": "size_m", "max_trials": 40}},
-    {"precision": {"detection_rate": 0.1, "per": [], "max_trials": 40}},
-    {"limit": {"require": ["detection >= 0.5"], "along": "size_m", "per": [], "max_trials": 40}},
+     "search": {"smallest": "size_m", "max_trials": 40}},
+    {"search": {"precision": {"detection_rate": 0.1}, "per": [], "max_trials": 40}},
+    {"require": {"all": ["detection >= 0.5"]},
+     "search": {"along": "size_m", "per": [], "max_trials": 40}},
 ])
 def test_a_first_wave_of_many_pooled_cells_can_be_decided(section):
     pipeline = Pipeline.from_dict({
@@ -149,7 +150,7 @@ def chosen(monkeypatch):
             "pose": {"distance_m": 1.0, "jitter_px": 0.5},
             "axes": {"size_m": list(sizes), "tilt_deg": [0, 60]},
             "require": {"all": ["detection >= 0.9"]},
-            "choose": {wish: "size_m", "max_trials": trials}})
+            "search": {wish: "size_m", "max_trials": trials}})
         found = np.arange(trials) < np.round(trials * np.asarray(rates))[..., None]
         detection = np.where(found, DetectionStatus.detected, DetectionStatus.rejected)
         detection[np.isnan(rates)] = DetectionStatus.not_visible
@@ -225,21 +226,21 @@ def test_pipelines_are_read_again_from_their_text():
     again = Pipeline.from_text(pipeline.to_toml())
     assert again.stopping == pipeline.stopping
     assert (again.budget_ms, again.requirements) == (2.0, ("detection >= 0.9",))
-    assert pipeline.stopping.per == ("tilt_deg",)
+    assert pipeline.stopping.at_all == ("tilt_deg",)
     assert pipeline.stopping.among == ("dictionary", "solver")
 
 
 def test_another_choice_does_not_continue_a_store():
     rule = Pipeline.from_dict(DOCUMENT).stopping
-    other = Pipeline.from_dict(changed(choose={"max_trials": 500})).stopping
-    assert other.looser(rule) == "choose.max_trials: the store has 400, this run 500"
+    other = Pipeline.from_dict(changed(search={"max_trials": 500})).stopping
+    assert other.looser(rule) == "search.max_trials: the store has 400, this run 500"
     assert not rule.looser(rule)
 
 
 @pytest.mark.long
 def test_a_search_is_the_same_with_one_or_two_workers_and_other_blocks(tmp_path):
     """The stores of a search are equal value for value, and cost less than the whole grid."""
-    document = changed(axes={"size_m": [0.01, 0.02, 0.03, 0.06]}, choose={"max_trials": 200})
+    document = changed(axes={"size_m": [0.01, 0.02, 0.03, 0.06]}, search={"max_trials": 200})
     stores = []
     for number, options in enumerate((
             {"workers": 1}, {"workers": 2}, {"workers": 1, "block_s": 0.01})):

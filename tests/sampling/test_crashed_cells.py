@@ -17,7 +17,7 @@ camera = { width_px = 64, height_px = 48 }
 pose = { jitter_px = 0.5 }
 scene = { renderer = "warp" }
 axes = { side_px = [8, 13, 30] }
-precision = { detection_rate = 0.1, max_trials = 150 }
+search = { precision = { detection_rate = 0.1 }, max_trials = 150 }
 """
 
 CRASHED, RAISED = (1, 60), (2, 10)

@@ -15,7 +15,7 @@ from sweep.analysis.limits import requirement_limits
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import wave_ends
+from sweep.experiment.stopping import wave_ends
 from sweep.measure.flags import DetectionStatus
 from sweep.report.limit_figure import as_json, limit_table
 from sweep.sampling.rules import GroupResults
@@ -211,7 +211,7 @@ def test_the_hard_end_of_an_axis_is_the_same_for_the_search_and_for_its_results(
 
 AXES = {"side_px": [10, 20], "dictionary": ["DICT_4X4_50", "DICT_5X5_50"], "roll_deg": [0],
         "solver": ["ippe", "iterative"], "tilt_deg": [0, 30]}
-GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
+GOOD = {"along": "side_px", "max_trials": 80}
 
 
 @pytest.mark.parametrize(("changed", "words"), [
@@ -223,22 +223,18 @@ GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
     ({"along": "trial"}, "trials are what is counted"),
     ({"along": "sides"}, "no such axis"),
     ({"along": 3}, "the axis that is searched"),
-    ({"require": []}, "a list of texts"),
-    ({"require": ["detection"]}, "NAME >= NUMBER"),
-    ({"require": ["budget_ms <= 2"]}, "the cost is that of a configuration"),
     ({"per": ["side_px"]}, "other axes than side_px"),
-    ({"per": ["tilt_deg"], "at_all": ["tilt_deg"]}, "in per or in at_all"),
-    ({"at_all": ["nothing"]}, "no such axis"),
+    ({"per": ["nothing"]}, "no such axis"),
+    ({"smallest": "side_px"}, "not along and smallest"),
+    ({"among": ["solver"]}, "beside smallest"),
     ({"max_trials": 1}, "at least 2"),
-    ({"coarse_trials": 1}, "a whole number from 2 to"),
-    ({"coarse_trials": 81}, "coarse_trials = 81: expected at most max_trials, 80"),
     ({"more": 1}, "unknown key"),
 ])
 def test_faults_are_told_in_a_line(changed, words):
     with pytest.raises(PipelineError) as raised:
         Pipeline.from_dict({
             "pose": {"jitter_px": 0.5, "azimuth_deg": {"uniform": [0, 90]}}, "axes": AXES,
-            "limit": {**GOOD, **changed}})
+            "require": {"all": ["detection >= 0.9"]}, "search": {**GOOD, **changed}})
     assert len(raised.value.faults) == 1
     assert words in raised.value.faults[0]
 
@@ -250,7 +246,7 @@ def test_faults_are_told_in_a_line(changed, words):
 ])
 def test_names_and_contradictions_are_told_when_the_rule_is_made(texts, words):
     pipeline = Pipeline.from_dict({
-        "pose": {"jitter_px": 0.5}, "axes": AXES, "limit": {**GOOD, "require": texts}})
+        "pose": {"jitter_px": 0.5}, "axes": AXES, "search": GOOD, "require": {"all": texts}})
     with pytest.raises(PipelineError, match=words):
         limit_sampling(pipeline, pipeline.stopping)
 
@@ -258,3 +254,9 @@ def test_names_and_contradictions_are_told_when_the_rule_is_made(texts, words):
 def test_waves_end_at_the_most_trials():
     assert wave_ends(100, 40) == (40, 80, 100)
     assert math.isclose(looks_factor(1), 1.0)
+
+
+@pytest.mark.parametrize("section", ["limit", "choose", "precision"])
+def test_sections_of_earlier_versions_name_the_one_in_their_place(section):
+    with pytest.raises(PipelineError, match=rf"{section}: unknown.*write \[search\]"):
+        Pipeline.from_dict({section: {"max_trials": 80}})

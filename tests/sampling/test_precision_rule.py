@@ -16,7 +16,7 @@ seed = 3
 camera = { width_px = 64, height_px = 48 }
 pose = { jitter_px = 0.5, side_px = 30 }
 axes = { marker_id = [0, 1], tilt_deg = [0, 20, 40, 60], solver = ["ippe", "sqpnp"] }
-precision = { max_trials = 3000, per = ["tilt_deg"], WANTED }
+search = { max_trials = 3000, per = ["tilt_deg"], precision = { WANTED } }
 """
 
 

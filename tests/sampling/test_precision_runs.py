@@ -24,7 +24,7 @@ camera = { width_px = 64, height_px = 48 }
 pose = { jitter_px = 0.5 }
 scene = { renderer = "warp" }
 axes = { side_px = [8, 13, 30] }
-precision = { detection_rate = %s, max_trials = 150 }
+search = { precision = { detection_rate = %s }, max_trials = 150 }
 """
 
 WIDTHS = ("0.4", "0.14", "0.1")
@@ -113,7 +113,7 @@ def test_fixed_trials_and_waves_reuse_each_other(first, second, tmp_path):
 
 @pytest.mark.long
 def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
-    change = ["side_px = {linspace = [8, 30, 12]}", "precision.max_trials = 600"]
+    change = ["side_px = {linspace = [8, 30, 12]}", "search.max_trials = 600"]
     reference = str(tmp_path / "reference.zarr")
     summary = execute(precise("0.05", change), reference)
     assert summary.unsettled == 0
@@ -128,7 +128,7 @@ def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
 
 def test_a_run_in_waves_is_refused_for_what_it_needs_and_not_for_all_its_trials():
     """Two conditions of rates 0 and 1: a few hundred of three million poses."""
-    pipeline = precise("0.02", ["side_px = [8, 30]", "precision.max_trials = 1_500_000"])
+    pipeline = precise("0.02", ["side_px = [8, 30]", "search.max_trials = 1_500_000"])
     with pytest.raises(StoreError, match="takes about"):
         check_affordable("none.zarr", pipeline, 1.0, 1, 30_000, 30_000, Here())
     check_affordable("none.zarr", pipeline, 0.04, 1, 30_000, 30_000, Here())
@@ -136,11 +136,11 @@ def test_a_run_in_waves_is_refused_for_what_it_needs_and_not_for_all_its_trials(
 
 @pytest.mark.long
 @pytest.mark.parametrize(("settings", "needed"), [
-    (["precision.max_trials = 19"], 3 * 19),
-    (["precision.per = []"], None),
+    (["search.max_trials = 19"], 3 * 19),
+    (["search.per = []"], None),
     (["side_px = 30"], None),
-    (["side_px = 30", "bearing_x_deg = 80", "precision.max_trials = 5000"], 50),
-    (["side_px = 30", "marker_id = {range = [0, 50]}", "precision.per = ['side_px']"], None),
+    (["side_px = 30", "bearing_x_deg = 80", "search.max_trials = 5000"], 50),
+    (["side_px = 30", "marker_id = {range = [0, 50]}", "search.per = ['side_px']"], None),
 ])
 def test_extremes_end(settings, needed, tmp_path):
     url = str(tmp_path / "extreme.zarr")

@@ -27,7 +27,7 @@ def pipeline_of(name, width, most, repetitions):
         seed = 1
         pose = {{ jitter_px = 0.5, side_px = 30 }}
         axes = {{ azimuth_deg = {{ linspace = [0, 300, {repetitions}] }} }}
-        precision = {{ {name} = {width}, max_trials = {most} }}
+        search = {{ precision = {{ {name} = {width} }}, max_trials = {most} }}
     """, name="simulated")
 
 

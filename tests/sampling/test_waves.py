@@ -10,7 +10,7 @@ from support.stores import by_hand, same
 from sweep.errors import PipelineError
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import wave_ends
+from sweep.experiment.stopping import wave_ends
 from sweep.measure.flags import DetectionStatus
 from sweep.sampling.rules import Waves, block_unit, make_rule
 from sweep.store.lifecycle import open_dataset
@@ -21,7 +21,7 @@ camera = { width_px = 64, height_px = 48 }
 pose = { jitter_px = 0.5 }
 scene = { renderer = "warp" }
 axes = { tilt_deg = [0, 60], side_px = [8, 13, 30] }
-precision = { detection_rate = 0.1, max_trials = 100, per = ["side_px"] }
+search = { precision = { detection_rate = 0.1 }, max_trials = 100, per = ["side_px"] }
 """
 
 
@@ -79,7 +79,7 @@ def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_p
 
 
 @pytest.mark.parametrize(("change", "expected"), [
-    ("precision.detection_rte=0.1",
+    ("search.precision={ detection_rte = 0.1 }",
      "nothing of this name has an interval; did you mean detection_rate?"),
 ])
 def test_unknown_quantity_is_refused_by_the_rule(change, expected):

@@ -9,13 +9,13 @@ from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import group_dataset, limit_sampling
 
 
-def pipeline_of(curves, values, text, most, coarse=40):
+def pipeline_of(curves, values, text, most):
     """Return a pipeline whose tilts stand for the conditions of curves (conditions, values)."""
     return Pipeline.from_dict({
         "pose": {"jitter_px": 0.5},
         "axes": {"tilt_deg": np.linspace(0, 80, len(curves)).tolist(), "side_px": list(values)},
-        "limit": {"require": [text], "along": "side_px", "per": ["tilt_deg"], "max_trials": most,
-                  "coarse_trials": coarse},
+        "require": {"all": [text]},
+        "search": {"along": "side_px", "per": ["tilt_deg"], "max_trials": most},
     })
 
 

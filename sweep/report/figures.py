@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -213,14 +213,14 @@ class Grouped:
 
 def grouped(
     data: ReportData, analysis: Analysis, groups: Grouping | None = None,
-    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *, targets: bool = True,
+    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
 ) -> Grouped:
     """Return an analysis by configuration and groups.
 
     ``stages`` are those whose settings make a difference: of the detection rate the detector's.
     """
     groups = groups or Grouping()
-    settings = settings_of(data, stages, without, targets=targets)
+    settings = settings_of(data, stages, without)
     grouping = settings.grouping + groups
     _, summary = by_configuration(
         data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
@@ -265,7 +265,7 @@ def _errors(data: ReportData) -> Figure | None:
         "errors", f"Errors of the pose by {short_name(data.size)}",
         "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
         "relative to the true depth), and the solved poses that are nearer to the mirror of the "
-        f"truth (flips). {INFINITE_ERRORS}", "Errors", (LOOKED_FOR, *ERRORS),
+        f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors", (LOOKED_FOR, *ERRORS),
         (*ERROR_CURVES, FLIPS), covers=data.size_axes)
 
 
@@ -583,8 +583,8 @@ def _effect(data: ReportData, name: str) -> Figure:
 # --------------------------------------------------------------------------------------------------
 # Tables of errors, of boards' markers, and of the precision that was reached.
 
-MAX_TABLE_ROWS, MAX_SIZE_ROWS = 40, 12
-"""The most rows of a table of all detector settings, and of one by size."""
+MAX_TABLE_ROWS = 40
+"""The most rows of a table of all detector settings."""
 
 GROUPS = ("camera_frame", "camera_in_marker", "yaw_pitch_roll", "angles")
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
@@ -607,21 +607,6 @@ def board_tables(data: ReportData) -> list[Table]:
     return [table_of(
         rates, "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
         sources=data.results)]
-
-
-def size_errors_table(data: ReportData, at: Mapping[str, int], name: str) -> list[Table]:
-    """Return detection, bias and spread of one configuration, the indices ``at``, by size."""
-    axis = signed_axis(data)
-    targets = any(each.name in at for each in data.target_axes)
-    found = grouped(data, signed_error_statistics,
-                    data.along(axis, MAX_SIZE_ROWS) if axis else None, targets=targets)
-    table = found.summary.isel({CONFIGURATION: found.settings.combinations.index(dict(at))})
-    if not np.nan_to_num(table["solved"].values).sum():
-        return []
-    return [table_of(
-        table, f"Errors{f' by {axis}' if axis else ''}{f' with {name}' if name else ''}, with 95 % "
-        "intervals: range p95 (not solved: infinite), bias and standard deviation of the solved "
-        "poses without flips", found.dims, (*RATES, RANGE_P95, *SIGNED_COLUMNS), data.results)]
 
 
 def signed_errors_table(data: ReportData) -> Table:

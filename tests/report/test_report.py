@@ -322,30 +322,6 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
             assert re.sub(r"\\.", "", line).count("|") >= 3
 
 
-@pytest.mark.long
-def test_the_figures_of_an_earlier_markdown_go_but_nothing_else_does(tmp_path):
-    url = made(tmp_path, f"title = ' '\n{ODD['single pose']}", "one")
-    output, folder = tmp_path / "answer.md", tmp_path / "answer_figures"
-    folder.write_text("mine")
-    assert "it is a file" in command("report", url, "-o", output)[2]
-    assert not output.exists()
-    folder.unlink()
-    folder.mkdir()
-    (folder / "stale.png").write_text("old")
-    assert command("report", url, "-o", output)[::2] == (0, "")
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "failures.png", "failures.svg", "scene-1.png"]
-    assert output.read_text(encoding="utf-8").startswith("# one\n")
-    (folder / "notes.txt").write_text("mine")
-    code, _, err = command("report", url, "-o", output)
-    held = f"{folder}: cannot be replaced: it holds notes.txt, which is not a figure"
-    assert (code, err) == (2, f"{held}; choose another output\n")
-    (folder / "notes.txt").unlink()
-    inside = folder / "inside"
-    assert "is replaced as a whole" in command(
-        "report", url, "-o", output, "--figures", inside)[2]
-
-
 def test_the_pipeline_can_be_taken_from_the_page(full, page):
     encoded = re.search(r'href="data:application/toml;base64,([^"]*)"', page)[1]
     assert base64.b64decode(encoded).decode() == open_store(full).pipeline.text

@@ -13,6 +13,7 @@ from sweep.cli.answers import (
     compare,
     error_model,
     limit,
+    reference,
     report,
     require,
     size,
@@ -20,7 +21,7 @@ from sweep.cli.answers import (
 )
 from sweep.cli.command import Command, argument, command, flushed
 from sweep.cli.experiments import plan, repro, run, show, status, verify
-from sweep.cli.programs import export, fit, photos, plugins, score
+from sweep.cli.programs import diagnose, export, fit, photos, plugins, score
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
@@ -30,8 +31,8 @@ from sweep.version import __version__
 
 SHELLS = ("bash", "zsh", "fish")
 
-FILES = ("PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR", "FILE", "FIGURE",
-         "PNG")
+FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR",
+         "FILE", "FIGURE", "PNG")
 """Arguments for which names of files and folders are offered."""
 
 
@@ -61,8 +62,8 @@ def completion(options: argparse.Namespace) -> int:
 GROUPS = {
     "experiments": (run, plan, show, status, verify, repro),
     "answers": (report, require, size, limit, tradeoff, error_model, calibration),
-    "your camera": (photos, fit, compare),
-    "other programs": (export, score, plugins, completion),
+    "your camera": (photos, fit, diagnose, compare),
+    "other programs": (export, score, plugins, reference, completion),
 }
 """Every command, by group, in the order in which the help lists them."""
 

@@ -122,6 +122,9 @@ class Axis:
         return np.array(part, dtype=type(self.values[0]))
 
 
+MAX_DEVIATIONS = 8.3
+"""The largest distance of a normal draw of 53 bits from its mean, in standard deviations."""
+
 @dataclass(frozen=True, slots=True)
 class Distribution:
     """A parameter that is drawn per trial: ``uniform`` on [a, b] or ``normal`` (mean a, sd b)."""
@@ -138,12 +141,14 @@ class Distribution:
 
         return np.asarray(self.a + self.b * ndtri(uniform))
 
+    @property
+    def largest(self) -> float:
+        """The largest number that a draw is added up from."""
+        return max(abs(self.a), self.b * MAX_DEVIATIONS if self.kind == "normal" else abs(self.b))
+
     def __str__(self) -> str:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
-
-MAX_DEVIATIONS = 8.3
-"""The largest distance of a normal draw of 53 bits from its mean, in standard deviations."""
 
 AXIS_FORMS = {
     "range": "[start, stop] or [start, stop, step], whole numbers, half-open",

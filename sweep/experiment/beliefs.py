@@ -77,7 +77,7 @@ def calibrated_columns(
 def beliefs_in_one_way(reading: Reading) -> None:
     """Demand beliefs that do not contradict each other, and a calibration where one is believed."""
     known = _calibration_is_sound(reading)
-    if "calibration" not in reading.values("believed"):
+    if "calibration" not in reading.values_of("believed"):
         return
     if known and not any(reading.fixed[name] for name in STATED):
         where = "camera_file has none" if reading.fixed.get("camera_file") else "or a camera_file"
@@ -111,11 +111,11 @@ def _calibration_is_sound(reading: Reading) -> bool:
     try:
         errors = [
             CalibrationError.of(sd, covariance, count)
-            for count in {len(lens) for lens in reading.values("distortion")}
+            for count in {len(lens) for lens in reading.values_of("distortion")}
         ]
     except ValueError as error:
         return fault(name, str(error))
-    values = [reading.values(parameter) for parameter in VIEW_PARAMETERS]
+    values = [reading.values_of(parameter) for parameter in VIEW_PARAMETERS]
     if not errors or not all(map(len, values)):
         return False
     least = intrinsics(*map(_with_least_focal_length, VIEW_PARAMETERS, values))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sweep.declaration import check_table, declared_fields
-from sweep.experiment.axes import combinations
+from sweep.experiment.experiment import shows_boards
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.reader import Reading
 from sweep.experiment.toml_text import MAX_BYTES, read_document
@@ -20,13 +20,11 @@ from sweep.model.board_kinds import (
     ARRANGING,
     KINDS,
     NEEDED,
-    SINGLE,
     arranged_board,
     arrangement_faults,
     is_solid,
     used_by,
 )
-from sweep.model.effects import GEOMETRIC
 from sweep.model.image_file import read_regular
 from sweep.model.renderers import MAX_BITMAP_PX, MAX_BITMAP_SIDE, bitmap_shape
 from sweep.model.scene import RENDERERS, is_renderer
@@ -115,7 +113,7 @@ MAX_BOARDS = 10_000
 
 def boards_can_be_printed(reading: Reading) -> None:
     """Demand what each kind of board needs, and boards whose parts do not overlap."""
-    kinds = reading.values("kind")
+    kinds = reading.values_of("kind")
     given = [name for name, parameter in reading.parameters.items()
              if parameter.section == "board" and name in reading.given and name != "kind"]
     needed = [name for kind in kinds for name in NEEDED[kind] if name not in reading.given]
@@ -131,21 +129,24 @@ def boards_can_be_printed(reading: Reading) -> None:
             users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
             reading.refuse(name, f"kind = {users}, which uses it; kind = "
                            f"{' or '.join(dict.fromkeys(kinds))} does not: delete it")
-    if not _shows_boards(reading):
+    if not shows_boards(reading):
         return
-    if needed or not all(reading.values(name) for name in ARRANGING):
+    if needed or not all(reading.values_of(name) for name in ARRANGING):
         return
-    if "marker_id" in reading.given and any(reading.values("ids")):
-        reading.fault(
-            "board.ids", list(reading.values("ids")[0]), "ids, or marker_id of the first; not both"
-        )
+    if "marker_id" in reading.given and any(reading.values_of("ids")):
+        reading.refuse("ids", "ids, or marker_id of the first; not both")
         return
     for name in ("ids", "markers", "distractors"):
         if reading.axis_of(name) is not None:
             reading.fault(f"axes.{name}", "...", f"{name} under [board]: they cannot be an axis")
             return
+    count = math.prod(
+        len(axis) for axis in reading.axes.values() if not set(axis.columns).isdisjoint(ARRANGING))
+    if count > MAX_BOARDS:
+        reading.note("axes", f"{count:,} different boards: expected at most {MAX_BOARDS:,}")
+        return
     seen = set()
-    for values in _arrangements(reading):
+    for values in reading.arrangements():
         for name, value, expected in arrangement_faults(values):
             if (name, expected) not in seen:
                 seen.add((name, expected))
@@ -153,13 +154,13 @@ def boards_can_be_printed(reading: Reading) -> None:
                 reading.fault(f"{section}.{name}", value, expected)
         if len(seen) > MAX_FAULTS:
             return
-    if not seen and WARP in reading.values("renderer"):
+    if not seen and WARP in reading.values_of("renderer"):
         _bitmaps_fit(reading)
 
 
 def _bitmaps_fit(reading: Reading) -> None:
     """Demand boards of which ``warp`` can draw bitmaps."""
-    for values in _arrangements(reading):
+    for values in reading.arrangements():
         height, width = bitmap_shape(arranged_board(*values))
         if max(height, width) > MAX_BITMAP_SIDE or height * width > MAX_BITMAP_PX:
             reading.fault(
@@ -175,33 +176,12 @@ MAX_FAULTS = 10
 """Faults of boards after which no other board is checked."""
 
 
-def _shows_boards(reading: Reading) -> bool:
-    """Return whether scenes show a board, or a marker with something beside it."""
-    beside = any(reading.values("distractors"))
-    return beside or any(kind != SINGLE for kind in reading.values("kind"))
-
-
-def _arrangements(reading: Reading) -> Iterator[tuple[Any, ...]]:
-    """Yield the values of every board of the grid; note a fault if there are too many."""
-    axes = [axis for axis in reading.axes.values() if not set(axis.columns).isdisjoint(ARRANGING)]
-    count = math.prod(len(axis) for axis in axes)
-    if count > MAX_BOARDS:
-        reading.faults.append(
-            f"{reading.source}: axes: {count:,} different boards: expected at most {MAX_BOARDS:,}"
-        )
-        return
-    fixed = {name: reading.fixed.get(name) for name in ARRANGING}
-    for chosen in combinations(axes):
-        values = fixed | chosen
-        yield tuple(values[name] for name in ARRANGING)
-
-
 def boards_are_searched_and_solved(reading: Reading) -> None:
     """Demand detectors, solvers and renderers that can do boards."""
-    kinds = reading.values("kind")
+    kinds = reading.values_of("kind")
     on_boards = ("points", "refine", "refineDetectedMarkers", "minMarkers")
     plugged = [each.name for each in reading.plugins if each.of_boards]
-    if not _shows_boards(reading):
+    if not shows_boards(reading):
         reading.refuse_values("solver", "a solver of single markers, or a board: give kind under "
                               "[board]", lambda name: name in plugged)
         for name in reading.given.intersection(on_boards):
@@ -212,7 +192,14 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
                        "delete it")
     reading.refuse_values(
         "renderer", f"{RENDERERS}, for boards", lambda name: not is_renderer(name))
-    reading.refuse_values("detector", "a detector that searches images, for boards", is_recording)
+    if any(map(is_recording, reading.values("detector"))):
+        for name, value, expected in (
+            ("points", "chessboard",
+             "markers beside recorded detections, which have no corners of chessboards"),
+            ("refineDetectedMarkers", True,
+             "false beside recorded detections: no image is searched"),
+        ):
+            reading.refuse_values(name, expected, lambda given, value=value: given == value)
     if "solver" not in reading.given:
         reading.faults.append(
             f"{reading.source}: estimator.solver: missing; a board needs one of "
@@ -248,30 +235,31 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
                else "; others with points = largest_marker" if SOLVERS[solver].corners_alone
                else ""),
         )
-    if any(map(is_solid, (*reading.values("markers"), *reading.values("distractors")))):
+    if any(map(is_solid, (*reading.values_of("markers"), *reading.values_of("distractors")))):
         _several_planes(reading)
-    if "chessboard" in reading.values("points") and not {"charuco", "diamond"} & set(kinds):
+    if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & set(kinds):
         reading.fault(
             "estimator.points", "chessboard", "kind = charuco or diamond, which have a chessboard"
         )
 
 
-IN_ONE_PLANE = tuple(
-    name for name in GEOMETRIC if name not in ("blur_px", "marker_scale", "sharpening")
-)
-"""Switches of effects that boards in several planes cannot have."""
+IN_ONE_PLANE = {
+    "curvature_per_m": "a bend is that of one sheet",
+    "occlusion": "the sheet that hides lies in the target's plane",
+}
+"""Switches of effects that targets in several planes cannot have, and why."""
 
 
 def _several_planes(reading: Reading) -> None:
     """Refuse what sheets in several planes cannot have: solvers for a plane, and effects."""
-    target = any(map(is_solid, reading.values("markers")))
+    target = any(map(is_solid, reading.values_of("markers")))
     why = f"for {'markers' if target else 'distractors'} with z_m or tilt_deg"
-    if target and {"markers", "chessboard"}.intersection(reading.values("points")):
+    if target and {"markers", "chessboard"}.intersection(reading.values_of("points")):
         reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, {why}",
                               lambda name: name in SOLVERS and SOLVERS[name].planar_only)
-    for name in IN_ONE_PLANE:
+    for name, reason in IN_ONE_PLANE.items():
         if reading.is_active(name):
-            reading.refuse(name, f"it absent, {why}")
+            reading.refuse(name, f"it absent, {why}: {reason}")
     reading.refuse_values("renderer", f"exact, {why}", lambda name: name != "exact")
-    if target and any(reading.values("refineDetectedMarkers")):
+    if target and any(reading.values_of("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import tomlkit
 
 from sweep.experiment.parameters import (
     FIELDS_OF_VIEW,
@@ -46,7 +44,7 @@ def resolve_sensor(reading: Reading) -> None:
 
 def _ends(reading: Reading, name: str) -> list[Any]:
     """Return the least and the largest value of a parameter on the grid; empty if at fault."""
-    values = reading.values(name)
+    values = reading.values_of(name)
     if len(values) == 0:
         return []
     return [values[0]] if len(values) == 1 else [min(values), max(values)]
@@ -59,16 +57,6 @@ def _default_is_square(width: Any, height: Any, sensor_width: Any, sensor_height
         None, None, None, None,
     )
     return bool(are_square(fx, fy))
-
-
-def with_values(text: str, section: str, values: Mapping[str, Any]) -> str:
-    """Return the text of a pipeline with values written under a section; its comments stay."""
-    written = tomlkit.parse(text)
-    if section not in written:
-        written[section] = tomlkit.table()
-    for name, value in values.items():
-        written[section][name] = list(value) if isinstance(value, tuple) else value
-    return tomlkit.dumps(written)
 
 
 # --------------------------------------------------------------------------------------------------

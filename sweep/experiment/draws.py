@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from hashlib import blake2b
 from typing import Any
 
@@ -505,11 +505,17 @@ def geometry_keys(
     for name, distribution in distributions.items():
         if name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS:
             columns[name] = Column.of(f"{name}={distribution}")
-    used = [columns[name] for name in sorted(columns) if columns[name].differs_from("")]
-    joined = map_columns(lambda *texts: "|".join(filter(None, texts)), used)
-    return joined.map(cache(_hash)).broadcast(count, np.uint64)
+    return hashed([columns[name] for name in sorted(columns)], count)
 
 
+def hashed(texts: Sequence[Column], count: int) -> NDArray[np.uint64]:
+    """Return a hash (count,) of the texts of each of ``count`` scenes; empty ones do not count."""
+    used = [column for column in texts if column.differs_from("")]
+    joined = map_columns(lambda *each: "|".join(filter(None, each)), used or [Column.of("")])
+    return joined.map(_hash).broadcast(count, np.uint64)
+
+
+@lru_cache(maxsize=1 << 14)
 def _hash(text: str) -> np.uint64:
     """Return 64 bits of a text's BLAKE2b hash."""
     return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))

@@ -1,39 +1,28 @@
-"""The experiment: a checked grid with its fixed values, random draws, boards and plug-ins."""
+"""What the parameters are on a grid, and what follows of boards, effects and renderers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, cast
 
 from sweep.experiment.axes import Axis, Distribution, combinations
 from sweep.experiment.parameters import Parameter, Stage
 from sweep.experiment.plugins import parameters_with
-from sweep.experiment.reader import StoppingRule
-from sweep.messages import plain
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin
 
 # --------------------------------------------------------------------------------------------------
-# The experiment: a checked grid with its fixed values and random draws, as a value.
+# What a document and the pipeline that is read from it have in common: values on a grid.
 
-@dataclass(frozen=True, slots=True)
-class Experiment:
-    """A checked experiment: the grid, its fixed values and its random draws.
-
-    :class:`sweep.experiment.pipeline.Pipeline` reads it from a document and checks it as a whole.
+class Grid:
+    """The value, the axis or the distribution of every parameter.
 
     Attributes
     ----------
-    name
-        What stores are named after: the file's stem.
-    title, seed, sampling
-        As the document says; the seed of all random draws, and how those of a cell's trials relate
-        (:data:`sweep.experiment.draws.SAMPLINGS`).
     fixed
         Value of every parameter that is neither an axis nor drawn.
     given
@@ -41,43 +30,29 @@ class Experiment:
     distributions
         Distribution of every parameter that is drawn per trial.
     axes
-        The grid's dimensions, in the document's order.
-    text
-        The effective TOML text: settings and the values of a camera file included.
+        The grid's dimensions, in the document's order; by name while a document is read.
+    plugins
+        The plug-ins that the document names.
+    seed, sampling
+        The seed of all random draws, and how those of a cell's trials relate
+        (:data:`sweep.experiment.draws.SAMPLINGS`).
     files
-        Path as written -> SHA-256 of every file that the pipeline refers to.
+        Path as written -> SHA-256 of every file that the document refers to.
     folder
         Where relative paths start.
-    plugins
-        The plug-ins that it names.
-    requirements, require_per
-        What is required of the results, as texts, and the axes whose values are conditions: the
-        section [require]. No part of an experiment's identity.
-    stopping
-        When sampling stops, as a section such as [precision] says; None if every trial is computed.
-    budget_ms
-        The most milliseconds of a frame, if [require] has a budget.
-    source
-        What lines on faults begin with: the file, if there is one. It is not compared.
     """
 
-    name: str
-    title: str
+    __slots__ = ()
+
+    fixed: Mapping[str, Any]
+    given: Collection[str]
+    distributions: Mapping[str, Distribution]
+    axes: Any
+    plugins: tuple[DeclaredPlugin, ...]
     seed: int
     sampling: str
-    fixed: Mapping[str, Any]
-    given: frozenset[str]
-    distributions: Mapping[str, Distribution]
-    axes: tuple[Axis, ...]
-    text: str
     files: Mapping[str, str]
     folder: str
-    plugins: tuple[DeclaredPlugin, ...] = ()
-    requirements: tuple[str, ...] = ()
-    require_per: tuple[str, ...] = ()
-    stopping: StoppingRule | None = None
-    budget_ms: float | None = None
-    source: str = field(default="pipeline", compare=False)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -85,42 +60,30 @@ class Experiment:
         return parameters_with(self.plugins)
 
     def plugin(self, kind: str, name: str) -> DeclaredPlugin | None:
-        """Return the plug-in of a kind by its name; None if it is not one of the pipeline's."""
+        """Return the plug-in of a kind by its name; None if it is not one of the document's."""
         return next((p for p in self.plugins if (p.kind, p.name) == (kind, name)), None)
 
-    @property
-    def heading(self) -> str:
-        """The title, or without one the name, as it can be printed."""
-        return self.title.strip() or plain(self.name)
+    def _dimensions(self) -> Collection[Axis]:
+        return self.axes.values() if isinstance(self.axes, dict) else self.axes
 
     def axis(self, name: str) -> Axis | None:
         """Return an axis by name."""
-        return next((axis for axis in self.axes if axis.name == name), None)
+        return next((axis for axis in self._dimensions() if axis.name == name), None)
 
     def axis_of(self, parameter: str) -> Axis | None:
         """Return the axis along which a parameter varies, alone or together with others."""
-        return next((axis for axis in self.axes if parameter in axis.columns), None)
-
-    def cell_at(self, index: Mapping[str, int]) -> dict[str, Any]:
-        """Return the value of each parameter that varies, and ``trial``, at indices along axes.
-
-        Axes that ``index`` does not name are left out.
-        """
-        return {
-            name: value for axis in self.axes if axis.name in index
-            for name, value in axis.at(index[axis.name]).items()
-        }
+        return next((axis for axis in self._dimensions() if parameter in axis.columns), None)
 
     def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
         """Return the axes that bind to the given stages, in the document's order."""
-        return tuple(axis for axis in self.axes if axis.stage in stages)
+        return tuple(axis for axis in self._dimensions() if axis.stage in stages)
 
     def size(self, *stages: Stage) -> int:
         """Return the number of grid points over the axes of the given stages."""
         return math.prod(len(axis) for axis in self.axes_of(*stages))
 
     def values_of(self, name: str) -> Sequence[Any]:
-        """Return all values that a parameter takes on the grid; empty if it is drawn."""
+        """Return the values of a parameter on the grid; empty if it is drawn, or at fault."""
         axis = self.axis_of(name)
         if axis is not None:
             return axis.columns[name]
@@ -129,6 +92,17 @@ class Experiment:
     def any_value(self, name: str, condition: Callable[[Any], bool]) -> bool:
         """Return whether a parameter takes a value for which ``condition`` holds."""
         return any(condition(value) for value in self.values_of(name) if value is not None)
+
+    def arrangements(self, names: Collection[str] = ARRANGING) -> Iterator[tuple[Any, ...]]:
+        """Yield the values of `ARRANGING` of each combination of the axes of some parameters.
+
+        Those along other axes have their first value.
+        """
+        first = {name: self.values_of(name)[0] for name in ARRANGING}
+        axes = [axis for axis in self._dimensions() if not set(axis.columns).isdisjoint(names)]
+        for chosen in combinations(axes):
+            board = first | chosen
+            yield tuple(board[name] for name in ARRANGING)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -139,47 +113,39 @@ _SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_patter
 """The parameters that a board's numbers of markers and corners depend on."""
 
 
-def shows_boards(pipeline: Experiment) -> bool:
+def shows_boards(pipeline: Grid) -> bool:
     """Return whether the scenes of a pipeline show boards; single markers count as boards then.
 
     Markers with something beside them do, too.
     """
-    return bool(pipeline.values_of("distractors")[0]) or pipeline.any_value(
+    return any(pipeline.values_of("distractors")) or pipeline.any_value(
         "kind", lambda kind: kind != SINGLE
     )
 
 
-def target_word(pipeline: Experiment) -> str:
+def target_word(pipeline: Grid) -> str:
     """Return what the scenes of a pipeline show, in a word: marker, board, or target if both."""
     if not shows_boards(pipeline):
         return "marker"
     return "target" if pipeline.any_value("kind", lambda kind: kind == SINGLE) else "board"
 
 
-def largest_board(pipeline: Experiment) -> tuple[int, int]:
+def largest_board(pipeline: Grid) -> tuple[int, int]:
     """Return the most markers and the most chessboard corners of a pipeline's boards."""
     markers, corners = zip(
-        *(arranged(values).counts for values in _arrangements(pipeline, _SIZED_BY)), strict=True
+        *(arranged(values).counts for values in pipeline.arrangements(_SIZED_BY)), strict=True
     )
     return max(markers), max(corners)
 
 
-def relative_sizes(pipeline: Experiment) -> tuple[float, float]:
+def relative_sizes(pipeline: Grid) -> tuple[float, float]:
     """Return the least and the largest side of a marker over ``size_m``: listed ones have own."""
     listed = [
         each.size_m / values[ARRANGING.index("size_m")]
-        for values in _arrangements(pipeline, ("kind", "size_m", "markers"))
+        for values in pipeline.arrangements(("kind", "size_m", "markers"))
         if isinstance(board := arranged(values), Markers) for each in board.markers
     ] if pipeline.any_value("markers", bool) else []
     return min(listed, default=1.0), max(listed, default=1.0)
-
-
-def _arrangements(pipeline: Experiment, names: Sequence[str]) -> list[list[Any]]:
-    """Return the values of `ARRANGING` of each combination of the axes of some parameters."""
-    any_board = {name: pipeline.values_of(name)[0] for name in ARRANGING}
-    axes = [axis for axis in pipeline.axes if not set(axis.columns).isdisjoint(names)]
-    boards = [any_board | chosen for chosen in combinations(axes)]
-    return [[values[name] for name in ARRANGING] for values in boards]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -197,7 +163,7 @@ def _effect(plugin: DeclaredPlugin) -> Effect:
     return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
 
 
-def scene_plugins(pipeline: Experiment) -> ScenePlugins:
+def scene_plugins(pipeline: Grid) -> ScenePlugins:
     """Return what a pipeline's plug-ins add to its scenes, imported.
 
     Raises

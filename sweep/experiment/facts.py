@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,7 @@ from sweep.model.extent import hidden, outside_frame
 from sweep.model.lens import fold_radius
 from sweep.model.marker import module_count
 from sweep.model.pose import viewing_angle
-from sweep.model.scene import Scenes, build_cameras, build_scenes
+from sweep.model.scene import build_cameras, build_scenes
 from sweep.plugins.declared import DeclaredPlugin
 from sweep.typing import Floats, Masks
 
@@ -111,21 +111,18 @@ class CameraFacts:
 
     def attributes(self) -> dict[str, Any]:
         """Return the dataset's attributes: a number, or the least and the largest one."""
-        named = {
-            "camera_fx_px": self.fx_px, "camera_fy_px": self.fy_px,
-            "camera_hfov_deg": self.hfov_deg, "camera_vfov_deg": self.vfov_deg,
-        }
-        attributes: dict[str, Any] = {
-            name: low if low == high else [low, high] for name, (low, high) in named.items()
-        }
-        if self.side_px is not None:
-            far, near = self.side_px
-            attributes |= {"nearest_side_px": near, "farthest_side_px": far}
-        return attributes
+        sides = {} if self.side_px is None else dict(
+            zip(("farthest_side_px", "nearest_side_px"), self.side_px, strict=True))
+        return {
+            f"camera_{name}": low if low == high else [low, high]
+            for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
+            for low, high in [getattr(self, name)]
+        } | sides
 
 
-def _text(ends: Range, digits: int = 6) -> str:
-    low, high = (f"{end:.{digits}g}" for end in ends)
+def _text(numbers: Sequence[float] | Floats, digits: int = 6) -> str:
+    """Return the least and the largest of some numbers; one of them if they print alike."""
+    low, high = (f"{round(float(end), 9) + 0.0:.{digits}g}" for end in (min(numbers), max(numbers)))
     return low if low == high else f"{low} to {high}"
 
 
@@ -187,17 +184,17 @@ def camera_facts(pipeline: Pipeline) -> CameraFacts:
     )
 
 
-def _ends(pipeline: Pipeline, name: str) -> Range | None:
-    """Return the least and the largest number that the document has for a parameter, if any."""
-    values = _numbers(pipeline, name)
-    return (min(values), max(values)) if values else None
-
-
 def _numbers(pipeline: Pipeline, name: str) -> list[float]:
     """Return the numbers that the document has for a parameter: the ends or the mean of draws."""
     if (drawn := pipeline.distributions.get(name)) is not None:
         return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
     return [float(value) for value in pipeline.values_of(name) if value is not None]
+
+
+def _in_degrees(name: str, numbers: Sequence[float]) -> str:
+    largest = max(numbers, key=abs)
+    return (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
+            f"{math.degrees(largest):.4g}")
 
 
 OFF_CENTRE = 0.15
@@ -219,23 +216,21 @@ NOT_SQUARE = 0.01
 def camera_notes(pipeline: Pipeline) -> list[str]:
     """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
     facts = camera_facts(pipeline)
-    hfov = _text(facts.hfov_deg, 4)
-    squareness = max(abs(ratio - 1) for ratio in facts.aspect)
-    fx_alone = _varies(pipeline, "width_px") and pipeline.fixed.get("fx_px") is not None
-    lines = [text for condition, text in (
-        (squareness > NOT_SQUARE,
-         (f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the sensor, "
-         "or fx_px alone, makes them square")),
-        (facts.hfov_deg[1] > WIDE_DEG,
-         f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in another unit?"),
-        (fx_alone, (f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
-         "place of fx_px keeps it")),
-    ) if condition]
+    hfov, lines = _text(facts.hfov_deg, 4), []
+    if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
+        lines.append(
+            f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
+            "sensor, or fx_px alone, makes them square")
+    if facts.hfov_deg[1] > WIDE_DEG:
+        lines.append(f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in "
+                     "another unit?")
+    if len(pipeline.values_of("width_px")) > 1 and pipeline.fixed.get("fx_px") is not None:
+        lines.append(f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
+                     "place of fx_px keeps it")
     lines += [
-        f"{name} = {_text(ends)}: in degrees; {ends[1]:g} radians would be "
-        f"{math.degrees(ends[1]):.4g}"
-        for name in FIELDS_OF_VIEW
-        if (ends := _ends(pipeline, name)) and ends[0] > RADIANS[0] and ends[1] < RADIANS[1]
+        _in_degrees(name, numbers) for name in FIELDS_OF_VIEW
+        if (numbers := _numbers(pipeline, name))
+        and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]
     ]
     return [
         *lines, *_centre_notes(facts), *_fold_notes(pipeline, facts), *_side_notes(pipeline, facts),
@@ -248,18 +243,19 @@ def _side_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
     if facts.side_px is None:
         return []
     far, near = facts.side_px
+    if near < min(map(module_count, pipeline.values_of("dictionary"))):
+        problem = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
+    elif far > max(facts.width_px[1], facts.height_px[1]):
+        problem = f"at least {far:.4g} px, more than the frame's"
+    else:
+        return []
     units = (
         "" if "side_px" in pipeline.given
         else "; are size_m and the distances in metres?" if "size_m" in pipeline.given
         else f"; size_m is not given: {pipeline.fixed['size_m']:g} m"
     )
-    line = ""
-    if near < min(map(module_count, pipeline.values_of("dictionary"))):
-        line = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
-    elif far > max(facts.width_px[1], facts.height_px[1]):
-        line = f"at least {far:.4g} px, more than the frame's"
     whose = "the markers' sides are" if facts.boards else "the marker's side is"
-    return [f"{whose} {line}{units}"] if line else []
+    return [f"{whose} {problem}{units}"]
 
 
 def _centre_notes(facts: CameraFacts) -> list[str]:
@@ -302,11 +298,6 @@ def _fold_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
     return [
         f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
     ]
-
-
-def _varies(pipeline: Pipeline, name: str) -> bool:
-    axis = pipeline.axis_of(name)
-    return axis is not None and len(axis) > 1
 
 
 # --------------------------------------------------------------------------------------------------
@@ -352,22 +343,15 @@ class PoseFacts:
 
     def line(self) -> str:
         """Return the poses in one line."""
-        parts = [
-            f"tilt {_extent(self.tilt_deg, '.4g')}°",
-            f"viewing angle {_extent(self.viewing_angle_deg, '.4g')}°",
-            f"{_extent(self.range_m, '.4g')} m away",
-        ]
         sample = "" if self.sampled == self.poses else f" ({self.sampled:,} poses looked at)"
-        return ", ".join(parts) + sample
+        return (f"tilt {_text(self.tilt_deg, 4)}°, viewing angle "
+                f"{_text(self.viewing_angle_deg, 4)}°, {_text(self.range_m, 4)} m away{sample}")
 
     def ranges(self) -> dict[str, list[float]]:
         """Return the least and the largest tilt, viewing angle and distance."""
         return {
-            name: [float(numbers.min()), float(numbers.max())]
-            for name, numbers in (
-                ("tilt_deg", self.tilt_deg), ("viewing_angle_deg", self.viewing_angle_deg),
-                ("range_m", self.range_m),
-            )
+            name: [float(getattr(self, name).min()), float(getattr(self, name).max())]
+            for name in ("tilt_deg", "viewing_angle_deg", "range_m")
         }
 
     def share(self, chosen: Masks) -> str:
@@ -389,6 +373,8 @@ def pose_facts(pipeline: Pipeline) -> PoseFacts:
     outside = np.zeros(count, dtype=bool)
     seen = np.flatnonzero(~behind & ~averted)
     outside[seen] = outside_frame(scenes, seen)
+    corners = scenes.corners_px
+    beyond = (corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)
     return PoseFacts(
         poses=math.prod(len(axis) for axis in scene_axes(pipeline)),
         sampled=count,
@@ -397,14 +383,8 @@ def pose_facts(pipeline: Pipeline) -> PoseFacts:
         range_m=np.linalg.norm(scenes.translation, axis=1),
         depth_m=depth,
         behind=behind, averted=averted, outside=outside,
-        cut=_cut(scenes) & ~behind & ~averted & ~outside,
+        cut=np.asarray(beyond.any(axis=(1, 2)) & ~behind & ~averted & ~outside),
     )
-
-
-def _cut(scenes: Scenes) -> Masks:
-    """Return (n,) whether a corner of the black square is outside the frame."""
-    corners, limit = scenes.corners_px, scenes.frame[:, None, :] - 0.5
-    return np.asarray(((corners < -0.5) | (corners > limit)).any(axis=(1, 2)))
 
 
 def pose_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
@@ -453,7 +433,7 @@ def _axis_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
     if in_camera and "view_angle_deg" not in given and apart > APART_DEG:
         lines.append(
             f"off the optical axis the viewing angle differs from the tilt by up to {apart:.3g}° "
-            f"(tilt {_extent(tilt, '.3g')}°, viewing angle {_extent(view, '.3g')}°): {angles} to "
+            f"(tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): {angles} to "
             "the image plane, view_angle_deg is to the line of sight")
     if in_camera and farther > FARTHER:
         lines.append(
@@ -479,17 +459,8 @@ def _unit_notes(pipeline: Pipeline) -> list[str]:
         steps = np.array([value for value in values if value]) / (math.pi / 12)
         close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
         if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
-            largest = max(values, key=abs)
-            lines.append(
-                f"{parameter.name} = {largest:g}: in degrees; {largest:g} radians would be "
-                f"{math.degrees(largest):.4g}"
-            )
+            lines.append(_in_degrees(parameter.name, values))
     return lines
-
-
-def _extent(numbers: Floats, form: str) -> str:
-    low, high = (format(round(float(end), 9) + 0.0, form) for end in (numbers.min(), numbers.max()))
-    return low if low == high else f"{low} to {high}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -551,11 +522,7 @@ def _effect(pipeline: Pipeline, effect: Effect) -> Part:
     values = [value for value in pipeline.values_of(switch) if effect.is_on(value)]
     if not values:
         return Part(name, False, f"{switch} is {effect.off_text}", switch)
-    if is_coded(effect.off):
-        extent = ", ".join(dict.fromkeys(map(label, values)))
-    else:
-        low, high = min(values), max(values)
-        extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    extent = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) else _text(values)
     return Part(name, True, f"{switch} is {extent}", switch)
 
 
@@ -580,35 +547,33 @@ def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") 
 def parts(pipeline: Pipeline) -> list[Part]:
     """Return every optional part, active or not."""
     effects, target = effects_of(pipeline.plugins), target_word(pipeline)
-    on = [
-        effect for effect in effects if effect.switch in pipeline.distributions
-        or pipeline.any_value(effect.switch, effect.is_on)
-    ]
+    drawn = pipeline.distributions
+    on = [effect for effect in effects
+          if effect.switch in drawn or pipeline.any_value(effect.switch, effect.is_on)]
     calibrated = "calibration" in pipeline.values_of("believed")
-    draws = [*pipeline.distributions]
-    if pipeline.any_value("jitter_px", lambda value: value > 0):
-        draws.append("jitter_px")
-    draws += [each.switch for each in on if each.random and each.switch not in draws]
-    draws += ["the believed calibration"] if calibrated else []
-    lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
+    draws = list(dict.fromkeys([
+        *drawn, *(["jitter_px"] if pipeline.any_value("jitter_px", bool) else []),
+        *(each.switch for each in on if each.random),
+        *(["the believed calibration"] if calibrated else []),
+    ]))
+    lens = any(map(canonical_distortion, pipeline.values_of("distortion")))
     image = pipeline.any_value("background", lambda value: isinstance(value, str))
     asked = "full" in pipeline.values_of("window")
     guarded = pipeline.any_value("guarded", bool)
     settings = detector_settings(pipeline)
-    whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
-    gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
-    if any("uneven light" in effect.worsens for effect in on):
-        gain = math.inf
-    uneven = any(effect.widens == "uneven light" for effect in on)
-    if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
+    whole = sorted({reason for each in settings if (reason := full_frame_reason(each)) is not None})
+    gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
+        [1.0, *pipeline.values_of("gain")])
+    if any(effect.widens == "uneven light" for effect in on) and any(
+            uneven_light_needs_frame(setting, gain) for setting in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
     if image:
         whole.append(
             f"the background is an image: clutter near the {target} may change the detection")
     if asked:
         whole.append('window = "full"')
-    noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
     coarse = any("noise" in effect.worsens for effect in on)
+    noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
     noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
     margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
     assumptions = [

@@ -6,10 +6,9 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from hashlib import blake2b
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +19,28 @@ from sweep.experiment.draws import (
     bits,
     even_uniform,
     geometry_keys,
+    hashed,
     jointly_drawn,
     resolve_pose,
     uniform,
 )
-from sweep.experiment.experiment import Experiment, effects_of, shows_boards
+from sweep.experiment.experiment import (
+    Grid,
+    effects_of,
+    largest_board,
+    scene_plugins,
+    shows_boards,
+)
 from sweep.experiment.parameters import PARAMETERS, Stage
 from sweep.experiment.photographs import is_simulated, recorded_poses, shows_photographs
+from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
 from sweep.model.board_kinds import ARRANGING, arranged_board
+from sweep.model.calibration import CalibrationError
 from sweep.model.camera import Column, canonical_distortion, map_columns
+from sweep.model.effects import Effect, ScenePlugins
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats
 
@@ -109,11 +118,6 @@ class Blocks:
         return int(np.ravel_multi_index(index, self.counts)) if index else 0
 
 
-def scene_axes(pipeline: Experiment) -> tuple[Axis, ...]:
-    """Return the axes that blocks are cut along."""
-    return pipeline.axes_of(Stage.scene)
-
-
 def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     """Return a parameter's values along an axis at indices (N,)."""
     low, high = int(indices.min()), int(indices.max()) + 1
@@ -125,85 +129,10 @@ def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     return Column.of([part[i] for i in (indices - low).tolist()])
 
 
-def scene_values(
-    pipeline: Experiment, indices: Sequence[NDArray[np.intp]]
-) -> dict[str, Column]:
-    """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
-
-    Random ones are drawn (those of later stages too), the pose is resolved, lenses are
-    canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
-    """
-    axes, parameters = scene_axes(pipeline), pipeline.parameters
-    count = len(indices[0]) if axes else 1
-    values = {
-        name: Column(value, constant=True)
-        for name, value in pipeline.fixed.items() if parameters[name].stage is Stage.scene
-    }
-    for axis, index in zip(axes, indices, strict=True):
-        for name, along in axis.columns.items():
-            values[name] = _column(along, index)
-    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
-    values["distortion"] = values["distortion"].map(canonical_distortion)
-    if shows_boards(pipeline):
-        values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
-    drawn = pipeline.distributions
-    if "background" not in drawn:
-        values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
-    jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
-    values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
-    noisy = any(
-        effect.switch in drawn or values[effect.switch].differs_from(effect.off)
-        for effect in effects_of(pipeline.plugins) if effect.random
-    )
-    poses = {} if values["photographs"].missing else _photographed(pipeline, values, trials)
-    if shows_photographs(pipeline):
-        return values | poses
-    calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
-    if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
-        resolve_pose(values)
-        return values | poses
-    keys = geometry_keys(values, drawn, count)
-    draw: Callable[..., Floats] = uniform
-    if pipeline.sampling == "sobol":
-        calibrated = () if calibration is None else calibration.names
-        quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
-        draw = partial(even_uniform, quantities=quantities)
-    # What is drawn for a photograph is the same for all its markers; their noise is not.
-    shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
-    for name, distribution in drawn.items():
-        number = draw(pipeline.seed, name, keys=shared, trials=trials)
-        values[name] = Column.of(distribution.at(number))
-    if (jitter > 0).any():
-        for name in ("shift_u_px", "shift_v_px"):
-            number = draw(pipeline.seed, name, keys=keys, trials=trials)
-            values[name] = Column.of(jitter * (2 * number - 1))
-    if calibration is not None:
-        values |= calibrated_columns(
-            calibration, values, count,
-            lambda quantity: draw(pipeline.seed, quantity, keys=keys, trials=trials),
-        )
-    if noisy:
-        values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
-    resolve_pose(values)
-    return values | poses
-
-
 ANY_MARKER = {
     name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
 }
 """Values of what differs from marker to marker in a photograph, as if it did not."""
-
-
-def _photographed(
-    pipeline: Experiment, values: Mapping[str, Column], trials: NDArray[np.int64]
-) -> dict[str, Column]:
-    """Return the parameters of scenes at the poses of photographs of numbers ``trials`` (N,)."""
-    names = values["photographs"].listed(len(trials))
-    ids = values["marker_id"].broadcast(len(trials), np.int64)
-    poses = recorded_poses(
-        names, pipeline.folder, trials, ids, simulated=is_simulated(pipeline)
-    )
-    return {name: Column.of(column) for name, column in poses.items()}
 
 
 def _absolute(folder: str, background: Any) -> Any:
@@ -219,71 +148,9 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
     return [grid.ravel() for grid in grids]
 
 
-def _settings(pipeline: Experiment, section: str, stage: Stage) -> list[dict[str, Any]]:
-    """Return the values of a section at all combinations of a stage's axes, in their order."""
-    fixed = {
-        p.name: pipeline.fixed.get(p.name, p.default)
-        for p in pipeline.parameters.values() if p.section == section
-    }
-    return [fixed | chosen for chosen in combinations(pipeline.axes_of(stage))]
-
-
-def detector_settings(pipeline: Experiment) -> list[AnyDetectorSetting]:
-    """Return the detector settings of the grid, in the order of its detection axes."""
-    return [
-        DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
-        if (plugin := pipeline.plugin("detector", values["detector"])) is None
-        else _plugin_setting(pipeline, plugin, values)
-        for values in _settings(pipeline, "detector", Stage.detection)
-    ]
-
-
-def _plugin_setting(
-    pipeline: Experiment, plugin: DeclaredPlugin, values: Mapping[str, Any]
-) -> PluginSetting:
-    own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
-    return PluginSetting(plugin, own, pipeline.folder)
-
-
 OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
-
-
-def board_settings(pipeline: Experiment) -> list[BoardDetectorSetting]:
-    """Return what the detector settings of the grid do with boards, in their order."""
-    names = [field.name for field in dataclasses.fields(BoardDetectorSetting)]
-    return [
-        BoardDetectorSetting(**{name: values[name] for name in names})
-        for values in _settings(pipeline, "detector", Stage.detection)
-    ]
-
-
-def estimators(pipeline: Experiment) -> list[EstimatorSetting]:
-    """Return the estimators of the grid, in the order of its estimation axes."""
-    return [
-        _estimator_setting(pipeline, values)
-        for values in _settings(pipeline, "estimator", Stage.estimation)
-    ]
-
-
-def _estimator_setting(pipeline: Experiment, values: Mapping[str, Any]) -> EstimatorSetting:
-    """Return the setting of an estimator that has these values; a plug-in takes its own, too."""
-    common = {name: values[name] for name in ESTIMATOR_FIELDS}
-    plugin = pipeline.plugin("estimator", values["solver"])
-    if plugin is None:
-        return EstimatorSetting(**common)
-    return PluggedEstimatorSetting(**common, own=_plugin_setting(pipeline, plugin, values))
-
-
+BOARD_FIELDS = tuple(field.name for field in dataclasses.fields(BoardDetectorSetting))
 ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))
-
-
-# --------------------------------------------------------------------------------------------------
-# A key of each image: a function of its scene's own parameters and draws, not of the grid.
-#
-# By it an image that was exported is recognised again: on another grid that has the same scene,
-# or as a single cell. Keys are hashes of the texts of all parameters that change the image,
-# sorted by name, defaults left out, numbers rounded to 12 significant digits, mixed with the seed
-# and the trial.
 
 NOT_IN_IMAGE = {
     "window", "camera_file", "calibration_sd", "calibration_covariance",
@@ -292,56 +159,265 @@ NOT_IN_IMAGE = {
 """Parameters of the scene's stage that do not change its image."""
 
 
-def image_keys(pipeline: Experiment, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
-    """Return the keys (N,) of the images of scenes at ``indices`` (N,) along each scene axis."""
-    axes, parameters = scene_axes(pipeline), pipeline.parameters
-    count = len(indices[0]) if axes else 1
-    values = {
-        name: Column(value, constant=True) for name, value in pipeline.fixed.items()
-        if parameters[name].stage is Stage.scene
-    }
-    for axis, index in zip(axes, indices, strict=True):
-        for name, along in axis.columns.items():
-            values[name] = Column.of([along[i] for i in index.tolist()])
-    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
-    texts = [
-        _texts(pipeline, name, values[name])
-        for name in sorted(values.keys() - NOT_IN_IMAGE - pipeline.distributions.keys())
-    ]
-    texts += [
-        Column.of(f"{name}={distribution}")
-        for name, distribution in sorted(pipeline.distributions.items())
-        if parameters[name].stage is Stage.scene
-    ]
-    used = [column for column in texts if column.differs_from("")]
-    joined = map_columns(lambda *each: "|".join(filter(None, each)), used) if used \
-        else Column.of("")
-    keys = joined.map(_hash).broadcast(count, np.uint64)
-    return bits(pipeline.seed, f"image {pipeline.sampling}", keys, trials)
+# --------------------------------------------------------------------------------------------------
+# The experiment: what a pipeline asks for, resolved once in each process.
 
+class Experiment:
+    """What follows from a checked pipeline: axes, draws, settings and variables, resolved once.
 
-def _texts(pipeline: Experiment, name: str, column: Column) -> Column:
-    """Return "name=value" of each value, empty where it is the default."""
-    default = pipeline.parameters[name].default
+    Attributes
+    ----------
+    grid
+        The values, axes and distributions of the pipeline.
+    """
 
-    @cache
-    def text(value: Any) -> str:
-        if value is None or value == default:
-            return ""
-        if name == "background" and isinstance(value, str):
-            return f"{name}={pipeline.files.get(value) or value}"
-        return f"{name}={_text(value)}"
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
 
-    return column.map(text)
+    @cached_property
+    def scene_axes(self) -> tuple[Axis, ...]:
+        """The axes that blocks are cut along."""
+        return self.grid.axes_of(Stage.scene)
+
+    @cached_property
+    def detectors(self) -> list[AnyDetectorSetting]:
+        """The detector settings, in the order of the detection axes."""
+        return [
+            DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+            if (plugin := self.grid.plugin("detector", values["detector"])) is None
+            else self._plugged(plugin, values)
+            for values in self._settings("detector", Stage.detection)
+        ]
+
+    @cached_property
+    def board_settings(self) -> list[BoardDetectorSetting]:
+        """What the detector settings do with boards, in their order."""
+        return [
+            BoardDetectorSetting(**{name: values[name] for name in BOARD_FIELDS})
+            for values in self._settings("detector", Stage.detection)
+        ]
+
+    @cached_property
+    def estimators(self) -> list[EstimatorSetting]:
+        """The estimators, in the order of the estimation axes."""
+        return [
+            EstimatorSetting(**common)
+            if (plugin := self.grid.plugin("estimator", values["solver"])) is None
+            else PluggedEstimatorSetting(**common, own=self._plugged(plugin, values))
+            for values in self._settings("estimator", Stage.estimation)
+            for common in [{name: values[name] for name in ESTIMATOR_FIELDS}]
+        ]
+
+    def _settings(self, section: str, stage: Stage) -> list[dict[str, Any]]:
+        """Return the values of a section at all combinations of a stage's axes, in their order."""
+        fixed = {
+            p.name: self.grid.fixed.get(p.name, p.default)
+            for p in self.grid.parameters.values() if p.section == section
+        }
+        return [fixed | chosen for chosen in combinations(self.grid.axes_of(stage))]
+
+    def _plugged(self, plugin: DeclaredPlugin, values: Mapping[str, Any]) -> PluginSetting:
+        own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
+        return PluginSetting(plugin, own, self.grid.folder)
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """The built-in effects and those of plug-ins, which are not imported for it."""
+        return effects_of(self.grid.plugins)
+
+    @property
+    def scene_plugins(self) -> ScenePlugins:
+        """What plug-ins add to the scenes, imported.
+
+        Raises
+        ------
+        PluginError
+            If one is not the plug-in that was declared; in one line.
+        """
+        return scene_plugins(self.grid)
+
+    @cached_property
+    def calibration(self) -> CalibrationError | None:
+        """The error of the calibration that an estimator believes; None if none does."""
+        return believed_calibration(self.grid.fixed, self.grid.values_of("believed"))
+
+    @cached_property
+    def shows_boards(self) -> bool:
+        """Whether scenes show boards; single markers count as boards then."""
+        return shows_boards(self.grid)
+
+    @cached_property
+    def largest_board(self) -> tuple[int, int]:
+        """The most markers and the most chessboard corners of a target."""
+        return largest_board(self.grid) if self.shows_boards else (1, 0)
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """The variables of the dataset: the schema's, then draws."""
+        return variables_of(self.grid)
+
+    @cached_property
+    def drawn(self) -> tuple[Variable, ...]:
+        """Those of them that hold what is drawn for each scene."""
+        return drawn_variables(self.grid)
+
+    @cached_property
+    def _constants(self) -> dict[str, Column]:
+        """The scene's parameters that are fixed."""
+        return {
+            name: Column(value, constant=True) for name, value in self.grid.fixed.items()
+            if self.grid.parameters[name].stage is Stage.scene
+        }
+
+    def scene_values(self, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
+        """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
+
+        Random ones are drawn (those of later stages too), the pose is resolved, lenses are
+        canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
+        """
+        grid = self.grid
+        count = len(indices[0]) if self.scene_axes else 1
+        values = dict(self._constants)
+        for axis, index in zip(self.scene_axes, indices, strict=True):
+            for name, along in axis.columns.items():
+                values[name] = _column(along, index)
+        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+        values["distortion"] = values["distortion"].map(canonical_distortion)
+        if self.shows_boards:
+            values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
+        drawn = grid.distributions
+        if "background" not in drawn:
+            values["background"] = values["background"].map(partial(_absolute, grid.folder))
+        jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
+        values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
+        noisy = any(
+            effect.switch in drawn or values[effect.switch].differs_from(effect.off)
+            for effect in self.effects if effect.random
+        )
+        poses = {} if values["photographs"].missing else self._photographed(values, trials)
+        if shows_photographs(grid):
+            return values | poses
+        calibration = self.calibration
+        if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
+            resolve_pose(values)
+            return values | poses
+        keys = geometry_keys(values, drawn, count)
+        draw: Callable[..., Floats] = uniform
+        if grid.sampling == "sobol":
+            calibrated = () if calibration is None else calibration.names
+            quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
+            draw = partial(even_uniform, quantities=quantities)
+        # What is drawn for a photograph is the same for all its markers; their noise is not.
+        shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
+        for name, distribution in drawn.items():
+            number = draw(grid.seed, name, keys=shared, trials=trials)
+            values[name] = Column.of(distribution.at(number))
+        if (jitter > 0).any():
+            for name in ("shift_u_px", "shift_v_px"):
+                number = draw(grid.seed, name, keys=keys, trials=trials)
+                values[name] = Column.of(jitter * (2 * number - 1))
+        if calibration is not None:
+            values |= calibrated_columns(
+                calibration, values, count,
+                lambda quantity: draw(grid.seed, quantity, keys=keys, trials=trials),
+            )
+        if noisy:
+            values["noise_key"] = Column.of(bits(grid.seed, "noise", keys, trials))
+        resolve_pose(values)
+        return values | poses
+
+    def _photographed(
+        self, values: Mapping[str, Column], trials: NDArray[np.int64]
+    ) -> dict[str, Column]:
+        """Return the parameters of scenes at the poses of photographs ``trials`` (N,)."""
+        names = values["photographs"].listed(len(trials))
+        ids = values["marker_id"].broadcast(len(trials), np.int64)
+        poses = recorded_poses(
+            names, self.grid.folder, trials, ids, simulated=is_simulated(self.grid)
+        )
+        return {name: Column.of(column) for name, column in poses.items()}
+
+    # A key of each image: a function of its scene's own parameters and draws, not of the grid.
+    #
+    # By it an image that was exported is recognised again: on another grid that has the same
+    # scene, or as a single cell. Keys are hashes of the texts of all parameters that change the
+    # image, sorted by name, defaults left out, numbers rounded to 12 significant digits, mixed
+    # with the seed and the trial.
+
+    def image_keys(self, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
+        """Return the keys (N,) of the images of scenes at ``indices`` (N,) along the scene axes."""
+        grid = self.grid
+        count = len(indices[0]) if self.scene_axes else 1
+        values = dict(self._constants)
+        for axis, index in zip(self.scene_axes, indices, strict=True):
+            for name, along in axis.columns.items():
+                values[name] = Column.of([along[i] for i in index.tolist()])
+        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+        texts = [
+            self._texts(name, values[name])
+            for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())
+        ]
+        texts += [
+            Column.of(f"{name}={distribution}")
+            for name, distribution in sorted(grid.distributions.items())
+            if grid.parameters[name].stage is Stage.scene
+        ]
+        return bits(grid.seed, f"image {grid.sampling}", hashed(texts, count), trials)
+
+    def _texts(self, name: str, column: Column) -> Column:
+        """Return "name=value" of each value, empty where it is the default."""
+        default = self.grid.parameters[name].default
+
+        @cache
+        def text(value: Any) -> str:
+            if value is None or value == default:
+                return ""
+            if name == "background" and isinstance(value, str):
+                return f"{name}={self.grid.files.get(value) or value}"
+            return f"{name}={_text(value)}"
+
+        return column.map(text)
 
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return ",".join(_text(item) for item in value)
+        return ",".join("" if item is None else _text(item) for item in value)
     return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
 
 
-@cache
-def _hash(text: str) -> np.uint64:
-    """Return 64 bits of a text's BLAKE2b hash."""
-    return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))
+class Compiled(Protocol):
+    """A pipeline, whose experiment is resolved when it is asked for."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment that it describes."""
+
+
+def scene_axes(pipeline: Compiled) -> tuple[Axis, ...]:
+    """Return the axes that blocks are cut along."""
+    return pipeline.experiment.scene_axes
+
+
+def scene_values(pipeline: Compiled, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
+    """Return :meth:`Experiment.scene_values` of a pipeline."""
+    return pipeline.experiment.scene_values(indices)
+
+
+def image_keys(pipeline: Compiled, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
+    """Return :meth:`Experiment.image_keys` of a pipeline."""
+    return pipeline.experiment.image_keys(indices)
+
+
+def detector_settings(pipeline: Compiled) -> list[AnyDetectorSetting]:
+    """Return the detector settings of a pipeline."""
+    return pipeline.experiment.detectors
+
+
+def board_settings(pipeline: Compiled) -> list[BoardDetectorSetting]:
+    """Return what the detector settings of a pipeline do with boards."""
+    return pipeline.experiment.board_settings
+
+
+def estimators(pipeline: Compiled) -> list[EstimatorSetting]:
+    """Return the estimators of a pipeline."""
+    return pipeline.experiment.estimators

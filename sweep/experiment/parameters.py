@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from sweep.declaration import Declared, declared_fields
 from sweep.measure.bound import BoundSetting
@@ -151,3 +152,23 @@ def contradictions(given: Collection[str]) -> list[tuple[list[str], list[str]]]:
         ways = [names for way in choice if (names := [name for name in way if name in given])]
         pairs += [(ways[0], other) for other in ways[1:]]
     return pairs
+
+
+# --------------------------------------------------------------------------------------------------
+# Where a document has a parameter: under its section, or along an axis, alone or with others.
+
+def is_zip(value: Any) -> bool:
+    """Return whether a value under [axes] makes an axis of parameters that go together."""
+    return isinstance(value, dict) and value.keys() == {"zip"} and isinstance(value["zip"], dict)
+
+
+def places(document: Mapping[str, Any], parameter: Parameter) -> dict[str, Any]:
+    """Return the value of each place of a document that gives a parameter, by its path."""
+    axes = document.get("axes")
+    tables = {parameter.section: document.get(parameter.section), "axes": axes} | {
+        f"axes.{key}": value["zip"]
+        for key, value in (axes if isinstance(axes, dict) else {}).items() if is_zip(value)
+    }
+    name = parameter.name
+    return {f"{path}.{name}": table[name] for path, table in tables.items()
+            if isinstance(table, dict) and name in table}

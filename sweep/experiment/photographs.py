@@ -30,7 +30,7 @@ from sweep.plugins.array_file import array_file, read_arrays
 from sweep.typing import Floats, Integers, Masks
 
 if TYPE_CHECKING:
-    from sweep.experiment.experiment import Experiment
+    from sweep.experiment.experiment import Grid
 
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""
@@ -164,12 +164,12 @@ def along_photographs(axes: Iterable[Axis]) -> list[bool]:
     return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
 
 
-def shows_photographs(pipeline: Experiment) -> bool:
+def shows_photographs(pipeline: Grid) -> bool:
     """Return whether the images of a pipeline are photographs, not simulated at their poses."""
     return PHOTOGRAPHS in pipeline.given and not is_simulated(pipeline)
 
 
-def is_simulated(pipeline: Experiment) -> bool:
+def is_simulated(pipeline: Grid) -> bool:
     """Return whether a pipeline's images are simulated at the poses of photographs."""
     return pipeline.fixed.get(SIMULATED) is True
 

@@ -1,29 +1,37 @@
-"""The pipeline: an experiment read from a document, which is checked as a whole; --set and --at."""
+"""The pipeline: a document that is checked as a whole; its values changed by --set and --at."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import tomlkit
-import tomlkit.items
 
-from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL
+from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL, Axis, Distribution
 from sweep.experiment.cameras import (
     FILE_DEVIATIONS,
     FILE_VALUES,
     OTHER_WAYS,
     read_camera_file,
     resolve_sensor,
-    with_values,
 )
-from sweep.experiment.experiment import Experiment
-from sweep.experiment.parameters import PARAMETERS, REMOVED, RIVALS, Parameter
+from sweep.experiment.experiment import Grid
+from sweep.experiment.grid import Experiment
+from sweep.experiment.parameters import PARAMETERS, RIVALS, Parameter, is_zip
 from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
-from sweep.experiment.reader import HEADER, REQUIRE, is_zip, read_keys, section_of
+from sweep.experiment.reader import (
+    HEADER,
+    REQUIRE,
+    Reading,
+    StoppingRule,
+    read_keys,
+    removed,
+    section_of,
+)
 from sweep.experiment.rules import check_rules
 from sweep.experiment.sampling import (
     MAX_TRIALS,
@@ -39,6 +47,7 @@ from sweep.experiment.toml_text import (
     quoted_if_bare,
     read_document,
     read_value,
+    toml_item,
 )
 from sweep.messages import MAX_FAULTS, nearest, plain, refusal
 from sweep.model.board_kinds import used_by
@@ -92,8 +101,7 @@ def parse_settings(
         elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-            hint = f"; {REMOVED[name]}" if name in REMOVED else hint
-            faults.append(f"{start}unknown parameter{hint}")
+            faults.append(f"{start}unknown parameter{removed(name) or hint}")
         elif is_zip(value) and section in ("", "axes"):
             chosen[name] = value
         elif home and section not in ("", home, "axes"):
@@ -115,12 +123,29 @@ def displaced_by(chosen: Collection[str]) -> set[str]:
     return others.difference(chosen)
 
 
-def _delete(document: Any, names: Collection[str]) -> None:
-    """Delete parameters from all tables of a document."""
-    for table in document.values():
-        if isinstance(table, dict):
-            for name in table.keys() & names:
-                del table[name]
+def _displaced(
+    document: Mapping[str, Any], chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]
+) -> set[str]:
+    """Return the keys of a document that give way to chosen values.
+
+    They are other ways to say the same, and parameters of boards that chosen kinds do not use.
+    """
+    names = displaced_by(chosen)
+    if any(name.endswith(f".{MAX_TRIALS}") for name in chosen):
+        names.add(TRIAL)
+    elif TRIAL in chosen:
+        names.add(MAX_TRIALS)
+    if "kind" in chosen:
+        kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
+        used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
+        names |= {name for name, each in parameters.items() if each.section == "board"} - used
+    camera = document.get("camera")
+    if isinstance(camera, dict) and "camera_file" not in chosen and (
+        camera.keys() >= {"camera_file", *FILE_VALUES}
+        and not chosen.keys().isdisjoint((*FILE_VALUES, *OTHER_WAYS))
+    ):
+        names.add("camera_file")  # the document has its values, one of which is another now
+    return names
 
 
 def apply_settings(
@@ -131,92 +156,28 @@ def apply_settings(
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
     makes the parameter fixed or drawn. What the chosen values displace goes.
     """
-    _leave_camera_file(document, chosen)
-    _delete(document, displaced_by(chosen))
-    _delete(document, _other_counts(chosen) | _of_other_boards(chosen, parameters))
+    displaced = _displaced(document, chosen, parameters)
+    for table in document.values():
+        if isinstance(table, dict):
+            for name in table.keys() & displaced:
+                del table[name]
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
-        elif "." in name:  # a key of a section that has no parameters
-            section, _, key = name.partition(".")
-            if isinstance(document.setdefault(section, {}), dict):
-                document[section][key] = value
-        elif all(
-            isinstance(document.get(table, {}), dict)
-            for table in (section_of(name, parameters), "axes")
-        ):
-            _write(document, name, value, parameters)
+            continue
+        if "." in name:  # a key of a section that has no parameters
+            home, _, key = name.partition(".")
+            other = home
+        else:
+            section, key = section_of(name, parameters) or "axes", name
+            home, other = (
+                ("axes", section) if _is_axis(name, value, parameters) else (section, "axes"))
+        if all(isinstance(document.get(table, {}), dict) for table in (home, other)):
+            if other != home and key in document.get(other, {}):
+                del document[other][key]
+            inline = isinstance(document, tomlkit.TOMLDocument) and isinstance(value, dict)
+            document.setdefault(home, {})[key] = toml_item(value) if inline else value
         # Otherwise a section is no table, which reading the document reports.
-
-
-def _of_other_boards(
-    chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]
-) -> set[str]:
-    """Return the parameters of boards that chosen kinds do not use; those of other kinds go."""
-    if "kind" not in chosen:
-        return set()
-    kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
-    used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
-    return {name for name, each in parameters.items() if each.section == "board"} - used
-
-
-def _other_counts(chosen: Collection[str]) -> set[str]:
-    """Return the keys that say how many trials there are in another way than chosen ones."""
-    if any(name.endswith(f".{MAX_TRIALS}") for name in chosen):
-        return {TRIAL}
-    return {MAX_TRIALS} if TRIAL in chosen else set()
-
-
-def _leave_camera_file(document: Any, chosen: Collection[str]) -> None:
-    """Delete the name of a camera file whose values the document has, if one of them is chosen."""
-    camera = document.get("camera")
-    if not isinstance(camera, dict) or "camera_file" in chosen:
-        return
-    if camera.keys() >= {"camera_file", *FILE_VALUES} and {*FILE_VALUES, *OTHER_WAYS} & {*chosen}:
-        del camera["camera_file"]
-
-
-def fix_values(
-    document: Any, chosen: Mapping[str, Any], parameters: Mapping[str, Parameter] = PARAMETERS
-) -> None:
-    """Fix parameters of a document at chosen values.
-
-    The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen, and
-    what the chosen values displace. The document has the values of its camera file, which goes if
-    another value is chosen for one of them.
-    """
-    axes = document.get("axes", {})
-    for section in (REQUIRE, *STOPPING_SECTIONS):  # one pose fulfils or fails nothing
-        document.pop(section, None)
-    _leave_camera_file(document, chosen)
-    _delete(document, {
-        TRIAL, *displaced_by(chosen), *_of_other_boards(chosen, parameters),
-        *(name for name, value in axes.items() if is_zip(value)),
-    })
-    for name, value in chosen.items():
-        written = list(value) if isinstance(value, tuple) else value
-        _write(document, name, written, parameters)
-
-
-def _write(
-    document: Any, name: str, value: Any, parameters: Mapping[str, Parameter]
-) -> None:
-    """Write a parameter under its section or under the axes, and delete it from the other."""
-    section = parameters[name].section if name in parameters else "axes"
-    is_axis = name == TRIAL or _is_axis(name, value, parameters)
-    home, other = ("axes", section) if is_axis else (section, "axes")
-    if other != home and name in document.get(other, {}):
-        del document[other][name]
-    if home not in document:
-        document[home] = {}
-    inline = isinstance(document, tomlkit.TOMLDocument) and isinstance(value, dict)
-    document[home][name] = _inline(value) if inline else value
-
-
-def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
-    inline = tomlkit.inline_table()
-    inline.update(table)
-    return inline
 
 
 def _is_axis(name: str, value: Any, parameters: Mapping[str, Parameter]) -> bool:
@@ -233,16 +194,37 @@ def _is_axis(name: str, value: Any, parameters: Mapping[str, Parameter]) -> bool
 
 
 # --------------------------------------------------------------------------------------------------
-# The pipeline: an experiment read from a document, which is checked as a whole.
+# The pipeline: a document that is checked as a whole.
 
 MAX_SHOWN_PATH_LENGTH = 400
 
 
-@dataclass(frozen=True, slots=True)
-class Pipeline(Experiment):
-    """An experiment read from a document, which is checked as a whole.
+@dataclass(frozen=True)
+class Pipeline(Grid):
+    """A document that is checked as a whole: the grid, its fixed values and its random draws.
 
     Made by :meth:`from_toml`, :meth:`from_text` or :meth:`from_dict`.
+
+    Attributes
+    ----------
+    name
+        What stores are named after: the file's stem.
+    title, seed, sampling
+        As the document says; the seed of all random draws, and how those of a cell's trials relate
+        (:data:`sweep.experiment.draws.SAMPLINGS`).
+    fixed, given, distributions, axes, files, folder, plugins
+        As :class:`sweep.experiment.experiment.Grid` has them.
+    text
+        The effective TOML text: settings and the values of a camera file included.
+    requirements, require_per
+        What is required of the results, as texts, and the axes whose values are conditions: the
+        section [require]. No part of an experiment's identity.
+    stopping
+        When sampling stops, as a section such as [precision] says; None if every trial is computed.
+    budget_ms
+        The most milliseconds of a frame, if [require] has a budget.
+    source
+        What lines on faults begin with: the file, if there is one. It is not compared.
 
     Examples
     --------
@@ -250,9 +232,51 @@ class Pipeline(Experiment):
     ...     "marker": {"size_m": 0.05},
     ...     "axes": {"distance_m": {"geom": [0.1, 1, 20]}, "tilt_deg": [0, 45, 70]},
     ... })
-    >>> [axis.name for axis in pipeline.axes], pipeline.size(Stage.scene)
-    (['distance_m', 'tilt_deg'], 60)
+    >>> {axis.name: len(axis) for axis in pipeline.axes}
+    {'distance_m': 20, 'tilt_deg': 3}
     """
+
+    name: str
+    title: str
+    seed: int
+    sampling: str
+    fixed: Mapping[str, Any]
+    given: frozenset[str]
+    distributions: Mapping[str, Distribution]
+    axes: tuple[Axis, ...]
+    text: str
+    files: Mapping[str, str]
+    folder: str
+    plugins: tuple[DeclaredPlugin, ...] = ()
+    requirements: tuple[str, ...] = ()
+    require_per: tuple[str, ...] = ()
+    stopping: StoppingRule | None = None
+    budget_ms: float | None = None
+    source: str = field(default="pipeline", compare=False)
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """The experiment that it describes, resolved once in each process."""
+        return Experiment(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process gets; it resolves the experiment itself."""
+        return {name: value for name, value in vars(self).items() if name != "experiment"}
+
+    @property
+    def heading(self) -> str:
+        """The title, or without one the name, as it can be printed."""
+        return self.title.strip() or plain(self.name)
+
+    def cell_at(self, index: Mapping[str, int]) -> dict[str, Any]:
+        """Return the value of each parameter that varies, and ``trial``, at indices along axes.
+
+        Axes that ``index`` does not name are left out.
+        """
+        return {
+            name: value for axis in self.axes if axis.name in index
+            for name, value in axis.at(index[axis.name]).items()
+        }
 
     @staticmethod
     def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
@@ -329,20 +353,14 @@ class Pipeline(Experiment):
         PipelineError
             One line for each fault of the text or of the settings.
         """
-        document = _document(text, source)
+        reading = Reading(
+            _document(text, source), source, str(folder), files, camera_files, plugins)
+        chosen = {}
         if settings:
-            parameters = _parameters(document, settings, folder, plugins)
+            parameters = _parameters(reading, settings)
             chosen = parse_settings(settings, parameters)
-            apply_settings(document, chosen, parameters)
-            # Checked before tomlkit, which keeps the comments, reads it again: tomlkit is slow.
-            _checked(
-                document, text, name, source, Path(folder), files, camera_files, plugins
-            )
-            written = tomlkit.parse(text)
-            apply_settings(written, chosen, parameters)
-            text = tomlkit.dumps(written)
-            document = _document(text, source)
-        return _checked(document, text, name, source, Path(folder), files, camera_files, plugins)
+            apply_settings(reading.document, chosen, parameters)
+        return _checked(reading, text, name, chosen)
 
     @staticmethod
     def from_dict(
@@ -395,7 +413,8 @@ class Pipeline(Experiment):
     def fixed_at(self, chosen: Mapping[str, Any], source: str = "--at") -> Pipeline:
         """Return the pipeline with parameters fixed at chosen values, checked as a file is.
 
-        The axis ``trial`` goes, and what they replace, such as ``side_px`` for ``distance_m``.
+        The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen,
+        and what they replace, such as ``side_px`` for ``distance_m``.
 
         Raises
         ------
@@ -403,11 +422,17 @@ class Pipeline(Experiment):
             One line for each fault, beginning with ``source``.
         """
         document = _document(self.text, source)
-        fix_values(document, chosen, self.parameters)
-        text = tomlkit.dumps(document)
-        return _checked(
-            document, text, self.name, source, Path(self.folder), None, self.files, self.plugins
-        )
+        for section in (REQUIRE, *STOPPING_SECTIONS):  # one pose fulfils or fails nothing
+            document.pop(section, None)
+        axes = document.get("axes", {})
+        for name in [name for name, value in axes.items() if name == TRIAL or is_zip(value)]:
+            del axes[name]
+        apply_settings(document, {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in chosen.items()
+        }, self.parameters)
+        reading = Reading(document, source, self.folder, None, self.files, self.plugins)
+        return _checked(reading, document_text(document), self.name)
 
 
 def _similar(path: Path) -> str:
@@ -430,29 +455,28 @@ def _document(text: str, source: str) -> dict[str, Any]:
         raise refusal([f"{source}: {error}"]) from None
 
 
-def _parameters(
-    document: Mapping[str, Any], settings: Sequence[str], folder: str | Path,
-    known: Sequence[DeclaredPlugin] | None,
-) -> Mapping[str, Parameter]:
+def _parameters(reading: Reading, settings: Sequence[str]) -> Mapping[str, Parameter]:
     """Return the parameters of a document once the settings that name plug-ins are applied."""
     naming = {EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values())}
     chosen = parse_settings(
         [each for each in settings
          if each.partition("=")[0].strip().rpartition(".")[2] in naming]
     )
-    changed = copy.deepcopy(dict(document))
+    changed = copy.deepcopy(reading.document)
     apply_settings(changed, chosen)
-    plugins, _ = read_plugins(changed, str(folder), known)  # faults are told when it is checked
+    # Faults are told when it is checked.
+    plugins, _ = read_plugins(changed, reading.folder, reading.known_plugins)
     return parameters_with(tuple(plugins))
 
 
 def _checked(
-    document: Mapping[str, Any], text: str, name: str, source: str, folder: Path,
-    files: Mapping[str, str] | None, camera_files: Mapping[str, str] | None,
-    plugins: Sequence[DeclaredPlugin] | None,
+    reading: Reading, text: str, name: str, chosen: Mapping[str, Any] | None = None
 ) -> Pipeline:
-    """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files, camera_files, plugins, STOPPING_SECTIONS)
+    """Return the pipeline of a document; PipelineError with all its faults.
+
+    ``text`` is its text without the ``chosen`` values, which the document has.
+    """
+    read_keys(reading, STOPPING_SECTIONS)
     read_stopping(reading)
     read_camera_file(reading)
     resolve_sensor(reading)
@@ -460,15 +484,20 @@ def _checked(
     read_required(reading)
     if reading.faults:
         raise refusal(reading.faults)
-    if reading.stated:
-        text = with_values(text, "camera", reading.stated)
+    if chosen or reading.stated:
+        # Comments stay. A text that is refused never comes here: tomlkit is slow.
+        written = tomlkit.parse(text)
+        apply_settings(written, chosen or {}, reading.parameters)
+        for key, value in reading.stated.items():
+            written.setdefault("camera", tomlkit.table())[key] = toml_item(value)
+        text = tomlkit.dumps(written)
     return Pipeline(
         name=name, title=reading.title, seed=reading.seed, sampling=reading.sampling,
         fixed=reading.fixed,
         given=frozenset(reading.given), distributions=reading.distributions,
         axes=tuple(reading.axes.values()), text=text, files=reading.files,
-        folder=str(folder.resolve()), plugins=reading.plugins,
+        folder=str(Path(reading.folder).resolve()), plugins=reading.plugins,
         requirements=reading.requirements, require_per=reading.require_per,
         stopping=reading.stopping,
-        budget_ms=reading.budget_ms, source=source,
+        budget_ms=reading.budget_ms, source=reading.source,
     )

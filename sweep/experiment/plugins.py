@@ -8,7 +8,7 @@ from functools import cache, lru_cache
 from typing import Any
 
 from sweep.errors import PluginError
-from sweep.experiment.parameters import PARAMETERS, SECTIONS, Parameter
+from sweep.experiment.parameters import PARAMETERS, SECTIONS, Parameter, places
 from sweep.messages import MAX_FAULTS
 from sweep.plugins.declared import DeclaredPlugin, declare
 from sweep.plugins.loading import installed_names
@@ -27,27 +27,22 @@ def section_of_settings(kind: str) -> str:
     return NAMED_BY[kind].section if kind in NAMED_BY else "scene"
 
 
-def named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield kind, name and key of each plug-in that a document names, in its order, once."""
-    seen = set()
+def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Yield kind, name and key of each plug-in that a document names, in its order."""
     installed = cache(installed_names)
     for kind, parameter in NAMED_BY.items():
-        for key, value in _values(document, parameter.section, parameter.name):
-            for name in value if isinstance(value, list) else [value]:
-                if (
-                    isinstance(name, str) and (kind, name) not in seen
-                    and is_plugin(parameter, name, installed)
-                ):
-                    seen.add((kind, name))
+        for key, value in places(document, parameter).items():
+            listed = value.get("values") if isinstance(value, dict) else value
+            for name in listed if isinstance(listed, list) else [listed]:
+                if isinstance(name, str) and _is_plugin(parameter, name, installed):
                     yield kind, name, key
     effects = document.get(EFFECTS_KEY)
     for name in effects if isinstance(effects, list) else ():
-        if isinstance(name, str) and ("effect", name) not in seen:
-            seen.add(("effect", name))
+        if isinstance(name, str):
             yield "effect", name, EFFECTS_KEY
 
 
-def is_plugin(
+def _is_plugin(
     parameter: Parameter, name: str, installed: Callable[[str], Sequence[str]]
 ) -> bool:
     """Return whether a value names a plug-in, or is meant to: it is none of the choices.
@@ -64,23 +59,6 @@ def is_plugin(
     return False
 
 
-def _values(document: Mapping[str, Any], section: str, parameter: str) -> Iterator[tuple[str, Any]]:
-    """Yield key and value of each place of a document that gives a parameter."""
-    table = document.get(section)
-    if isinstance(table, dict) and parameter in table:
-        yield f"{section}.{parameter}", table[parameter]
-    axes = document.get("axes")
-    for key, value in axes.items() if isinstance(axes, dict) else ():
-        if key == parameter:
-            yield f"axes.{key}", value.get("values") if isinstance(value, dict) else value
-        elif isinstance(value, dict) and isinstance(value.get("zip"), dict):
-            member = value["zip"].get(parameter)
-            if member is not None:
-                yield f"axes.{key}.{parameter}", (
-                    member.get("values") if isinstance(member, dict) else member
-                )
-
-
 def read_plugins(
     document: Mapping[str, Any], folder: str, known: Iterable[DeclaredPlugin] | None
 ) -> tuple[list[DeclaredPlugin], list[tuple[str, str, str, str]]]:
@@ -89,19 +67,18 @@ def read_plugins(
     ``known`` are those of a store, or of the pipeline that the document is a cell of: they are
     taken instead of importing them, also those that the document does not name.
     """
-    if known is not None:
-        plugins = list(known)
-        recorded = {(plugin.kind, plugin.name) for plugin in plugins}
-        return plugins, [
-            (kind, key, name, "a plug-in that the store has recorded")
-            for kind, name, key in named(document) if (kind, name) not in recorded
-        ]
-    plugins = []
+    plugins = list(known or ())
+    declared = {(plugin.kind, plugin.name) for plugin in plugins}
     faults: list[tuple[str, str, str, str]] = []
-    for kind, name, key in named(document):
+    for kind, name, key in _named(document):
+        if (kind, name) in declared:
+            continue
+        declared.add((kind, name))
         if len(faults) == MAX_FAULTS:
             break  # no more are told
         try:
+            if known is not None:
+                raise PluginError("a plug-in that the store has recorded")
             plugin = declare(kind, name, folder)
             parameters_with((*plugins, plugin))
         except PluginError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from sweep.declaration import Declaration, Declared, TablesError
@@ -19,14 +18,16 @@ from sweep.experiment.axes import (
     zipped_axis,
 )
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.parameters import PARAMETERS, REMOVED, SECTIONS, Parameter
-from sweep.experiment.plugins import (
-    EFFECTS_KEY,
-    NAMED_BY,
-    parameters_with,
-    read_plugins,
-    section_of_settings,
+from sweep.experiment.experiment import Grid
+from sweep.experiment.parameters import (
+    PARAMETERS,
+    REMOVED,
+    SECTIONS,
+    Parameter,
+    is_zip,
+    places,
 )
+from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, read_plugins, section_of_settings
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -72,7 +73,7 @@ class StoppingRule(Protocol):
 
 
 @dataclass(slots=True)
-class Reading:
+class Reading(Grid):
     """What a document says, as far as it could be read, and its faults.
 
     Attributes
@@ -89,14 +90,12 @@ class Reading:
         The same of camera files alone, whose values the document has.
     known_plugins
         The plug-ins that a store has recorded, used instead of importing them; None to import.
-    title, seed, sampling, fixed, distributions, axes, files
-        As :class:`sweep.experiment.experiment.Experiment` has them; ``axes`` by name.
+    title, seed, sampling, fixed, distributions, axes, files, plugins
+        As :class:`sweep.experiment.pipeline.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
     requirements, require_per, budget_ms, stopping
-        As :class:`sweep.experiment.experiment.Experiment` has them.
-    plugins, parameters
-        The plug-ins that the document names, and every parameter by its name, theirs included.
+        As :class:`sweep.experiment.pipeline.Pipeline` has them.
     unread
         Parameters that name plug-ins that cannot be used, and the sections of their settings: any
         key may be theirs.
@@ -108,8 +107,8 @@ class Reading:
 
     document: Mapping[str, Any]
     source: str
-    folder: Path
-    known_files: Mapping[str, str] | None
+    folder: str
+    known_files: Mapping[str, str] | None = None
     known_cameras: Mapping[str, str] | None = None
     known_plugins: Sequence[DeclaredPlugin] | None = None
     title: str = ""
@@ -126,66 +125,60 @@ class Reading:
     budget_ms: float | None = None
     stated: dict[str, Any] = field(default_factory=dict)
     plugins: tuple[DeclaredPlugin, ...] = ()
-    parameters: Mapping[str, Parameter] = field(default_factory=lambda: PARAMETERS)
     unread: set[str] = field(default_factory=set)
     faults: list[str] = field(default_factory=list)
 
     def fault(self, key: str, value: Any, expected: str) -> None:
         """Note a fault of a key's value."""
-        self.faults.append(f"{self.source}: {plain(key)} = {shown(value)}: expected {expected}")
+        self.note(f"{plain(key)} = {shown(value)}", f"expected {expected}")
+
+    def note(self, key: str, problem: str) -> None:
+        """Note a fault without a value."""
+        self.faults.append(f"{self.source}: {key}: {problem}")
 
     def refuse(self, name: str, expected: str) -> None:
         """Note a fault of a parameter as the document has it."""
-        path = next(iter(self.places(name)), f"{self.parameters[name].section}.{name}")
+        parameter = self.parameters[name]
+        path = next(iter(places(self.document, parameter)), f"{parameter.section}.{name}")
         self.fault(path, self.written(name), expected)
 
     def refuse_values(self, name: str, expected: str, wrong: Callable[[Any], bool]) -> None:
         """Note a fault of each value of a parameter on the grid that is wrong."""
-        for value in dict.fromkeys(filter(wrong, self.values(name))):
+        for value in dict.fromkeys(filter(wrong, self.values_of(name))):
             self.fault(f"{self.parameters[name].section}.{name}", value, expected)
 
     def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
         """Note an unknown key, with the nearest known one if the line will be printed."""
         hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
-        if (removed := key.rpartition(".")[2]) in REMOVED:
-            hint = f"; {REMOVED[removed]}"
-        self.faults.append(f"{self.source}: {plain(key)}: {problem}{hint}")
+        self.note(plain(key), f"{problem}{removed(key.rpartition('.')[2]) or hint}")
 
     def unknown_key(self, section: str, key: str, known: Sequence[str], expected: str = "") -> None:
         """Note a key that a section does not have, with the section where it or a similar one is.
 
         ``known`` are the section's keys; ``expected`` says so in words.
         """
-        start = f"{self.source}: {plain(f'{section}.{key}')}: unknown key{expected}"
-        if len(self.faults) >= MAX_FAULTS or key in REMOVED:
-            self.faults.append(f"{start}; {REMOVED[key]}" if key in REMOVED else start)
-            return
-        homes = dict.fromkeys(known, "")
-        for name in (*self.parameters, TRIAL):
-            homes.setdefault(name, f"under [{section_of(name, self.parameters)}]")
-        for name in HEADER:
-            homes.setdefault(name, "at the top, above the sections")
-        if home := homes.get(key, ""):
-            self.faults.append(f"{start}; it belongs {home}")
-            return
-        hint = nearest(key, list(homes), 0.8) or nearest(key, known)
-        home = homes.get(hint.removeprefix("; did you mean ").removesuffix("?"), "")
-        self.faults.append(f"{start}{hint[:-1]} {home}?" if home else f"{start}{hint}")
+        homes = dict.fromkeys(known, "") | {
+            name: home for name in (*self.parameters, TRIAL, *HEADER)
+            if name not in known and (home := self.home_of(name))
+        }
+        hint = removed(key)
+        if not hint and len(self.faults) < MAX_FAULTS:
+            hint = f"; it belongs {homes[key]}" if homes.get(key) else (
+                nearest(key, list(homes), 0.8) or nearest(key, known))
+            similar = hint.removeprefix("; did you mean ").removesuffix("?")
+            if homes.get(similar):
+                hint = f"{hint[:-1]} {homes[similar]}?"
+        self.note(plain(f"{section}.{key}"), f"unknown key{expected}{hint}")
 
-    def values(self, name: str) -> Sequence[Any]:
-        """Return the values of a parameter on the grid; empty if it is drawn or at fault."""
-        axis = self.axis_of(name)
-        if axis is not None:
-            return axis.columns[name]
-        return (self.fixed[name],) if name in self.fixed else ()
-
-    def axis_of(self, name: str) -> Axis | None:
-        """Return the axis along which a parameter varies, alone or together with others."""
-        return next((axis for axis in self.axes.values() if name in axis.columns), None)
+    def home_of(self, name: str) -> str:
+        """Return where a key belongs, in words; empty for an unknown one."""
+        section = section_of(name, self.parameters)
+        return f"under [{section}]" if section else (
+            "at the top, above the sections" if name in HEADER else "")
 
     def is_active(self, switch: str) -> bool:
         """Return whether a switch has, or was meant to have, another than its neutral value."""
-        values, off = self.values(switch), self.parameters[switch].default
+        values, off = self.values_of(switch), self.parameters[switch].default
         return any(value != off for value in values) if values else switch in self.given
 
     def names_axis(self, name: str) -> bool:
@@ -201,37 +194,34 @@ class Reading:
                 row = axis.at(index)
                 yield (row[a],), (row[b],)
         else:
-            yield self.values(a), self.values(b)
-
-    def places(self, name: str) -> dict[str, Any]:
-        """Return the value of each place of the document that gives a parameter, by its path."""
-        axes, section = self.document.get("axes"), self.parameters[name].section
-        tables = {section: self.document.get(section), "axes": axes} | {
-            f"axes.{key}": value["zip"]
-            for key, value in (axes if isinstance(axes, dict) else {}).items() if is_zip(value)
-        }
-        return {f"{key}.{name}": table[name] for key, table in tables.items()
-                if isinstance(table, dict) and name in table}
+            yield self.values_of(a), self.values_of(b)
 
     def written(self, name: str) -> Any:
         """Return the value that the document gives a parameter, for messages."""
-        return next(iter(self.places(name).values()), self.fixed.get(name))
+        given = places(self.document, self.parameters[name]).values()
+        return next(iter(given), self.fixed.get(name))
 
 
-def read_keys(
-    document: Mapping[str, Any], source: str, folder: Path,
-    known_files: Mapping[str, str] | None = None, known_cameras: Mapping[str, str] | None = None,
-    known_plugins: Sequence[DeclaredPlugin] | None = None, others: Collection[str] = (),
-) -> Reading:
-    """Return what the keys of a document say, each checked on its own (as :class:`Reading`).
+def removed(key: str) -> str:
+    """Return what to do instead of a parameter of an earlier version; empty for others."""
+    return f"; {REMOVED[key]}" if key in REMOVED else ""
+
+
+def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
+    """Return the section that a parameter belongs under; empty for an unknown name."""
+    if name == TRIAL:
+        return "axes"
+    return parameters[name].section if name in parameters else ""
+
+
+def read_keys(reading: Reading, others: Collection[str] = ()) -> None:
+    """Read the keys of a document, each checked on its own.
 
     ``others`` are the names of sections that are read elsewhere.
     """
-    reading = Reading(document, source, folder, known_files, known_cameras, known_plugins)
     _read_header(reading)
-    _read_plugins(reading)
     known = [*HEADER, *SECTIONS, "axes", REQUIRE, *others]
-    for key, value in document.items():
+    for key, value in reading.document.items():
         if key in HEADER or key == REQUIRE or key in others:
             continue
         if key == "axes" or key in SECTIONS:
@@ -244,17 +234,17 @@ def read_keys(
             homes = [f"{name} belongs under [{section_of(name, reading.parameters)}]"
                      for name in (value if isinstance(value, dict) else ())
                      if section_of(name, reading.parameters)][:MAX_HOMES]
-            if nearest(key, known):
-                homes = []
             reading.unknown(key, "; ".join([
-                f"unknown; expected {kind} of {', '.join(known)}", *homes]), key, known)
+                f"unknown; expected {kind} of {', '.join(known)}",
+                *([] if nearest(key, known) else homes)]), key, known)
     for section in SECTIONS:
-        _read_section(reading, section)
+        table = reading.document.get(section)
+        for key, value in table.items() if isinstance(table, dict) else ():
+            _read_key(reading, section, key, value)
     _read_axes(reading)
     for parameter in reading.parameters.values():
         if parameter.name not in reading.given:
             reading.fixed[parameter.name] = parameter.default
-    return reading
 
 
 def _title(value: Any) -> str:
@@ -263,86 +253,75 @@ def _title(value: Any) -> str:
     return value
 
 
+def _effects(value: Any) -> list[str]:
+    if (
+        not isinstance(value, list) or len({*map(str, value)}) < len(value)
+        or not all(isinstance(name, str) and name for name in value)
+    ):
+        raise ValueError('a list of plug-ins, each once, such as ["haze"]')
+    return value
+
+
 _HEADER = (
     Declared("title", (str,), "", Declaration("title", reads=_title)),
     Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
     Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
+    Declared(EFFECTS_KEY, (list,), [], Declaration("plug-ins", reads=_effects)),
 )
 
 
 def _read_header(reading: Reading) -> None:
+    """Read the keys above the sections, and the plug-ins that the document names."""
     for declared in _HEADER:
         value = reading.document.get(declared.name, declared.default)
         try:
-            setattr(reading, declared.name, declared.check(value))
+            checked = declared.check(value)
+            if declared.name != EFFECTS_KEY:  # plug-ins of all kinds follow
+                setattr(reading, declared.name, checked)
         except ValueError as error:
             reading.fault(declared.name, value, str(error))
-    effects = reading.document.get(EFFECTS_KEY, [])
-    if (
-        not isinstance(effects, list) or len({*map(str, effects)}) < len(effects)
-        or not all(isinstance(name, str) and name for name in effects)
-    ):
-        reading.fault(EFFECTS_KEY, effects, 'a list of plug-ins, each once, such as ["haze"]')
-
-
-def _read_plugins(reading: Reading) -> None:
-    """Note the plug-ins that the document names, their files' digests, and their parameters."""
-    plugins, faults = read_plugins(
-        reading.document, str(reading.folder), reading.known_plugins
-    )
+    plugins, faults = read_plugins(reading.document, reading.folder, reading.known_plugins)
     for kind, key, name, expected in faults:
         reading.fault(key, name, expected)
-        reading.unread |= {section_of_settings(kind), *(
-            [NAMED_BY[kind].name] if kind in NAMED_BY else []
-        )}
-    reading.plugins, reading.parameters = tuple(plugins), parameters_with(tuple(plugins))
+        reading.unread.add(section_of_settings(kind))
+        if kind in NAMED_BY:
+            reading.unread.add(NAMED_BY[kind].name)
+    reading.plugins = tuple(plugins)
     reading.files.update({each.file: each.digest for each in plugins if each.file})
 
 
-def _read_section(reading: Reading, section: str) -> None:
-    table = reading.document.get(section, {})
-    if not isinstance(table, dict):
+def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
+    """Read a key of a section: a value, or a distribution."""
+    path = f"{section}.{key}"
+    parameter = reading.parameters.get(key)
+    if parameter is None or parameter.section != section:
+        if section in reading.unread and not section_of(key, reading.parameters):
+            return
+        if is_zip(value):
+            reading.fault(path, value, "parameters that go together under [axes]")
+        else:
+            reading.unknown_key(section, key, [
+                each.name for each in reading.parameters.values() if each.section == section])
         return
-    names = [p.name for p in reading.parameters.values() if p.section == section]
-    for key, value in table.items():
-        path = f"{section}.{key}"
-        if key not in names:
-            if section in reading.unread and not section_of(key, reading.parameters):
-                continue
-            if is_zip(value):
-                reading.fault(path, value, "parameters that go together under [axes]")
-            else:
-                reading.unknown_key(section, key, names)
-            continue
-        parameter = reading.parameters[key]
-        reading.given.add(key)
-        try:
-            if isinstance(value, dict):
-                reading.distributions[key] = parse_distribution(parameter, value)
-            else:
-                reading.fixed[key] = parameter.check(value)
-        except TablesError as error:
-            reading.faults += [f"{reading.source}: {path}{line}" for line in error.lines]
-        except ValueError as error:
-            if key not in reading.unread:
-                axis = "; several values are an axis: they go under [axes]" if (
-                    isinstance(value, list) and tuple not in parameter.types) else ""
-                reading.fault(path, value, f"{error}{axis}")
-
-
-def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
-    """Return the section that a parameter belongs under; empty for an unknown name."""
-    if name == TRIAL:
-        return "axes"
-    return parameters[name].section if name in parameters else ""
+    reading.given.add(key)
+    try:
+        if isinstance(value, dict):
+            reading.distributions[key] = parse_distribution(parameter, value)
+        else:
+            reading.fixed[key] = parameter.check(value)
+    except TablesError as error:
+        reading.faults += [f"{reading.source}: {path}{line}" for line in error.lines]
+    except ValueError as error:
+        if key not in reading.unread:
+            axis = "; several values are an axis: they go under [axes]" if (
+                isinstance(value, list) and tuple not in parameter.types) else ""
+            reading.fault(path, value, f"{error}{axis}")
 
 
 def _read_axes(reading: Reading) -> None:
     table = reading.document.get("axes", {})
-    if not isinstance(table, dict):
-        return
     quota = MAX_LISTED
-    for key, value in table.items():
+    for key, value in table.items() if isinstance(table, dict) else ():
         if key not in reading.parameters and key != TRIAL and is_zip(value):
             axis = _read_zip(reading, key, value["zip"], quota)
         else:
@@ -364,42 +343,33 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
             return parse_trial(value)
         if key == TRIAL:
             reading.fault(path, value, "it as an axis of its own: every cell has the same trials")
-        elif key not in reading.parameters and isinstance(value, dict) and (
-            not value.keys().isdisjoint(("zip", *reading.parameters))
-        ):
+        elif key in HEADER:
+            reading.unknown_key("axes", key, ())
+        elif key in reading.given:
+            other = next((other for other in places(reading.document, reading.parameters[key])
+                          if other != path), "it")
+            reading.fault(path, value, f"it once: {other} is given too; delete one of them")
+        elif key in reading.parameters:
+            reading.given.add(key)
+            return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
+        elif isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
             reading.fault(
                 path, value, "parameters that go together as "
                 "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip",
             )
-        elif key in HEADER:
-            reading.unknown_key("axes", key, ())
-        elif key not in reading.parameters:
-            if not reading.unread:
-                reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
-        elif key in reading.given:
-            other = next((other for other in reading.places(key) if other != path), "it")
-            reading.fault(path, value, f"it once: {other} is given too; delete one of them")
-        else:
-            reading.given.add(key)
-            return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
+        elif not reading.unread:
+            reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
     except ValueError as error:
         if key not in reading.unread:
             reading.fault(path, value, str(error))
     return None
 
 
-def is_zip(value: Any) -> bool:
-    """Return whether a value under [axes] makes an axis of parameters that go together."""
-    return isinstance(value, dict) and value.keys() == {"zip"} and isinstance(value["zip"], dict)
-
-
 def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -> Axis | None:
     """Return the axis of parameters that go together, or note why there is none."""
     path = f"axes.{key}"
     if not key.isidentifier():
-        reading.faults.append(
-            f"{reading.source}: {plain(path)}: expected a name of letters, digits and underscores"
-        )
+        reading.note(plain(path), "expected a name of letters, digits and underscores")
         return None
     columns: dict[str, Sequence[Any]] = {}
     quota //= max(len(members), 1)
@@ -416,5 +386,5 @@ def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -
     try:
         return zipped_axis(key, columns, reading.parameters)
     except ValueError as error:
-        reading.faults.append(f"{reading.source}: {path}: expected {error}")
+        reading.note(path, f"expected {error}")
         return None

@@ -47,7 +47,7 @@ from sweep.model.sensor import MAX_LEVEL, MIN_FRAME_PX
 
 def check_backgrounds(reading: Reading) -> None:
     """Note the digests of a reading's background images, and the faults of those that cannot be."""
-    for value in reading.values("background"):
+    for value in reading.values_of("background"):
         if not isinstance(value, str):
             continue
         if not value.isprintable():
@@ -103,7 +103,7 @@ def photographs_alone(reading: Reading) -> None:
 
     Of images that are simulated at their poses, the poses and the markers alone.
     """
-    simulated = any(reading.values(SIMULATED))
+    simulated = any(reading.values_of(SIMULATED))
     if PHOTOGRAPHS not in reading.given:
         if simulated:
             reading.refuse(SIMULATED, f"{PHOTOGRAPHS} beside it, whose poses are taken")
@@ -130,7 +130,7 @@ def photographs_alone(reading: Reading) -> None:
     if reading.known_files is not None:
         reading.files.update(reading.known_files)
         return
-    for name in dict.fromkeys(reading.values(PHOTOGRAPHS)):
+    for name in dict.fromkeys(reading.values_of(PHOTOGRAPHS)):
         _check_record(reading, name, simulated)
 
 
@@ -164,7 +164,7 @@ def _mismatches(
     if largest > len(record.paths) and not simulated:
         yield f"trial = {len(record.paths)} at most: its photographs; there are {trials} trials"
     ids = set(record.marker_id.tolist())
-    unknown = [each for each in reading.values("marker_id") if each not in ids]
+    unknown = [each for each in reading.values_of("marker_id") if each not in ids]
     if unknown:
         yield f"markers that it has: {shown(sorted(ids))}; marker_id = {unknown[0]} is none of them"
     for key, length in (("width_px", record.width_px), ("height_px", record.height_px)):
@@ -222,7 +222,7 @@ def dictionaries_can_be_drawn(reading: Reading) -> None:
 
     A store's pipeline can be read without them.
     """
-    for dictionary in reading.values("dictionary") if reading.known_files is None else ():
+    for dictionary in reading.values_of("dictionary") if reading.known_files is None else ():
         if (missing := missing_package(dictionary)) is not None:
             reading.fault("marker.dictionary", dictionary, missing)
     for dictionaries, renderers in reading.together("dictionary", "renderer"):
@@ -246,7 +246,7 @@ def partners_are_given(reading: Reading) -> None:
 
 def effects_need_the_exact_renderer(reading: Reading) -> None:
     """Demand the renderer ``exact`` for effects that act on edges."""
-    others = [name for name in reading.values("renderer") if name != "exact"]
+    others = [name for name in reading.values_of("renderer") if name != "exact"]
     for name in GEOMETRIC:
         if others and reading.is_active(name):
             reading.refuse(name, f"renderer = exact; {others[0]} does not have it")
@@ -270,8 +270,8 @@ def noise_tables_ascend(reading: Reading) -> None:
 def mosaics_have_room(reading: Reading) -> None:
     """Demand frames that can be demosaiced."""
     for name in ("width_px", "height_px"):
-        if min(reading.values(name), default=MIN_FRAME_PX) < MIN_FRAME_PX and any(
-                value != "none" for value in reading.values("bayer")):
+        if min(reading.values_of(name), default=MIN_FRAME_PX) < MIN_FRAME_PX and any(
+                value != "none" for value in reading.values_of("bayer")):
             reading.refuse(name, f"at least {MIN_FRAME_PX}, for bayer to be demosaiced")
 
 
@@ -317,13 +317,13 @@ def something_random_to_repeat(reading: Reading) -> None:
     if PHOTOGRAPHS in reading.given:
         return
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
-    jitter = reading.values("jitter_px")
+    jitter = reading.values_of("jitter_px")
     noisy = any(reading.is_active(name) for name in RANDOM)
     noisy = noisy or any(
         reading.is_active(plugin.settings[0].name)
         for plugin in reading.plugins if plugin.kind == "effect" and plugin.random
     )
-    noisy = noisy or "calibration" in reading.values("believed")
+    noisy = noisy or "calibration" in reading.values_of("believed")
     if trials > 1 and not reading.distributions and jitter and max(jitter) == 0 and not noisy:
         reading.fault(
             "axes.trial", trials,
@@ -342,8 +342,8 @@ def trials_fill_replicates(reading: Reading) -> None:
             f"a multiple of {REPLICATES}, at least {2 * REPLICATES}, for sampling = sobol: "
             f"{REPLICATES} replicates of as many points each, best a power of two",
         )
-    jitter = reading.values("jitter_px")
-    calibrated = "calibration" in reading.values("believed")
+    jitter = reading.values_of("jitter_px")
+    calibrated = "calibration" in reading.values_of("believed")
     if not reading.distributions and jitter and max(jitter) == 0 and not calibrated:
         reading.fault(
             "sampling", reading.sampling,
@@ -407,7 +407,7 @@ def size_of_whole_frames(reading: Reading) -> None:
         ("adaptiveThreshConstant", lambda value: value < 1),
         ("aprilTagQuadDecimate", lambda value: value > 1),
     ):
-        if any(is_whole(value) for value in reading.values(name)):
+        if any(is_whole(value) for value in reading.values_of(name)):
             reading.refuse(
                 name, f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from sweep.experiment.axes import Axis
 from sweep.experiment.beliefs import STATED
-from sweep.experiment.experiment import Experiment
+from sweep.experiment.experiment import Grid
 from sweep.experiment.grid import OPENCV_FIELDS
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import OPENCV
@@ -27,7 +27,7 @@ PIXEL_SETTINGS = {
 """Solver on pixels -> the settings that it has beside those of all solvers."""
 
 
-def used_settings(pipeline: Experiment, values: Mapping[str, Any]) -> dict[str, Any]:
+def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     r"""Return those of some axes' values that the detector and the solver among them have.
 
     ``values`` has an axis' name -> its value, or its label if parameters go together.
@@ -51,7 +51,7 @@ def used_settings(pipeline: Experiment, values: Mapping[str, Any]) -> dict[str, 
     return used
 
 
-def distinct(pipeline: Experiment, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
+def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the indices of the combinations of axes' values that no earlier one means, too."""
     first: dict[tuple[tuple[str, Any], ...], int] = {}
     for index, values in enumerate(combinations):
@@ -59,7 +59,7 @@ def distinct(pipeline: Experiment, combinations: Sequence[Mapping[str, Any]]) ->
     return list(first.values())
 
 
-def _parameters(pipeline: Experiment, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _parameters(pipeline: Grid, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield name and value of each parameter of some axes' values."""
     for name, value in values.items():
         axis = pipeline.axis(name)
@@ -67,7 +67,7 @@ def _parameters(pipeline: Experiment, values: Mapping[str, Any]) -> Iterator[tup
             yield from axis.at(list(axis.values).index(value)).items()
 
 
-def _only(pipeline: Experiment, name: str, parameters: Mapping[str, Any]) -> Any:
+def _only(pipeline: Grid, name: str, parameters: Mapping[str, Any]) -> Any:
     """Return the value of a parameter; None if the pipeline has several, and none is chosen."""
     if name in parameters:
         return parameters[name]
@@ -75,7 +75,7 @@ def _only(pipeline: Experiment, name: str, parameters: Mapping[str, Any]) -> Any
     return values.pop() if len(values) == 1 else None
 
 
-def _settings_of_plugins(pipeline: Experiment, kind: str, name: str) -> set[str]:
+def _settings_of_plugins(pipeline: Grid, kind: str, name: str) -> set[str]:
     """Return the settings of the plug-ins of a kind that the one of this name does not have."""
     own = pipeline.plugin(kind, name)
     every = {each.name for plugin in pipeline.plugins if plugin.kind == kind
@@ -83,14 +83,14 @@ def _settings_of_plugins(pipeline: Experiment, kind: str, name: str) -> set[str]
     return every - {each.name for each in own.settings} if own is not None else every
 
 
-def _unused_by_detector(pipeline: Experiment, detector: str | None) -> set[str]:
+def _unused_by_detector(pipeline: Grid, detector: str | None) -> set[str]:
     if detector is None:
         return set()
     others = _settings_of_plugins(pipeline, "detector", detector)
     return others if detector == OPENCV else {*others, *OPENCV_FIELDS}
 
 
-def _unused_by_solver(pipeline: Experiment, solver: str | None) -> set[str]:
+def _unused_by_solver(pipeline: Grid, solver: str | None) -> set[str]:
     if solver is None:
         return set()
     others = _settings_of_plugins(pipeline, "estimator", solver)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import MAX_DEVIATIONS, Axis, Distribution
+from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.beliefs import CALIBRATED, believed_calibration
 from sweep.experiment.experiment import largest_board, shows_boards
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
@@ -26,14 +26,12 @@ from sweep.measure.flags import (
     TruthSource,
 )
 from sweep.messages import label
-from sweep.model.calibration import VIEW, CalibrationError
-from sweep.model.camera import Column
-from sweep.typing import Floats
+from sweep.model.calibration import VIEW
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from sweep.experiment.experiment import Experiment
+    from sweep.experiment.experiment import Grid
 
 
 # --------------------------------------------------------------------------------------------------
@@ -134,35 +132,7 @@ class FixedValue:
     attributes: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnQuantity:
-    """A number of each scene that is drawn, or follows from one that is.
-
-    Attributes
-    ----------
-    name
-        Of the coordinate: the parameter's name.
-    column
-        Its name among the scene's values (:func:`sweep.experiment.grid.scene_values`).
-    meaning, unit
-        What it means, and its ``units``.
-    scale
-        The largest numbers that it is added up from, by which rounding is measured; 0 if it is
-        a product.
-    """
-
-    name: str
-    column: str
-    meaning: str
-    unit: str
-    scale: float
-
-    def of(self, values: Mapping[str, Column], count: int) -> Floats:
-        """Return its values (count,) among those of scenes."""
-        return values[self.column].broadcast(count)
-
-
-def fixed_values(pipeline: Experiment) -> list[FixedValue]:
+def fixed_values(pipeline: Grid) -> list[FixedValue]:
     """Return the fixed parameters that are coordinates, in the order of their declaration.
 
     They are those of marker and pose that have a value (unless the pose is given otherwise), and
@@ -185,59 +155,6 @@ def _scalar(value: Any) -> float | bool | str | None:
 def _attributes(parameter: Parameter) -> dict[str, str]:
     unit = {"units": parameter.unit} if parameter.unit else {}
     return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
-
-
-def drawn_quantities(pipeline: Experiment) -> list[DrawnQuantity]:
-    """Return what is drawn for each scene of a pipeline, except the noise of pixels.
-
-    Examples
-    --------
-    >>> from sweep.experiment.pipeline import Pipeline
-    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
-    >>> [quantity.name for quantity in drawn_quantities(pipeline)]
-    ['side_px', 'distance_m']
-    """
-    quantities = [
-        _of_parameter(pipeline.parameters[name], _scale(distribution))
-        for name, distribution in pipeline.distributions.items()
-    ]
-    if "side_px" in pipeline.distributions:
-        quantities.append(_of_parameter(PARAMETERS["distance_m"], 0.0))
-    jitter = [float(value) for value in pipeline.values_of("jitter_px")]
-    if any(jitter):
-        quantities += [
-            DrawnQuantity(
-                f"jitter_{axis}_px", f"shift_{axis}_px",
-                f"shift of the centre's undistorted projection along {axis}", "px", max(jitter),
-            )
-            for axis in ("u", "v")
-        ]
-    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
-    if error is not None:
-        quantities += [_calibrated(error, name) for name in error.names]
-    return quantities
-
-
-def _calibrated(error: CalibrationError, name: str) -> DrawnQuantity:
-    """Return a number of the camera that a calibration gives."""
-    unit = "px" if name in VIEW else ""
-    return DrawnQuantity(
-        f"believed_{name}", CALIBRATED + name, f"{name.removesuffix('_px')} as a calibration "
-        "gives it, for estimators that believe it", unit,
-        (CALIBRATION_SCALE_PX if unit else 1.0) + MAX_DEVIATIONS * error.sd(name),
-    )
-
-
-def _of_parameter(parameter: Parameter, scale: float) -> DrawnQuantity:
-    return DrawnQuantity(
-        parameter.name, parameter.name, parameter.declaration.meaning, parameter.unit, scale
-    )
-
-
-def _scale(distribution: Distribution) -> float:
-    """Return the largest number that a draw is added up from."""
-    a, b = abs(distribution.a), abs(distribution.b)
-    return float(np.maximum(a, b * (MAX_DEVIATIONS if distribution.kind == "normal" else 1.0)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -421,7 +338,7 @@ class Variable:
         widths = [(0, 0)] * outer + [(0, each) for each in missing]
         return np.pad(kept, widths, constant_values=beyond)
 
-    def configuration_axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+    def configuration_axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return the axes of detection and estimation that it has, stage by stage.
 
         They span its configurations, the last axis fastest; a scene's variable has none.
@@ -429,19 +346,19 @@ class Variable:
         stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
         return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
 
-    def configurations(self, pipeline: Experiment) -> int:
+    def configurations(self, pipeline: Grid) -> int:
         """Return the number of its configurations: one for a scene's variable."""
         return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
 
-    def axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+    def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return its axes in the pipeline's order: those of its stage and of the stages before."""
         return pipeline.axes_of(*(stage for stage in Stage if stage <= self.stage))
 
-    def dimensions(self, pipeline: Experiment) -> tuple[str, ...]:
+    def dimensions(self, pipeline: Grid) -> tuple[str, ...]:
         """Return the names of its dimensions: its axes, then ``inner``."""
         return tuple(axis.name for axis in self.axes(pipeline)) + self.inner
 
-    def shape(self, pipeline: Experiment) -> tuple[int, ...]:
+    def shape(self, pipeline: Grid) -> tuple[int, ...]:
         """Return the lengths of its dimensions."""
         return tuple(len(axis) for axis in self.axes(pipeline)) + self.inner_shape
 
@@ -580,22 +497,59 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
 """The variables that stores of photographs have besides."""
 
 
-def drawn_variables(pipeline: Experiment) -> tuple[Variable, ...]:
-    """Return the variables that hold what is drawn for each scene of a pipeline."""
-    return tuple(
-        Variable(
-            drawn.name, Stage.scene, "f8", drawn.meaning, drawn.unit, present_when=_TRUTH,
-            tolerance=(
-                Tolerance("absolute", TRUTH_RTOL * drawn.scale) if drawn.scale
-                else Tolerance("relative", TRUTH_RTOL)
-            ),
-            drawn_as=drawn.column,
-        )
-        for drawn in drawn_quantities(pipeline)
-    )
+def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
+    """Return the variables that hold what is drawn for each scene, except the noise of pixels.
+
+    Examples
+    --------
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
+    >>> [variable.name for variable in drawn_variables(pipeline)]
+    ['side_px', 'distance_m']
+    """
+    variables = [
+        _drawn_parameter(pipeline.parameters[name], distribution.largest)
+        for name, distribution in pipeline.distributions.items()
+    ]
+    if "side_px" in pipeline.distributions:
+        variables.append(_drawn_parameter(PARAMETERS["distance_m"]))
+    jitter = max(map(float, pipeline.values_of("jitter_px")), default=0.0)
+    if jitter:
+        variables += [
+            _drawn(f"jitter_{axis}_px", f"shift of the centre's undistorted projection along "
+                   f"{axis}", "px", jitter, f"shift_{axis}_px")
+            for axis in ("u", "v")
+        ]
+    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    if error is not None:
+        variables += [
+            _drawn(f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, "
+                   "for estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
+                   CALIBRATED + name)
+            for name in error.names
+            for unit, scale in [("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)]
+        ]
+    return tuple(variables)
 
 
-def variables_of(pipeline: Experiment) -> tuple[Variable, ...]:
+def _drawn_parameter(parameter: Parameter, scale: float = 0.0) -> Variable:
+    name = parameter.name
+    return _drawn(name, parameter.declaration.meaning, parameter.unit, scale, name)
+
+
+def _drawn(name: str, meaning: str, unit: str, scale: float, drawn_as: str) -> Variable:
+    """Return the variable of a number of each scene that is drawn, or follows from one that is.
+
+    ``scale`` is the largest number that it is added up from, by which rounding is measured; 0 if
+    it is a product.
+    """
+    tolerance = Tolerance("absolute", TRUTH_RTOL * scale) if scale else Tolerance(
+        "relative", TRUTH_RTOL)
+    return Variable(name, Stage.scene, "f8", meaning, unit, present_when=_TRUTH,
+                    tolerance=tolerance, drawn_as=drawn_as)
+
+
+def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables that a pipeline's store has: the schema's, then draws.
 
     >>> from sweep.experiment.pipeline import Pipeline
@@ -612,7 +566,7 @@ def variables_of(pipeline: Experiment) -> tuple[Variable, ...]:
     return common + drawn + photographed
 
 
-def _board_variables(pipeline: Experiment) -> tuple[Variable, ...]:
+def _board_variables(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables of a pipeline's boards, as long as its largest board."""
     markers, corners = largest_board(pipeline)
     lengths = (("marker", markers), ("chessboard_corner", corners))
@@ -622,7 +576,7 @@ def _board_variables(pipeline: Experiment) -> tuple[Variable, ...]:
     )
 
 
-def bytes_per_block(pipeline: Experiment, scenes: int) -> int:
+def bytes_per_block(pipeline: Grid, scenes: int) -> int:
     """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
     return scenes * sum(
         variable.configurations(pipeline)

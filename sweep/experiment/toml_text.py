@@ -132,7 +132,7 @@ def _add(
         faults.append(f"{path}: expected a string as key")
         return
     try:
-        table[key] = _item(value)
+        table[key] = toml_item(value)
     except TypeError:
         faults.append(f"{path} = {plain(repr(value))}: expected a string, a number, true, false, "
                       "a list or a table")
@@ -142,7 +142,7 @@ def _add(
         faults.append(f"{path}: nested too deeply")
 
 
-def _item(value: Any) -> tomlkit.items.Item:
+def toml_item(value: Any) -> tomlkit.items.Item:
     """Return a value as tomlkit's, tables in one line; TypeError if TOML has no such value."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
@@ -152,11 +152,11 @@ def _item(value: Any) -> tomlkit.items.Item:
         value = {"range": [value.start, value.stop, value.step]}
     if isinstance(value, Mapping):
         inline = tomlkit.inline_table()
-        inline.update({str(key): _item(item) for key, item in value.items()})
+        inline.update({str(key): toml_item(item) for key, item in value.items()})
         return inline
     if isinstance(value, (list, tuple)):
         # Made at once: tomlkit's arrays take time that grows with the square of what is appended.
-        parts = [part for item in value for part in (tomlkit.ws(", "), _item(item))]
+        parts = [part for item in value for part in (tomlkit.ws(", "), toml_item(item))]
         return tomlkit.items.Array(parts[1:], tomlkit.items.Trivia())
     if isinstance(value, (str, bool, int, float, dt.date, dt.time)):
         return tomlkit.item(value)

@@ -265,7 +265,8 @@ def _errors(data: ReportData) -> Figure | None:
         "errors", f"Errors of the pose by {short_name(data.size)}",
         "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
         "relative to the true depth), and the solved poses that are nearer to the mirror of the "
-        f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors", (LOOKED_FOR, *ERRORS),
+        f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors",
+        (LOOKED_FOR, *ERRORS),
         (*ERROR_CURVES, FLIPS), covers=data.size_axes)
 
 

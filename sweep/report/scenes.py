@@ -272,7 +272,8 @@ def _text_width(text: str, size: float) -> float:
 
 def _ascii(text: str) -> str:
     """Return text with the characters that OpenCV's font has."""
-    signs = {"\u00b2": "2", "\u00b0": " deg", "\u2212": "-", "\u2013": "-", "\u221e": "inf"}
+    signs: dict[str, str | int | None] = {
+        "\u00b2": "2", "\u00b0": " deg", "\u2212": "-", "\u2013": "-", "\u221e": "inf"}
     return text.translate(str.maketrans(signs))
 
 

@@ -367,7 +367,7 @@ def test_poses_that_are_missing_are_told(odd, tmp_path):
     chunks_of(url, "detection")[0].unlink()
     code, _, err = command("report", url, "-o", output)
     assert code == 2
-    assert "1 of 4 blocks lack chunks of detection" in err
+    assert "1 of 4 blocks lack chunks" in err
     assert "sweep verify --repair" in err
     assert not output.exists()
 

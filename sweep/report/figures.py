@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -516,8 +517,10 @@ def _ambiguity(data: ReportData) -> Figure | None:
             f"is a threshold. The table of thresholds below has the largest that is shown to keep "
             f"{wanted:g} % flips of the kept poses at most (the 95 % bound of all thresholds tried "
             "together), or says why there is none.", data.pooled()),
-        table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
-                 KEPT), KEPT[1:], KEPT[0].heading, CONFIGURATION)
+        dataclasses.replace(
+            table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
+                     KEPT), stub=1),  # the points of a line, not panels
+        KEPT[1:], KEPT[0].heading, CONFIGURATION)
 
 
 def threshold_tables(data: ReportData) -> list[Table]:

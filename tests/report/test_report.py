@@ -245,6 +245,8 @@ def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
         rejected = solved & ~kept
         right = 100 * (rejected & ~flipped).sum() / rejected.sum() if rejected.any() else math.nan
         assert row[6].split(" (")[0] == number(right)
+    assert "Flips kept<" in page.replace("\n", "")
+    assert "Flips kept, threshold" not in page
     assert sum(int(row[2]) for row in rows[1:]) == (
         results["estimate"] == EstimateStatus.solved).sum()
 

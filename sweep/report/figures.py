@@ -590,7 +590,6 @@ def _effect(data: ReportData, name: str) -> Figure:
 MAX_TABLE_ROWS = 40
 """The most rows of a table of all detector settings."""
 
-GROUPS = ("camera_frame", "camera_in_marker", "yaw_pitch_roll", "angles")
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
               "position": ("position", "m")}
 """Quantity in the names of errors -> its name in words, and its unit in those names."""
@@ -614,21 +613,16 @@ def board_tables(data: ReportData) -> list[Table]:
 
 
 def signed_errors_table(data: ReportData) -> Table:
-    """Return bias and spread in all frames, with rows for each configuration."""
-    found = grouped(data, signed_in_all_frames)
+    """Return bias and spread in the camera's frame, with rows for each configuration."""
+    found = grouped(data, signed_error_statistics)
     rows = [
         [f"{quantity.words}, {quantity.unit}", str(name), *values]
-        for quantity in (each for group in GROUPS for each in SIGNED[group])
+        for quantity in (each for group in SIGNED_GROUPS[1:] for each in SIGNED[group])
         for name, *values in zip(found.summary[CONFIGURATION].values, *(
             Column("", quantity.named(name)).cells(found.summary) for name in ("bias", "sd")),
             strict=True)]
     return Table.of("Bias and spread of the solved poses without flips, with 95 % intervals",
                     ["error", CONFIGURATION, "bias", "standard deviation"], rows, stub=2)
-
-
-def signed_in_all_frames(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-    """Return signed errors in the frames of the camera and of the target."""
-    return error_statistics(results, per, bins, GROUPS)
 
 
 def errors_table(errors: xr.Dataset, name: str) -> Table:

@@ -37,7 +37,7 @@ def test_rooms_import_one_way():
 @pytest.mark.parametrize(("lower", "upper"), [
     ("model/pose.py", "sweep.measure.flags"),
     ("store/layout.py", "sweep.evaluation"),      # neighbours are independent, too
-    pytest.param("experiment/draws.py", "sweep.report.charts", marks=pytest.mark.long),
+    pytest.param("experiment/draws.py", "sweep.report.figure", marks=pytest.mark.long),
 ])
 def test_an_import_upwards_breaks_the_contract(copied, lower, upper):
     with (copied / "sweep" / lower).open("a") as file:

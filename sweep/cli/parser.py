@@ -70,19 +70,6 @@ GROUPS = {
 
 COMMANDS = tuple(itertools.chain.from_iterable(GROUPS.values()))
 
-REMOVED = {
-    "check-detector": "`sweep plugins check NAME` tries a detector or a solver",
-    "environments": "to compare versions of OpenCV, run `sweep run` in each virtual environment, "
-    "then `sweep compare A.zarr B.zarr`",
-}
-"""Commands of earlier versions -> what to do instead."""
-
-REMOVED_FLAGS = {
-    "--durable": "blocks are written whole; what a power failure takes, "
-    "`sweep verify STORE --repair` computes again",
-}
-"""Flags of earlier versions -> what does their work."""
-
 UNGROUPED = "all commands"
 """Title of the list that argparse makes of the commands."""
 
@@ -102,16 +89,7 @@ class Parser(argparse.ArgumentParser):
         return re.sub(f"{UNGROUPED}:\n.*?\n\n", "", super().format_help(), flags=re.DOTALL)
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and an error with a hint, and exit with status 2.
-
-        A command or flag of earlier versions gives one line that says what to do instead.
-        """
-        chosen = INVALID_COMMAND.match(message)
-        if chosen is not None and chosen[1] in REMOVED:
-            self.exit(2, f"sweep {chosen[1]} is no longer a command; {REMOVED[chosen[1]]}\n")
-        for word in message.removeprefix("unrecognized arguments: ").split():
-            if word in REMOVED_FLAGS:
-                self.exit(2, f"{word} is no longer a flag; {REMOVED_FLAGS[word]}\n")
+        """Print the usage and an error with a hint, and exit with status 2."""
         super().error(plain(message + _hint(message), MAX_LINE_LENGTH))
 
 

@@ -30,7 +30,6 @@ from sweep.report.figures import (
     precision_tables,
     sentences,
     signed_errors_table,
-    size_errors_table,
     threshold_tables,
 )
 from sweep.report.limit_figure import as_json as limits_as_json
@@ -129,9 +128,8 @@ def answer(data: ReportData) -> Answer:
     return Answer(
         _headline(data, decided, compared, tiles), _notes(data, known), name, tiles,
         (*(decided.tables if decided is not None else ()), compared.table()),
-        (*(decided.details if decided is not None else ()),
-         *size_errors_table(data, known.settings.combinations[compared.best], name),
-         *board_tables(data), errors_table(one, name), signed_errors_table(data),
+        (*(decided.details if decided is not None else ()), *board_tables(data),
+         errors_table(one, name), signed_errors_table(data),
          *threshold_tables(data), *precision_tables(data), *error_model_tables(data)),
         _numbers(decided, compared))
 

@@ -258,7 +258,8 @@ def _differences(row: xr.Dataset) -> tuple[Difference, ...]:
         (numbers,) = Column("", each.variable, each.scale).cells(row)
         above, below = numbers.low > each.equal, numbers.high < each.equal
         verdict = int(above) - int(below) if each.large_is_good else int(below) - int(above)
-        out.append(Difference(each.words, *numbers, each.unit, verdict))
+        out.append(Difference(
+            each.words, numbers.value, numbers.low, numbers.high, each.unit, verdict))
     return tuple(out)
 
 

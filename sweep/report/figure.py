@@ -304,7 +304,7 @@ def _draw(panel: Panel, axes: Axes) -> None:
     legend = axes.get_legend()
     lines = 0 if legend is None else math.ceil(
         len(legend.get_texts()) / int(getattr(legend, "_ncols", 1)))
-    axes.set_title(panel.title, pad=6 + (8 + 12.5 * lines if lines else 0))
+    axes.set_title(panel.title, pad=6 + (6 + 11.5 * lines if lines else 0))
 
 
 def inline_svg(svg: str, alt: str, prefix: str) -> Markup:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -212,14 +213,14 @@ class Grouped:
 
 def grouped(
     data: ReportData, analysis: Analysis, groups: Grouping | None = None,
-    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *, targets: bool = True,
+    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
 ) -> Grouped:
     """Return an analysis by configuration and groups.
 
     ``stages`` are those whose settings make a difference: of the detection rate the detector's.
     """
     groups = groups or Grouping()
-    settings = settings_of(data, stages, without, targets=targets)
+    settings = settings_of(data, stages, without)
     grouping = settings.grouping + groups
     _, summary = by_configuration(
         data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
@@ -264,7 +265,8 @@ def _errors(data: ReportData) -> Figure | None:
         "errors", f"Errors of the pose by {short_name(data.size)}",
         "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
         "relative to the true depth), and the solved poses that are nearer to the mirror of the "
-        f"truth (flips). {INFINITE_ERRORS}", "Errors", (LOOKED_FOR, *ERRORS),
+        f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors",
+        (LOOKED_FOR, *ERRORS),
         (*ERROR_CURVES, FLIPS), covers=data.size_axes)
 
 
@@ -514,8 +516,10 @@ def _ambiguity(data: ReportData) -> Figure | None:
             f"is a threshold. The table of thresholds below has the largest that is shown to keep "
             f"{wanted:g} % flips of the kept poses at most (the 95 % bound of all thresholds tried "
             "together), or says why there is none.", data.pooled()),
-        table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
-                 KEPT), KEPT[1:], KEPT[0].heading, CONFIGURATION)
+        dataclasses.replace(
+            table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
+                     KEPT), stub=1),  # the points of a line, not panels
+        KEPT[1:], KEPT[0].heading, CONFIGURATION)
 
 
 def threshold_tables(data: ReportData) -> list[Table]:
@@ -582,10 +586,9 @@ def _effect(data: ReportData, name: str) -> Figure:
 # --------------------------------------------------------------------------------------------------
 # Tables of errors, of boards' markers, and of the precision that was reached.
 
-MAX_TABLE_ROWS, MAX_SIZE_ROWS = 40, 12
-"""The most rows of a table of all detector settings, and of one by size."""
+MAX_TABLE_ROWS = 40
+"""The most rows of a table of all detector settings."""
 
-GROUPS = ("camera_frame", "camera_in_marker", "yaw_pitch_roll", "angles")
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
               "position": ("position", "m")}
 """Quantity in the names of errors -> its name in words, and its unit in those names."""
@@ -608,37 +611,17 @@ def board_tables(data: ReportData) -> list[Table]:
         sources=data.results)]
 
 
-def size_errors_table(data: ReportData, at: Mapping[str, int], name: str) -> list[Table]:
-    """Return detection, bias and spread of one configuration, the indices ``at``, by size."""
-    axis = signed_axis(data)
-    targets = any(each.name in at for each in data.target_axes)
-    found = grouped(data, signed_error_statistics,
-                    data.along(axis, MAX_SIZE_ROWS) if axis else None, targets=targets)
-    table = found.summary.isel({CONFIGURATION: found.settings.combinations.index(dict(at))})
-    if not np.nan_to_num(table["solved"].values).sum():
-        return []
-    return [table_of(
-        table, f"Errors{f' by {axis}' if axis else ''}{f' with {name}' if name else ''}, with 95 % "
-        "intervals: range p95 (not solved: infinite), bias and standard deviation of the solved "
-        "poses without flips", found.dims, (*RATES, RANGE_P95, *SIGNED_COLUMNS), data.results)]
-
-
 def signed_errors_table(data: ReportData) -> Table:
-    """Return bias and spread in all frames, with rows for each configuration."""
-    found = grouped(data, signed_in_all_frames)
+    """Return bias and spread in the camera's frame, with rows for each configuration."""
+    found = grouped(data, signed_error_statistics)
     rows = [
         [f"{quantity.words}, {quantity.unit}", str(name), *values]
-        for quantity in (each for group in GROUPS for each in SIGNED[group])
+        for quantity in (each for group in SIGNED_GROUPS[1:] for each in SIGNED[group])
         for name, *values in zip(found.summary[CONFIGURATION].values, *(
             Column("", quantity.named(name)).cells(found.summary) for name in ("bias", "sd")),
             strict=True)]
     return Table.of("Bias and spread of the solved poses without flips, with 95 % intervals",
                     ["error", CONFIGURATION, "bias", "standard deviation"], rows, stub=2)
-
-
-def signed_in_all_frames(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-    """Return signed errors in the frames of the camera and of the target."""
-    return error_statistics(results, per, bins, GROUPS)
 
 
 def errors_table(errors: xr.Dataset, name: str) -> Table:

@@ -325,7 +325,7 @@ class ReportData:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
         names = [
             axis.name for axis in self.pipeline.axes_of(Stage.scene)
-            if len(axis) > 1 and axis.name not in kept
+            if len(axis) > 1 and axis.name not in (*kept, TRIAL)
         ]
         return f"Pooled over {', '.join(names)}." if names else ""
 

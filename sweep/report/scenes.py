@@ -227,7 +227,7 @@ def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) ->
     size = max(1.0, width / CAPTION_SIDE)
     room = width / size - 32
     texts = [(line, colour) for text, colour in (
-        (title, INK), (_drawn_text(scene), FAINT), (_result_text(scene), INK),
+        (title, INK), (_drawn_text(scene), FAINT), (_ascii(result_text(scene)), INK),
     ) for line in _wrapped(text, room, size)]
     rows = [[legend[0]]]
     for entry in legend[1:]:
@@ -270,6 +270,13 @@ def _text_width(text: str, size: float) -> float:
     return float(cv2.getTextSize(text, FONT, size * FONT_SCALE, thickness)[0][0]) / size
 
 
+def _ascii(text: str) -> str:
+    """Return text with the characters that OpenCV's font has."""
+    signs: dict[str, str | int | None] = {
+        "\u00b2": "2", "\u00b0": " deg", "\u2212": "-", "\u2013": "-", "\u221e": "inf"}
+    return text.translate(str.maketrans(signs))
+
+
 def _entry_width(text: str, size: float) -> float:
     """Return the width of an entry of the legend, with its colour and the gap behind it."""
     return 21 + _text_width(text, size) + 20
@@ -293,20 +300,6 @@ def _drawn_text(scene: SceneInspection) -> str:
         f"{name} {float(value):.5g}" for name, value in scene.values.items()
         if name not in VARIABLES and value.ndim == 0)
     return f"drawn: {drawn}" if drawn else ""
-
-
-def _result_text(scene: SceneInspection) -> str:
-    """Return flags and errors in one line of ASCII, which is all that OpenCV's font has."""
-    parts = [scene.detection.name.replace("_", " "), f"area {scene.area_px:.4g} px2"]
-    if not math.isnan(scene.errors["rotation_error_deg"]):
-        parts += [
-            f"rotation error {scene.errors['rotation_error_deg']:.3g} deg",
-            f"position error {1000 * scene.errors['translation_error_m']:.3g} mm",
-            f"reprojection error {scene.errors['reprojection_error_px']:.2g} px",
-        ]
-    if scene.detection.name == "detected" and scene.estimate.name != "solved":
-        parts.append(scene.estimate.name.replace("_", " "))
-    return ", ".join(parts)
 
 
 def css_colour(colour: Colour) -> str:
@@ -537,7 +530,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
     _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    result = _result_text_gallery(inspected)
+    result = result_text(inspected)
     return dataclasses.replace(
         scene, result=result, picture=encoded.tobytes(),
         problem=f"Differs from the store: {difference}." if difference else "",
@@ -561,7 +554,7 @@ def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:
     return ", ".join(name.replace("_", " ") for name in dict.fromkeys(names))
 
 
-def _result_text_gallery(scene: SceneInspection) -> str:
+def result_text(scene: SceneInspection) -> str:
     """Return the flags and the errors of the pose, in words."""
     parts = [scene.detection.name.replace("_", " "), f"area {number(scene.area_px)} px\u00b2"]
     if "marker_detection" in scene.values:

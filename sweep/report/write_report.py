@@ -212,63 +212,26 @@ COMPUTED_FLAGS = ("detection", "estimate", "flipped")
 REPAIR = "`sweep verify --repair` repairs it"
 
 
-def check_output(
-    output: Path, figures: Path | None = None, form: str = "html", store: str = ""
-) -> None:
+def check_output(output: Path, folders: Sequence[Path], store: str) -> None:
     """Check that a report can be written, before it is computed.
-
-    Parameters
-    ----------
-    output, figures, form
-        As in :func:`write_report`.
-    store
-        Path or URL of the report's own store.
 
     Raises
     ------
     StoreError
-        If the output is a folder, or its folder is missing or not writable; if the figures' folder
-        is a file; if anything would be written into a store; or if the Markdown's folder, which is
-        replaced as a whole, holds anything but pictures.
+        If the output is a folder, or its folder is missing or not writable; if a folder of figures
+        is a file; or if anything would be written into a store.
     """
-    folder = figures_folder(output) if form == "md" else None
-    for wanted in (output, figures, folder):
-        if wanted is not None:
-            with write_errors_explained(wanted):
-                _check_outside(wanted, store)
+    own = None if is_remote(store) else Path(os.path.realpath(store))
+    for wanted in (output, *folders):
+        with write_errors_explained(wanted):
+            resolved = Path(os.path.realpath(wanted))
+            around = own if own in (resolved, *resolved.parents) else enclosing_store(resolved)
+        if around is not None:
+            raise StoreError(f"{wanted}: cannot be written: it is inside the store {around}")
     check_output_file(output)
-    if folder is not None and output.exists() and not output.is_file():
-        raise StoreError(
-            f"{output}: cannot be written: Markdown needs a folder for its figures beside it; "
-            "choose a file, or --format html"
-        )
-    for wanted in (figures, folder):
-        if wanted is not None:
-            with write_errors_explained(wanted):
-                _check_folder(wanted)
-    if figures is not None and folder is not None and (
-        Path(os.path.realpath(folder)) in Path(os.path.realpath(figures)).parents):
-        raise StoreError(f"{figures}: cannot hold figures: {folder} is replaced as a whole")
-    if folder is not None and folder.is_dir():
-        others = sorted(path.name for path in folder.iterdir()
-                        if path.suffix not in PICTURES or path.is_dir())
-        if others:
-            raise StoreError(f"{folder}: cannot be replaced: it holds {others[0]}, which is not a "
-                             "figure; choose another output")
-
-
-def figures_folder(output: Path) -> Path:
-    """Return the folder of the figures and scenes of a report in Markdown."""
-    return output.with_name(f"{output.stem}_figures")
-
-
-def _check_outside(wanted: Path, store: str) -> None:
-    """Check that a path is not inside a local store, the report's own or any other."""
-    own = None if not store or is_remote(store) else Path(os.path.realpath(store))
-    resolved = Path(os.path.realpath(wanted))
-    store_around = own if own in (resolved, *resolved.parents) else enclosing_store(resolved)
-    if store_around is not None:
-        raise StoreError(f"{wanted}: cannot be written: it is inside the store {store_around}")
+    for folder in folders:
+        with write_errors_explained(folder):
+            _check_folder(folder)
 
 
 def _check_folder(wanted: Path) -> None:
@@ -295,8 +258,7 @@ def write_report(
         The file to write; an existing one is replaced.
     form
         ``html``: one self-contained page. ``md``: Markdown with its figures and scenes in a folder
-        beside it, named as ``output`` with ``_figures`` in place of the suffix; an existing folder
-        is replaced as a whole.
+        beside it, named as ``output`` with ``_figures`` in place of the suffix.
     figures
         Folder into which each figure is written as an SVG and a PNG file, too.
 
@@ -309,7 +271,9 @@ def write_report(
     """
     if form not in FORMATS:
         raise ArgumentError("form", form, f"expected one of {', '.join(FORMATS)}")
-    check_output(output, figures, form, data.store)
+    beside = output.with_name(f"{output.stem}_figures") if form == "md" else None
+    folders = [folder for folder in (beside, figures) if folder is not None]
+    check_output(output, folders, data.store)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
     data = data.in_memory()
@@ -317,21 +281,17 @@ def write_report(
     title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))
     rendered = figures_of(data)
-    folder = figures_folder(output) if form == "md" else None
     pictures = {
         f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
-        for figure in rendered for suffix in PICTURES if folder is not None or figures is not None}
+        for figure in rendered for suffix in PICTURES if folders}
     scenes = list(scenes_of(data))
     text = page(title, numbers, origin, rendered, scenes, data.require,
-                "" if folder is None else folder.name)
+                "" if beside is None else beside.name)
     # Files are written after all of them were made.
-    if figures is not None:
-        _write_pictures(figures, pictures)
-    if folder is not None:
-        with write_errors_explained(folder):
-            for path in folder.iterdir() if folder.is_dir() else ():
-                path.unlink()
-        _write_pictures(folder, pictures | {
+    for folder in folders:
+        _write_pictures(folder, pictures)
+    if beside is not None:
+        _write_pictures(beside, {
             f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
             if scene.picture is not None})
     # Invalid Unicode, which a file's name may hold, is written as a question mark.

@@ -52,18 +52,6 @@ def told(capsys, line):
     return code, *capsys.readouterr()
 
 
-@pytest.mark.parametrize(("line", "instead"), [
-    ("environments list", "`sweep compare A.zarr B.zarr`"),
-    ("check-detector opencv --calls 3", "`sweep plugins check NAME`"),
-    ("run small.toml --durable", "`sweep verify STORE --repair`"),
-])
-def test_a_removed_command_or_flag_says_in_one_line_what_to_do_instead(line, instead, capsys):
-    code, out, err = told(capsys, line)
-    assert (code, out) == (2, "")
-    assert instead in err
-    assert err.count("\n") == 1
-
-
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
     ("line", "hint"),

@@ -245,6 +245,8 @@ def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
         rejected = solved & ~kept
         right = 100 * (rejected & ~flipped).sum() / rejected.sum() if rejected.any() else math.nan
         assert row[6].split(" (")[0] == number(right)
+    assert "Flips kept<" in page.replace("\n", "")
+    assert "Flips kept, threshold" not in page
     assert sum(int(row[2]) for row in rows[1:]) == (
         results["estimate"] == EstimateStatus.solved).sum()
 
@@ -322,30 +324,6 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
             assert re.sub(r"\\.", "", line).count("|") >= 3
 
 
-@pytest.mark.long
-def test_the_figures_of_an_earlier_markdown_go_but_nothing_else_does(tmp_path):
-    url = made(tmp_path, f"title = ' '\n{ODD['single pose']}", "one")
-    output, folder = tmp_path / "answer.md", tmp_path / "answer_figures"
-    folder.write_text("mine")
-    assert "it is a file" in command("report", url, "-o", output)[2]
-    assert not output.exists()
-    folder.unlink()
-    folder.mkdir()
-    (folder / "stale.png").write_text("old")
-    assert command("report", url, "-o", output)[::2] == (0, "")
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "failures.png", "failures.svg", "scene-1.png"]
-    assert output.read_text(encoding="utf-8").startswith("# one\n")
-    (folder / "notes.txt").write_text("mine")
-    code, _, err = command("report", url, "-o", output)
-    held = f"{folder}: cannot be replaced: it holds notes.txt, which is not a figure"
-    assert (code, err) == (2, f"{held}; choose another output\n")
-    (folder / "notes.txt").unlink()
-    inside = folder / "inside"
-    assert "is replaced as a whole" in command(
-        "report", url, "-o", output, "--figures", inside)[2]
-
-
 def test_the_pipeline_can_be_taken_from_the_page(full, page):
     encoded = re.search(r'href="data:application/toml;base64,([^"]*)"', page)[1]
     assert base64.b64decode(encoded).decode() == open_store(full).pipeline.text
@@ -391,7 +369,7 @@ def test_poses_that_are_missing_are_told(odd, tmp_path):
     chunks_of(url, "detection")[0].unlink()
     code, _, err = command("report", url, "-o", output)
     assert code == 2
-    assert "1 of 4 blocks lack chunks of detection" in err
+    assert "1 of 4 blocks lack chunks" in err
     assert "sweep verify --repair" in err
     assert not output.exists()
 

@@ -25,7 +25,6 @@ from zarr.api import asynchronous
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
-from sweep.experiment.facts import camera_facts, camera_notes
 from sweep.experiment.grid import Blocks, scene_axes
 from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
 from sweep.experiment.sampling import texts_in
@@ -392,11 +391,11 @@ def root_attributes(
 ) -> dict[str, Any]:
     """Return the attributes of a store's root: texts and numbers, which netCDF can hold."""
     coordinates = [array.path for array in planned if array.coordinate]
-    surprising = camera_notes(pipeline)
+    surprising = pipeline.facts.camera_notes
     attributes = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
-        **camera_facts(pipeline).attributes(),
+        **pipeline.facts.camera.attributes(),
         **({"camera_notes": "; ".join(surprising)} if surprising else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": json.dumps(metadata),

@@ -8,7 +8,6 @@ from sweep.errors import PipelineError, StoreError
 from sweep.evaluation.block import run_cells
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
-from sweep.experiment.facts import camera_notes
 from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -176,8 +175,8 @@ def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line)
      "the calibration's numbers are drawn independently of each other"),
 ])
 def test_beliefs_that_may_surprise_are_told(camera, estimator, line):
-    assert [each for each in camera_notes(pipeline(camera, estimator, 1)) if line in each]
-    assert not camera_notes(pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1))
+    assert [each for each in pipeline(camera, estimator, 1).facts.camera_notes if line in each]
+    assert not pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1).facts.camera_notes
 
 
 # Reuse.

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.analysis.dataset import decode_flags
+    from sweep.diagnosis.detection import DetectionModel
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
@@ -48,8 +49,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
-    "StoreError", "SweepError", "__version__", "compare", "decode_flags", "fit", "limit",
-    "measure_tradeoff", "open", "photos", "require", "run", "size", "twins", "write_report",
+    "StoreError", "SweepError", "__version__", "compare", "decode_flags", "diagnose",
+    "error_model", "fit", "limit", "measure_tradeoff", "open", "photos", "reference", "require",
+    "run", "size", "twins", "write_report",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
@@ -97,7 +99,7 @@ def run(
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
     workers
-        Processes of the cluster that is started for the run (default: the available processors).
+        Processes that are started on this machine (default: the available processors).
     client
         A ``distributed.Client``, or a cluster object such as ``LocalCluster`` or ``SLURMCluster``,
         to run on instead. It stays open. Its workers must be processes that have the same versions
@@ -554,6 +556,86 @@ def require(
         os.fspath(store), requirements, per=per, at=at, against=older, every=True)
 
 
+def diagnose(
+    observations: str | os.PathLike[str] | Mapping[str, Sequence[Any]],
+    *,
+    camera: str | os.PathLike[str] | None = None,
+    size_m: float | None = None,
+    dictionary: str = "",
+    refinement: str = "",
+    zero_sd_m: float = 0.01,
+    compared: str = "z",
+    output: str | None = None,
+) -> Findings:
+    """Find why a program's poses are not what a tape says.
+
+    Parameters
+    ----------
+    observations
+        A CSV file, or its columns by name: what the program said (``tvec_x_m``, ``tvec_y_m``,
+        ``tvec_z_m``, or ``range_m``, ``rvec_x`` ...; or corners, ``corner0_x_px`` ...), what was
+        measured (``tape_m`` from lens to marker, ``x_m``, ``y_m``, ``z_m``, ``yaw_deg``), with
+        standard deviations (``tape_sd_m``, ``position_sd_m``). Empty cells are unknown.
+    camera
+        The file of the calibration that the program believes.
+    size_m, dictionary
+        As the program believes them.
+    refinement
+        none, subpix, contour or apriltag; its bias and noise are expected.
+    zero_sd_m
+        Standard deviation of the tape's zero point, in metres.
+    compared
+        What was compared with the tape: "z", the third number of tvec, or "range".
+    output
+        A PNG or SVG file for the figure of residuals.
+
+    Returns
+    -------
+    Findings
+        Causes by posterior probability, what each predicts, the test that would decide, and one
+        sentence. ``numbers`` has the same; ``status`` is 3 if the rows cannot tell.
+
+    Raises
+    ------
+    ArgumentError
+        One line on rows, columns or numbers that cannot be.
+
+    Examples
+    --------
+    >>> rows = {"range_m": [1.8, 3.6], "tape_m": [1.0, 2.0]}
+    >>> found = sweep.diagnose(rows, dictionary="tagStandard41h12")
+    >>> found.numbers["causes"][0]["causes"]
+    ['size']
+    """
+    return library.diagnosis.diagnose(
+        observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
+        zero_sd_m=zero_sd_m, compared=compared, output=output)
+
+
+def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
+    """Make a model of the error of one detection: covariance, bias, probability of a flip.
+
+    Parameters
+    ----------
+    store
+        A simulation of one detector setting and one solver, with drawn poses: its path, or results
+        of `open`, of which one setting was chosen with ``.isel``.
+
+    Returns
+    -------
+    DetectionModel
+        ``model.at(rvec, tvec_m, ambiguity)`` has the 6 x 6 covariance, the bias and the probability
+        of a flip of estimated poses, and whether they are known: the simulation has poses there.
+        ``model.to_json()`` keeps it.
+
+    Raises
+    ------
+    StoreError, DatasetError
+        If there is no store, fewer than 2,000 solved poses, or several settings.
+    """
+    return library.detection.error_model(store)
+
+
 def measure_tradeoff(
     store: str | os.PathLike[str],
     *,
@@ -708,3 +790,29 @@ def write_report(
         os.fspath(store), None if output is None else os.fspath(output), require=require, per=per,
         form=form, figures=None if figures is None else os.fspath(figures),
         error_model=error_model, command=command)
+
+
+def reference(*names: str) -> Findings:
+    """Return parameters, effects, solvers, variables, flags or statistics, with their meaning.
+
+    Parameters
+    ----------
+    names
+        A subject ("camera", "effects", "flags", ...) or a parameter; without any, the subjects.
+
+    Returns
+    -------
+    Findings
+        A table of each subject, and one of the parameters.
+
+    Raises
+    ------
+    ArgumentError
+        For a name that is neither.
+
+    Examples
+    --------
+    >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
+    'degree'
+    """
+    return library.reference.reference(names)

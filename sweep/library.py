@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from sweep.analysis import camera_calibration as camera_calibration
     from sweep.analysis import requirements as requirements
     from sweep.conformance import check as check
+    from sweep.diagnosis import detection as detection
+    from sweep.diagnosis import diagnosis as diagnosis
+    from sweep.diagnosis import observations as observations
     from sweep.evaluation import block as block
     from sweep.evaluation import inspection as inspection
     from sweep.exchange import answers as answers
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
     from sweep.report import limit_figure as limit_figure
     from sweep.report import output_file as output_file
     from sweep.report import questions as questions
+    from sweep.report import reference as reference
     from sweep.report import report_data as report_data
     from sweep.report import scenes as scenes
     from sweep.report import table as table
@@ -62,6 +66,9 @@ _MODULES = (
     "sweep.analysis.requirements",
     "sweep.compilation",
     "sweep.conformance.check",
+    "sweep.diagnosis.detection",
+    "sweep.diagnosis.diagnosis",
+    "sweep.diagnosis.observations",
     "sweep.evaluation.block",
     "sweep.evaluation.inspection",
     "sweep.exchange.answers",
@@ -93,6 +100,7 @@ _MODULES = (
     "sweep.report.limit_figure",
     "sweep.report.output_file",
     "sweep.report.questions",
+    "sweep.report.reference",
     "sweep.report.report_data",
     "sweep.report.scenes",
     "sweep.report.table",

@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import pytest
 
-from support.guide_tables import TABLES, outdated_tables
 from support.here import calls_here
 from sweep.cli import main
 from sweep.experiment.board_rules import read_board
-from sweep.experiment.parameters import PARAMETERS, SECTIONS, Stage
+from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.photographs.twins import read_scene
 
@@ -257,19 +256,6 @@ def test_glossary_is_short():
     words = re.findall(r"^\| (\w+) \|", text.partition("\n## ")[0], re.MULTILINE)[1:]
     assert words == sorted(words)
     assert 10 < len(words) <= 25
-
-
-def test_parameters_variables_flags_solvers_and_effects_are_those_of_the_declarations():
-    names = []
-    for path in GUIDES:
-        text = path.read_text()
-        assert not outdated_tables(text), f"python tests/support/guide_tables.py {path}"
-        names += re.findall("<!-- table: (.*) -->", text)
-    parts = {f"parameters.{section}" for section in SECTIONS}
-    parts |= {name for name in TABLES if name.startswith("flags.")}
-    assert set(names) | parts >= set(TABLES)
-    guide = (TOP / "pipelines" / "README.md").read_text()
-    assert all(f"\n| `{name}` |" in guide for name in PARAMETERS)
 
 
 def test_first_analysis_is_five_lines():

@@ -317,3 +317,17 @@ def calibration(options: argparse.Namespace) -> int:
         coefficients=options.coefficients, target_m=options.target_m)
     return answered(options, library.comparison_tables.calibration_findings(
         library.camera_calibration.calibration_summary(found), quoted(options.store)))
+
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep reference``.
+
+@command(
+    "pipelines/README.md", {
+        "sweep reference": "lists the subjects: sections of a pipeline, effects, variables, ...",
+        "sweep reference camera tilt_deg": "prints the parameters of [camera], and tilt_deg"},
+    argument("names", metavar="NAME", nargs="*", help="a subject, or a parameter"),
+    *FORM)
+def reference(options: argparse.Namespace) -> int:
+    """Explain parameters, effects, solvers, variables and flags."""
+    return answered(options, library.reference.reference(options.names))

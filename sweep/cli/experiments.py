@@ -498,7 +498,7 @@ def verify(options: argparse.Namespace) -> int:
         print_json(report.to_json())
         return 1 if report.damage else 0
 
-    unstable = [each for each in report.damage if each.kind == "not deterministic"]
+    unstable = [each for each in report.damage if each.where == report.unstable]
     damaged = [each for each in report.damage if each not in unstable]
     for what, listed in (("repaired", report.repaired), ("damaged", damaged)):
         for damage in listed[:MAX_LINES]:
@@ -514,8 +514,6 @@ def verify(options: argparse.Namespace) -> int:
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})"
     )
-    if report.retried:
-        again += f", {report.retried:,} that had failed"
     state = "" if report.finished else ", unfinished"
     say(
         f"{report.store}: "

@@ -12,6 +12,7 @@ from sweep.cli.answers import (
     compare,
     error_model,
     limit,
+    reference,
     report,
     require,
     size,
@@ -19,7 +20,7 @@ from sweep.cli.answers import (
 )
 from sweep.cli.command import Command, argument, command, flushed
 from sweep.cli.experiments import plan, repro, run, show, status, verify
-from sweep.cli.programs import export, fit, photos, plugins, score
+from sweep.cli.programs import diagnose, export, fit, photos, plugins, score
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
@@ -29,8 +30,8 @@ from sweep.version import __version__
 
 SHELLS = ("bash", "zsh", "fish")
 
-FILES = ("PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR", "FILE", "FIGURE",
-         "PNG")
+FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR",
+         "FILE", "FIGURE", "PNG")
 """Arguments for which names of files and folders are offered."""
 
 
@@ -59,7 +60,7 @@ def completion(options: argparse.Namespace) -> int:
 
 COMMANDS = (
     run, plan, size, limit, show, repro, tradeoff, report, require, error_model, calibration,
-    verify, status, export, score, photos, fit, compare, plugins, completion,
+    verify, status, export, score, photos, fit, diagnose, compare, plugins, reference, completion,
 )
 """Every command, in the order in which the help lists them."""
 

@@ -12,13 +12,17 @@ from pathlib import Path
 from sweep import library
 from sweep.cli.command import (
     CONTINUES,
+    FORM,
     JSON,
     PHOTOGRAPHS,
     PIPELINE,
+    answered,
     argument,
     command,
+    figure_argument,
     new_store,
     print_json,
+    quiet_matplotlib,
     read_pipeline,
     say,
     say_next,
@@ -148,6 +152,33 @@ def _measuring_command(options: argparse.Namespace) -> str:
     for setting in options.settings:
         words += ["--set", setting]
     return quoted(*words)
+
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep diagnose``.
+
+@command(
+    "pipelines/diagnose/README.md", {
+        "sweep diagnose rows.csv --camera camera.yaml --set size_m=0.153":
+            "ranks the causes of wrong distances, and says what to measure next",
+        "sweep diagnose rows.csv --set dictionary=tagStandard41h12 -o residuals.png":
+            "draws what each cause leaves unexplained"},
+    argument(
+        "observations", metavar="OBSERVATIONS",
+        help="CSV file with a row a pose: what the program said (tvec_x_m, tvec_y_m, tvec_z_m or "
+        "range_m) and what was measured (tape_m, or x_m, y_m, z_m)"),
+    argument("--camera", metavar="FILE",
+             help="file of the calibration that the program believes"),
+    settings_argument(
+        "what the program believes: size_m, dictionary, refinement; zero_sd_m of the tape's zero "
+        "point; compared, z or range"),
+    figure_argument("draw the residuals of each cause"), FORM)
+def diagnose(options: argparse.Namespace) -> int:
+    """Find why poses differ from what a tape says."""
+    quiet_matplotlib()
+    return answered(options, library.diagnosis.diagnose(
+        options.observations, camera=options.camera, output=options.output,
+        **library.observations.settings_of(options.settings)))
 
 
 # --------------------------------------------------------------------------------------------------

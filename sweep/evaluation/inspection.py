@@ -10,36 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import PluginError, RunError
-from sweep.evaluation.block import assumed_cameras, run_cells
+from sweep.evaluation.block import SceneBatch, assumed_cameras, run_cells, scenes_at
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import (
-    RecordedSearch,
     detection_source,
     is_recorded,
     search_windows,
-    visibility_flags,
     whole_frames,
 )
-from sweep.experiment.experiment import largest_board, scene_plugins
 from sweep.experiment.grid import (
     board_settings,
     detector_settings,
     estimators,
     image_keys,
-    scene_values,
 )
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import variables_of
-from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.camera import Column
 from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
-from sweep.model.scene import Scenes, build_scenes
-from sweep.typing import Floats, Grey, Integers, Masks
+from sweep.typing import Floats, Grey
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,36 +78,36 @@ class SceneInspection:
     values: dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class _Rendered:
-    """A pipeline's single scene: parameters, geometry, image and the image's window."""
-
-    values: dict[str, Column]
-    scenes: Scenes
-    boxes: Integers
-    invisible: Masks
-    window: tuple[int, int, int, int]
-    image: Grey
+def _searched_window(pipeline: Pipeline, batch: SceneBatch) -> list[int]:
+    """Return the window that is searched in a run; the whole frame if the target is not seen."""
+    full = whole_frames(batch.values, 1) | (batch.visibility != DetectionStatus.not_run)
+    boxes, setting = marker_boxes(batch.scenes), detector_settings(pipeline)[0]
+    window: list[int] = search_windows(batch.scenes, boxes, setting, full)[0].tolist()
+    return window
 
 
-def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
-    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, 1, scene_plugins(pipeline))
-    boxes = marker_boxes(scenes)
-    full = whole_frames(values, 1) | whole_frame
-    invisible = visibility_flags(scenes) != DetectionStatus.not_run
-    setting = detector_settings(pipeline)[0]
-    left, top, right, bottom = search_windows(scenes, boxes, setting, full | invisible)[0].tolist()
-    drawn = np.zeros_like(boxes[0]) if invisible[0] else boxes[0]
-    window = (left, top, right, bottom)
-    return _Rendered(values, scenes, boxes, invisible, window, render(scenes, 0, drawn, window))
+def _drawn(
+    pipeline: Pipeline, batch: SceneBatch, *, whole_frame: bool
+) -> tuple[Grey, tuple[int, int, int, int]]:
+    """Return the image (h, w) of a single scene, and its window in the frame."""
+    left, top, right, bottom = _searched_window(pipeline, batch)
+    if whole_frame:
+        left, top, (right, bottom) = 0, 0, batch.scenes.frame[0].tolist()
+    box = marker_boxes(batch.scenes)[0]
+    if batch.visibility[0] != DetectionStatus.not_run:
+        box = np.zeros_like(box)
+    return render(batch.scenes, 0, box, (left, top, right, bottom)), (left, top, right, bottom)
+
+
+def _single_scene(pipeline: Pipeline) -> list[NDArray[np.intp]]:
+    return [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
 
 
 @single_threaded()
 def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> Grey:
     """Return the image (h, w) of a pipeline's single scene; it is not searched."""
-    return _rendered(pipeline, whole_frame=whole_frame).image
+    batch = scenes_at(pipeline, _single_scene(pipeline))
+    return _drawn(pipeline, batch, whole_frame=whole_frame)[0]
 
 
 @single_threaded()
@@ -134,45 +127,35 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     RunError
         If the scene's computation raises.
     """
-    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    indices = _single_scene(pipeline)
     result = run_cells(pipeline, indices)
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
-    rendered = _rendered(pipeline, whole_frame=whole_frame)
-    values, scenes, image = rendered.values, rendered.scenes, rendered.image
-    left, top, _, _ = rendered.window
-    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
+    batch = scenes_at(pipeline, indices)
+    scenes, targets = batch.scenes, batch.targets
+    image, window = _drawn(pipeline, batch, whole_frame=whole_frame)
     # Searched in its own window, as in a run, even if the whole frame is shown.
-    full = whole_frames(values, 1) | rendered.invisible
-    searched = search_windows(scenes, rendered.boxes, setting, full)
-    x0, y0, x1, y1 = searched[0].tolist()
-    boards = values["board"].listed(1) if "board" in values else None
-    targets = target_scenes(
-        scenes, visibility_flags(scenes), boards,
-        (1, 0) if boards is None else largest_board(pipeline),
-    )
+    (left, top), (x0, y0, x1, y1) = window[:2], _searched_window(pipeline, batch)
+    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
     keys = image_keys(pipeline, indices) if is_recorded(setting) else None
     source = detection_source(setting, scenes, targets, keys, board_settings(pipeline)[0])
-    output, origin = SearchOutput([], None, []), np.zeros(2)
-    if isinstance(source, RecordedSearch):  # in pixels of the frame
-        with suppress(PluginError):  # flagged "failed" by the run
-            output = source(0)
-    else:
-        origin = np.array([x0, y0], dtype=np.float64)
+    output = SearchOutput([], None, [])
+    origin = np.array([x0, y0] if source.needs_images else [0, 0], dtype=np.float64)
+    with suppress(PluginError):  # flagged "failed" by the run
         output = source(0, image[y0 - top : y1 - top, x0 - left : x1 - left])
     columns = {name: parts[0][0] for name, parts in result.columns.items()}
     chessboard, length = np.zeros((0, 2)), float(scenes.size_m[0])
     true_markers = targets.corners_px[0]
-    if boards is None:
+    if targets.are_markers:
         markers = true_markers + columns["corner_error_px"]
     else:
         markers = true_markers + columns["marker_corner_error_px"]
         if "chessboard_corner_error_px" in columns:
             chessboard = targets.chessboard_px[0] + columns["chessboard_corner_error_px"]
-        length = float(np.ptp(boards[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
+        length = float(np.ptp(targets.targets[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
-        cameras, _ = assumed_cameras(estimator, values, scenes)
+        cameras, _ = assumed_cameras(estimator, batch.values, scenes)
         vector = columns["rotation_error_rad"]
         rotation = rotation_of_vector(vector) @ scenes.rotation[0]
         position = scenes.translation[0] + columns["translation_error_m"]
@@ -180,7 +163,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
-        window=rendered.window,
+        window=window,
         true_corners=scenes.corners_px[0],
         true_markers=true_markers,
         markers=markers,

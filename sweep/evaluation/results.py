@@ -49,10 +49,10 @@ MAX_TRACEBACKS = 1000
 """Failures whose traceback is kept; of the others only the last line is."""
 
 
-def exception_text(failures: Sequence[Failure]) -> str:
+def exception_text(failures: int) -> str:
     """Return the text of the exception that is being handled, the next after ``failures``."""
     text = traceback.format_exc()
-    return text if len(failures) < MAX_TRACEBACKS else text.strip().rpartition("\n")[2]
+    return text if failures < MAX_TRACEBACKS else text.strip().rpartition("\n")[2]
 
 
 @dataclass(slots=True)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +31,42 @@ from sweep.measure.detectors import (
 from sweep.measure.flags import DetectionStatus
 from sweep.model.camera import Column, map_columns
 from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
-from sweep.model.marker import marker_corners
 from sweep.model.pose import transform_points
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes
 from sweep.plugins.declared import PluginSetting
-from sweep.plugins.recording import REJECTED, RecordedDetector, Recording, is_recording
+from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Where detections come from: a detector that searches images, or what another program found.
+
+class DetectionSource(Protocol):
+    """Where the detections of N scenes with one setting come from.
+
+    Attributes
+    ----------
+    needs_images
+        Whether scenes are rendered for it, in windows; else its pixels are those of the frame.
+    """
+
+    needs_images: bool
+
+    def __call__(self, row: int, image: Grey) -> SearchOutput:
+        """Return what is found in the image of scene ``row``."""
+        ...
+
+    def poses(self, found: Findings) -> Poses | None:
+        """Return the poses that come with what was found; None if there never are any."""
+        ...
+
+
+class Poses(NamedTuple):
+    """Poses of N detected targets: (N, 3, 3) and (N, 3) in metres; NaN where none was given."""
+
+    rotation: Floats
+    translation: Floats
+
 
 @dataclass(slots=True)
 class ImageSearch:
@@ -52,15 +78,12 @@ class ImageSearch:
         The search for markers, and what OpenCV does by means of a board.
     scenes, targets
         What the images show.
-    sides
-        The larger side of each frame in px.
     """
 
     find: FindFunction
     boards: BoardDetector
     scenes: Scenes
     targets: TargetScenes
-    sides: Sequence[int]
     needs_images: bool = True
     _last: tuple[Grey, str, SearchOutput] | None = None
 
@@ -69,7 +92,7 @@ class ImageSearch:
         dictionary, target = self.scenes.dictionary[row], self.targets.targets[row]
         if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
             return self._last[2]  # another marker of a photograph
-        found = self.find(image, dictionary, self.sides[row])
+        found = self.find(image, dictionary, int(self.scenes.frame[row].max()))
         output = (
             SearchOutput(*found) if target.is_marker
             else self.boards.complete(image, target, found)
@@ -77,12 +100,8 @@ class ImageSearch:
         self._last = image, dictionary, output
         return output
 
-
-class Poses(NamedTuple):
-    """Poses of N detected markers: (N, 3, 3) and (N, 3) in metres; NaN where none was given."""
-
-    rotation: Floats
-    translation: Floats
+    def poses(self, found: Findings) -> None:
+        """Return None: images have no poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +110,7 @@ class RecordedSearch:
 
     Attributes
     ----------
-    recording, scenes
+    recording, scenes, targets
         The detections, and the scenes whose images they are of.
     keys
         (N,) keys of the scenes' images.
@@ -99,63 +118,86 @@ class RecordedSearch:
 
     recording: Recording
     scenes: Scenes
+    targets: TargetScenes
     keys: NDArray[np.uint64]
     needs_images: bool = False
 
-    def __call__(self, row: int, image: Grey | None = None) -> SearchOutput:  # noqa: ARG002
+    def __call__(self, row: int, image: Grey) -> SearchOutput:  # noqa: ARG002
         """Return what was found in the image of scene ``row``, in pixels of the frame."""
-        part = self.recording.rows(self.keys[row])
-        corners, ids = self._corners(part, row)[:, None], self.recording.marker_id[part]
-        decoded = ids != REJECTED
+        quads, ids, _ = self._squares(row)
+        decoded, corners = ids != REJECTED, quads[:, None]
         return SearchOutput(
             list(corners[decoded]), ids[decoded] if decoded.any() else None,
             list(corners[~decoded]),
         )
 
     def poses(self, found: Findings) -> Poses:
-        """Return the poses that belong to the markers that were detected."""
+        """Return the pose of each detected target: of the target itself, or of a square of it."""
         count = len(found.flags)
         poses = Poses(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
         for row in np.flatnonzero(found.flags == DetectionStatus.detected).tolist():
             part = self.recording.rows(self.keys[row])
-            same = (self._corners(part, row) == found.marker_corners[row]).all(axis=(1, 2))
-            same &= self.recording.marker_id[part] == self.scenes.marker_id[row]
-            first = part.start + int(np.argmax(same))
-            poses.rotation[row] = self.recording.rotation[first]
-            poses.translation[row] = self.recording.translation[first]
+            of_target = part.start + np.flatnonzero(self.recording.marker_id[part] == OF_TARGET)
+            first, last = np.searchsorted(found.owner, [row, row + 1])
+            squares = found.corners[first:last]
+            chosen = of_target.tolist() + [
+                at for quad, number, at in zip(*self._squares(row), strict=True)
+                if number in self.targets.targets[row].marker_ids
+                and (quad == squares).all(axis=(1, 2)).any()
+            ]
+            for at in chosen:
+                if np.isfinite(self.recording.translation[at]).all():
+                    poses.rotation[row] = self.recording.rotation[at]
+                    poses.translation[row] = self.recording.translation[at]
+                    break
         return poses
 
-    def _corners(self, part: slice, row: int) -> Floats:
-        """Return the corners (n, 4, 2) of an image's markers.
+    def _squares(self, row: int) -> tuple[Floats, Integers, Integers]:
+        """Return the squares of an image: corners (n, 4, 2), IDs and rows of the recording (n,).
 
-        Where only a pose was given, those of the true camera's image of it.
+        Where only a pose was given, the corners are the true camera's image of its square (the
+        first, of an ID that the target lacks); of the pose of the target as a whole all of them,
+        if the image has no corners.
         """
-        corners = self.recording.corners[part].copy()
-        which = np.flatnonzero(np.isnan(corners).any(axis=(1, 2)))
-        if len(which):
+        part, target = self.recording.rows(self.keys[row]), self.targets.targets[row]
+        given, ids = self.recording.corners[part], self.recording.marker_id[part]
+        missing = np.isnan(given).any(axis=(1, 2))
+        numbers = {marker_id: k for k, marker_id in enumerate(target.marker_ids)}
+        objects = target.corners_m * (self.scenes.size_m[row] if target.is_marker else 1.0)
+        quads, known, rows = [given[~missing]], ids[~missing].tolist(), np.flatnonzero(~missing)
+        at = rows.tolist()
+        for i in np.flatnonzero(missing).tolist():
+            if ids[i] != OF_TARGET:
+                shown = {int(ids[i]): numbers.get(int(ids[i]), 0)}
+            else:
+                shown = numbers if missing.all() else {}
             points = transform_points(
-                marker_corners(np.repeat(self.scenes.size_m[row], len(which))),
-                self.recording.rotation[part][which], self.recording.translation[part][which],
+                objects[list(shown.values())].reshape(1, -1, 3),
+                self.recording.rotation[part][[i]], self.recording.translation[part][[i]],
             )
-            cameras = self.scenes.cameras.take(np.repeat(row, len(which)))
-            corners[which] = cameras.project(points)
-        return corners
+            pixels = self.scenes.cameras.take(np.array([row])).project(points)
+            quads.append(pixels.reshape(-1, 4, 2))
+            known += shown
+            at += [i] * len(shown)
+        order = np.argsort(at, kind="stable")
+        return (
+            np.concatenate(quads)[order], np.array(known, dtype=np.int64)[order],
+            part.start + np.array(at, dtype=np.int64)[order],
+        )
 
 
 def detection_source(
     setting: AnyDetectorSetting, scenes: Scenes, targets: TargetScenes,
     keys: NDArray[np.uint64] | None, board_setting: BoardDetectorSetting,
-) -> ImageSearch | RecordedSearch:
+) -> DetectionSource:
     """Return where a setting's detections of scenes come from; ``keys`` are for recordings."""
-    if not is_recorded(setting):
-        return ImageSearch(
-            make_detector(setting), make_board_detector(setting, board_setting), scenes, targets,
-            scenes.frame.max(axis=1).tolist(),
-        )
-    record = setting.plugin.record(setting.folder) if isinstance(setting, PluginSetting) else None
-    if keys is None or not isinstance(record, RecordedDetector):
-        raise TypeError("recorded detections need keys")
-    return RecordedSearch(record.recording, scenes, keys)
+    if isinstance(setting, PluginSetting) and is_recorded(setting):
+        if keys is None:
+            raise TypeError("recorded detections need keys")
+        return RecordedSearch(setting.record().recording, scenes, targets, keys)
+    return ImageSearch(
+        make_detector(setting), make_board_detector(setting, board_setting), scenes, targets
+    )
 
 
 def is_recorded(setting: AnyDetectorSetting) -> bool:
@@ -240,12 +282,20 @@ def search_windows(
     ndarray
         (N, 4) left, top, right, bottom in pixels of the frame, half-open.
     """
-    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noise_coarseness[:, None]
+    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.effects.noise_coarseness[:, None]
     cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
-    whole |= uneven_light_needs_frame(setting, scenes.uneven_gain)
+    whole |= uneven_light_needs_frame(setting, scenes.effects.uneven_gain)
     frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     return np.where(whole[:, None], frame, cut)
+
+
+def common_windows(windows: Sequence[Integers]) -> Integers:
+    """Return the smallest windows (N, 4) that hold several settings' windows (N, 4)."""
+    return np.concatenate([
+        np.min([each[:, :2] for each in windows], axis=0),
+        np.max([each[:, 2:] for each in windows], axis=0),
+    ], axis=1)
 
 
 def search(
@@ -303,20 +353,14 @@ def search(
         )
         for k, (setting, on_board) in enumerate(zip(settings, on_boards, strict=True))
     ]
-    widest = np.concatenate(
-        [
-            np.min([each.windows[:, :2] for each in passes], axis=0),
-            np.max([each.windows[:, 2:] for each in passes], axis=0),
-        ],
-        axis=1,
-    )
+    widest = common_windows([each.windows for each in passes])
     for each in passes:
         each.cut_from(widest)
     imaged = wanted & np.array([keep or each.source.needs_images for each in passes])
     render_s, render_row_s = 0.0, np.zeros(len(scenes))
     for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
         begun = time.perf_counter()
-        images = _rendered(scenes, rows, boxes, widest, failures)
+        images = rendered(scenes, rows, boxes, widest, failures)
         spent = time.perf_counter() - begun
         render_s += spent
         render_row_s[rows] = spent / len(rows)
@@ -342,7 +386,7 @@ class _Pass:
     for which it raised, ``row_s`` (N,) the seconds spent on each.
     """
 
-    source: ImageSearch | RecordedSearch
+    source: DetectionSource
     number: int
     windows: Integers
     keep: bool
@@ -378,7 +422,7 @@ class _Pass:
             except Exception as error:
                 if self.source.needs_images:
                     raise_machine_fault(error)
-                text = exception_text(self.failures)
+                text = exception_text(len(self.failures))
                 self.failures.append(Failure(row, "detection", text, self.number))
                 self.failed.append(row)
             now = time.perf_counter()
@@ -387,13 +431,12 @@ class _Pass:
 
     def result(self, targets: TargetScenes) -> SearchResult:
         """Return what was found."""
-        start, origins, poses = time.perf_counter(), self.windows[:, :2], None
-        recorded = isinstance(self.source, RecordedSearch)  # in pixels of the frame
-        found = classify(targets, self.outputs, (0 if recorded else 1) * origins.astype(np.float64))
+        start, origins = time.perf_counter(), self.windows[:, :2]
+        offset = origins if self.source.needs_images else np.zeros_like(origins)
+        found = classify(targets, self.outputs, offset.astype(np.float64))
         flags = found.flags.copy()
         flags[self.failed] = DetectionStatus.failed
-        if isinstance(self.source, RecordedSearch):
-            poses = self.source.poses(found)
+        poses = self.source.poses(found)
         seconds = self.seconds + time.perf_counter() - start
         return SearchResult(targets, found, flags, seconds, self.images, origins, poses)
 
@@ -418,7 +461,7 @@ def _groups(
     yield from np.split(rows, np.flatnonzero(cuts) + 1)
 
 
-def _rendered(
+def rendered(
     scenes: Scenes, rows: NDArray[np.intp], boxes: Integers, windows: Integers,
     failures: list[Failure],
 ) -> Sequence[Grey | None]:
@@ -434,6 +477,6 @@ def _rendered(
                 images += render_all(scenes, alone, boxes[alone], windows[alone])
             except Exception as error:
                 raise_machine_fault(error)
-                failures.append(Failure(row, "scene", exception_text(failures)))
+                failures.append(Failure(row, "scene", exception_text(len(failures))))
                 images.append(None)
         return images

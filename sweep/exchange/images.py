@@ -10,24 +10,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.block import GEOMETRY
-from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
-from sweep.experiment.experiment import scene_plugins
-from sweep.experiment.grid import detector_settings, image_keys, scene_axes, scene_values
+from sweep.evaluation.block import scenes_at
+from sweep.evaluation.search import common_windows, search_windows, whole_frames
+from sweep.evaluation.variables import GEOMETRY, target_areas_px
+from sweep.experiment.grid import detector_settings, image_keys, scene_axes
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LABELS, VARIABLES, drawn_variables
+from sweep.experiment.schema import LABELS, VARIABLES, Variable, drawn_variables
+from sweep.measure.classify import TargetScenes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.camera import Column
 from sweep.model.extent import marker_boxes
-from sweep.model.pose import vector_of_rotation
-from sweep.model.scene import Scenes, build_scenes
+from sweep.model.polygon import signed_areas
+from sweep.model.scene import Scenes
 from sweep.store.files import write_whole
 from sweep.store.locations import reason_of
 from sweep.typing import Integers, Masks
@@ -49,19 +51,20 @@ class ImageBatch:
         (N,) places in the grid of scene axes, the last axis fastest.
     keys
         (N,) keys of the images (:func:`sweep.experiment.grid.image_keys`).
-    values, scenes
-        Parameters and geometry.
+    scenes, targets, values
+        Geometry, what is shown, and parameters.
     visible
-        (N,) whether there is an image: the marker is in the frame, and the lens model holds there.
+        (N,) whether there is an image: the target is in the frame, and the lens model holds there.
     boxes, windows
-        (N, 4) left, top, right, bottom in pixels of the frame, half-open: what the marker can
+        (N, 4) left, top, right, bottom in pixels of the frame, half-open: what the target can
         touch, and the part of the frame that the image shows.
     """
 
     numbers: NDArray[np.intp]
     keys: NDArray[np.uint64]
-    values: dict[str, Column]
     scenes: Scenes
+    targets: TargetScenes
+    values: dict[str, Column]
     visible: Masks
     boxes: Integers
     windows: Integers
@@ -71,20 +74,11 @@ class ImageBatch:
 
     @property
     def names(self) -> list[str]:
-        """The images' names without a suffix."""
+        """The images' names without a suffix: a number, which sorts, and half a key."""
         return [
-            image_name(number, key)
+            f"{number:06d}-{key & 0xFFFFFFFF:08x}"
             for number, key in zip(self.numbers.tolist(), self.keys.tolist(), strict=True)
         ]
-
-
-def image_name(number: int, key: int) -> str:
-    """Return the name of an image: its number, which sorts, and half its key, which identifies.
-
-    >>> image_name(12, 0x0123456789ABCDEF)
-    '000012-89abcdef'
-    """
-    return f"{number:06d}-{key & 0xFFFFFFFF:08x}"
 
 
 def scene_count(pipeline: Pipeline) -> int:
@@ -101,29 +95,22 @@ def scene_indices(pipeline: Pipeline, numbers: NDArray[np.intp]) -> list[NDArray
 def image_batch(
     pipeline: Pipeline, numbers: NDArray[np.intp], *, windowed: bool = False
 ) -> ImageBatch:
-    """Return scenes by their numbers (N,); ``windowed``: images of the marker's surroundings.
+    """Return scenes by their numbers (N,); ``windowed``: images of the target's surroundings.
 
     A window is the smallest that holds those of all detector settings of the experiment.
     """
     indices = scene_indices(pipeline, numbers)
-    count = len(numbers)
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count, scene_plugins(pipeline))
-    visible = visibility_flags(scenes) == DetectionStatus.not_run
-    boxes = marker_boxes(scenes)
-    frames = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
-    windows = frames
+    batch = scenes_at(pipeline, indices)
+    scenes, boxes = batch.scenes, marker_boxes(batch.scenes)
+    windows = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     if windowed:
-        full = whole_frames(values, count)
-        cut = [
+        full = whole_frames(batch.values, len(numbers))
+        windows = common_windows([
             search_windows(scenes, boxes, setting, full) for setting in detector_settings(pipeline)
-        ]
-        windows = np.concatenate([
-            np.min([each[:, :2] for each in cut], axis=0),
-            np.max([each[:, 2:] for each in cut], axis=0),
-        ], axis=1)
+        ])
     return ImageBatch(
-        np.asarray(numbers), image_keys(pipeline, indices), values, scenes, visible, boxes, windows
+        np.asarray(numbers), image_keys(pipeline, indices), scenes, batch.targets, batch.values,
+        batch.visibility == DetectionStatus.not_run, boxes, windows,
     )
 
 
@@ -172,52 +159,46 @@ class FileCamera:
 
     def opencv_yaml(self) -> str:
         """Return the text of a file that ``cv::FileStorage`` reads."""
-        return "\n".join([
-            "%YAML:1.0", "---",
-            f"image_width: {self.width_px}", f"image_height: {self.height_px}",
-            *_opencv_matrix("camera_matrix", 3, self.matrix),
-            *_opencv_matrix("distortion_coefficients", 1, self.distortion), "",
-        ])
+        file = cv2.FileStorage(
+            ".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+        )
+        file.write("image_width", self.width_px)
+        file.write("image_height", self.height_px)
+        file.write("camera_matrix", np.reshape(self.matrix, (3, 3)))
+        file.write("distortion_coefficients", np.array([self.distortion]))
+        return str(file.releaseAndGetString())
 
     def ros_yaml(self, name: str) -> str:
         """Return the text of a ``camera_info`` file as ROS's camera_calibration writes it."""
         fx, fy, cx, cy = self.view
-        model = MODELS.get(len(self.distortion), "rational_polynomial")
+        matrices = {
+            "camera_matrix": (3, self.matrix),
+            "distortion_coefficients": (1, self.distortion),
+            "rectification_matrix": (3, np.eye(3).ravel().tolist()),
+            "projection_matrix": (
+                3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+            ),
+        }
         return "\n".join([
             f"image_width: {self.width_px}", f"image_height: {self.height_px}",
             f"camera_name: {name}",
-            *_ros_matrix("camera_matrix", 3, self.matrix),
-            f"distortion_model: {model}",
-            *_ros_matrix("distortion_coefficients", 1, self.distortion),
-            *_ros_matrix("rectification_matrix", 3, np.eye(3).ravel().tolist()),
-            *_ros_matrix(
-                "projection_matrix", 3,
-                [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+            f"distortion_model: {MODELS.get(len(self.distortion), 'rational_polynomial')}",
+            *(
+                f"{key}:\n  rows: {rows}\n  cols: {len(values) // rows}\n  data: "
+                f"[{', '.join(repr(float(value)) for value in values)}]"
+                for key, (rows, values) in matrices.items()
             ), "",
         ])
 
 
-def _numbers(values: Sequence[float]) -> str:
-    return f"[{', '.join(repr(float(value)) for value in values)}]"
-
-
-def _opencv_matrix(name: str, rows: int, values: Sequence[float]) -> list[str]:
-    return [
-        f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {len(values) // rows}",
-        "   dt: d", f"   data: {_numbers(values)}",
-    ]
-
-
-def _ros_matrix(name: str, rows: int, values: Sequence[float]) -> list[str]:
-    return [f"{name}:", f"  rows: {rows}", f"  cols: {len(values) // rows}",
-            f"  data: {_numbers(values)}"]
-
-
 # --------------------------------------------------------------------------------------------------
-# The truth of exported images: a CSV row, COCO records, and the variables of a dataset.
+# The truth of exported images: rows of CSV, COCO records, and the variables of a dataset.
 
 CORNERS = tuple(f"{axis}{corner}" for corner in range(4) for axis in "xy")
 """Columns of the corners: x0, y0 of the top left one, then clockwise on the marker."""
+
+PLACES = tuple(f"{axis}{corner}_m" for corner in range(4) for axis in "XYZ")
+"""Columns of where the corners are on the target, in its frame."""
 
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Columns of the rotation vector in rad and of the position in m."""
@@ -244,30 +225,46 @@ class TruthTables:
     invisible: int = 0
 
     def write(self, folder: Path) -> None:
-        """Write ``truth.csv``, ``truth_coco.json`` and ``truth.nc`` into a folder."""
-        columns: dict[str, list[Any]] = {name: [] for name in (*GEOMETRY, "true_corners_px")}
+        """Write ``truth.csv``, ``truth_coco.json`` and ``truth.nc`` into a folder.
+
+        Of targets with a chessboard ``truth_chessboard.csv``, too.
+        """
         drawn = drawn_variables(self.pipeline)
-        columns |= {each.name: [] for each in drawn}
-        names: list[str] = []
+        columns: dict[str, list[Any]] = {}
         tables: list[pd.DataFrame] = []
+        chessboards: list[pd.DataFrame] = []
         for batch in image_batches(self.pipeline, windowed=self.windowed):
-            for name, function in GEOMETRY.items():
-                columns[name].append(function(batch.scenes))
-            columns["true_corners_px"].append(batch.scenes.corners_px)
-            values = batch.values  # noqa: PD011  (of scenes, not of a table)
-            for each in drawn:
-                columns[each.name].append(values[each.drawn_as].broadcast(len(batch)))
-            names += np.where(batch.visible, [f"{name}.png" for name in batch.names], "").tolist()
-            tables.append(self._rows(batch, {name: parts[-1] for name, parts in columns.items()}))
+            scenes, targets = batch.scenes, batch.targets
+            drawn_values = batch.values  # noqa: PD011  (of scenes, not of a table)
+            of_batch: dict[str, Any] = {
+                **{name: function(scenes) for name, function in GEOMETRY.items()},
+                "marker_area_px": target_areas_px(scenes, targets),
+                "image": np.where(
+                    batch.visible, [f"{name}.png" for name in batch.names], "").astype(object),
+                "true_corners_px": (
+                    targets.corners_px[:, 0] if targets.are_markers else targets.corners_px
+                ),
+                **{each.name: drawn_values[each.drawn_as].broadcast(len(batch))
+                   for each in drawn},
+            }
+            for name, values in of_batch.items():
+                columns.setdefault(name, []).append(values)
+            of_images = self._of_images(batch, of_batch)
+            tables.append(_of_squares(batch, of_images))
+            chessboards.append(_of_chessboards(batch, of_images))
         table = pd.concat(tables, ignore_index=True)
-        self.images, self.invisible = len(table), len(names) - len(table)
-        write_whole(folder / "truth.csv", table.to_csv(index=False, lineterminator="\n").encode())
+        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+        self.images = int((whole["image"] != "").sum())
+        self.invisible = len(whole["image"]) - self.images
+        write_whole(folder / "truth.csv", _csv(table))
+        if len(chessboard := pd.concat(chessboards, ignore_index=True)):
+            write_whole(folder / "truth_chessboard.csv", _csv(chessboard))
         write_whole(folder / "truth_coco.json", _coco(table).encode())
-        dataset = self._dataset(columns, names)
+        dataset = self._dataset(whole, drawn)
         write_whole(folder / "truth.nc", bytes(dataset.to_netcdf(engine="scipy")))
 
-    def _rows(self, batch: ImageBatch, variables: dict[str, Any]) -> pd.DataFrame:
-        """Return the rows of truth.csv of a batch with these variables, and note its cameras."""
+    def _of_images(self, batch: ImageBatch, variables: dict[str, Any]) -> pd.DataFrame:
+        """Return a row an image of a batch with these variables, and note its cameras."""
         scenes, axes = batch.scenes, scene_axes(self.pipeline)
         first, last = batch.windows[:, :2], batch.windows[:, 2:]
         view = scenes.cameras.view
@@ -275,65 +272,53 @@ class TruthTables:
             self.cameras.setdefault(FileCamera.of(scenes, row), f"camera-{len(self.cameras)}")
             if visible else "" for row, visible in enumerate(batch.visible.tolist())
         ]
-        numbers = np.column_stack([
-            (scenes.corners_px - first[:, None]).reshape(-1, 8),
-            vector_of_rotation(scenes.rotation), scenes.translation, scenes.size_m,
-        ])
+        pose = np.column_stack([variables["true_rvec"], scenes.translation, scenes.size_m])
         table = pd.DataFrame({
-            "image": [f"{name}.png" for name in batch.names],
-            "id": scenes.marker_id, "dictionary": scenes.dictionary,
-            **dict(zip((*CORNERS, *POSE, "size_m"), numbers.T, strict=True)),
+            "image": variables["image"],
+            **dict(zip((*POSE, "size_m"), pose.T, strict=True)),
             **dict(zip(("width_px", "height_px"), (last - first).T, strict=True)),
             **dict(zip(("origin_x_px", "origin_y_px"), first.T, strict=True)),
             **dict(zip(("fx_px", "fy_px"), view[:, :2].T, strict=True)),
             **dict(zip(("cx_px", "cy_px"), (view[:, 2:] - first).T, strict=True)),
             "camera": cameras, "marker_area_px": variables["marker_area_px"],
         })
-        lengths = tuple(len(axis) for axis in axes)
-        indices = np.unravel_index(batch.numbers, lengths) if lengths else ()
+        indices = scene_indices(self.pipeline, batch.numbers)
         for axis, along in zip(axes, indices, strict=True):
             for name, values in axis.columns.items():
-                if name not in (*table, "marker_id"):
+                if name not in (*table, "marker_id", "dictionary"):
                     labels = [label(v) if isinstance(v, tuple) else v for v in values]
                     table[name] = [labels[k] for k in along.tolist()]
         for each in drawn_variables(self.pipeline):
             if each.name not in table:
                 table[each.name] = variables[each.name]
-        return table.loc[batch.visible]
+        return table
 
-    def _dataset(self, columns: dict[str, list[Any]], names: list[str]) -> xr.Dataset:
+    def _dataset(
+        self, columns: dict[str, NDArray[Any]], drawn: Sequence[Variable]
+    ) -> xr.Dataset:
         """Return the truth over the experiment's scene axes."""
         axes = scene_axes(self.pipeline)
         dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
-
-        def shaped(values: Any) -> Any:
-            return np.asarray(values).reshape(shape + np.shape(values)[1:])
-
-        variables: dict[str, Any] = {}
-        for name in GEOMETRY:
-            variable = VARIABLES[name]
-            variables[name] = (
-                dims + variable.inner, shaped(np.concatenate(columns[name])), variable.attributes()
+        corner_dims = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
+        inner = {name: VARIABLES[name].inner for name in (*GEOMETRY, "marker_area_px")}
+        attributes = {name: VARIABLES[name].attributes() for name in inner} | {
+            "true_corners_px": {
+                "long_name": "true corners in the frame; pixel (0, 0) is the centre of the top "
+                "left pixel", "units": "px"},
+            "image": {"long_name": "name of the image; empty where the target is not visible"},
+            **{each.name: each.attributes() for each in drawn},
+        }
+        inner |= {"true_corners_px": corner_dims}
+        variables: dict[str, Any] = {
+            name: (
+                dims + inner.get(name, ()), values.reshape(shape + values.shape[1:]),
+                attributes[name],
             )
-        variables["true_corners_px"] = (
-            (*dims, "corner", "xy"), shaped(np.concatenate(columns["true_corners_px"])),
-            {"long_name": "true corners in the frame; pixel (0, 0) is the centre of the top left "
-             "pixel", "units": "px"},
-        )
-        variables["image"] = (
-            dims, shaped(np.array(names, dtype=object)),
-            {"long_name": "name of the image; empty where the marker is not visible"},
-        )
-        drawn = {
-            each.name: (
-                dims, shaped(np.concatenate(columns[each.name])),
-                each.attributes(),
-            )
-            for each in drawn_variables(self.pipeline)
+            for name, values in columns.items()
         }
         coordinates: dict[str, Any] = {
             name: list(LABELS[name]) for name in ("corner", "xy", "xyz")
-        }
+        } | {each.name: variables.pop(each.name) for each in drawn}
         for axis in axes:
             unit = {"units": axis.unit} if axis.unit else {}
             coordinates[axis.name] = (
@@ -345,7 +330,7 @@ class TruthTables:
                 for name, values in axis.zipped
             }
         return xr.Dataset(
-            variables, coordinates | drawn,
+            variables, coordinates,
             {"title": self.pipeline.heading, "pipeline": self.pipeline.text},
         )
 
@@ -355,6 +340,50 @@ def _plain(values: Any) -> Any:
     if values.dtype.kind in "TU":
         return values.astype(object)
     return values.astype(np.int8) if values.dtype.kind == "b" else values
+
+
+def _csv(table: pd.DataFrame) -> bytes:
+    return table.to_csv(index=False, lineterminator="\n").encode()
+
+
+def _repeated(table: pd.DataFrame, rows: Integers, own: dict[str, Any]) -> pd.DataFrame:
+    """Return rows of a table with columns of their own behind the first, the image's name."""
+    chosen = table.iloc[rows].reset_index(drop=True)
+    return pd.concat([chosen[["image"]], pd.DataFrame(own), chosen.iloc[:, 1:]], axis=1)
+
+
+def _of_squares(batch: ImageBatch, images: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each square of each image's target."""
+    scenes, targets = batch.scenes, batch.targets
+    row, square = np.nonzero(batch.visible[:, None] & (targets.marker_id >= 0))
+    corners = targets.corners_px[row, square] - batch.windows[row, None, :2]
+    places = [
+        targets.targets[i].corners_m[k]
+        * (scenes.size_m[i] if targets.targets[i].is_marker else 1.0)
+        for i, k in zip(row.tolist(), square.tolist(), strict=True)
+    ]
+    return _repeated(images, row, {
+        "id": targets.marker_id[row, square],
+        "dictionary": [targets.targets[i].dictionary for i in row.tolist()],
+        **dict(zip(CORNERS, corners.reshape(-1, 8).T, strict=True)),
+        "visible": (targets.flags[row, square] == DetectionStatus.not_run).astype(np.int64),
+        **dict(zip(PLACES, np.reshape(places, (-1, 12)).T, strict=True)),
+    })
+
+
+def _of_chessboards(batch: ImageBatch, images: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each inner corner of each image's chessboard, by OpenCV's numbers."""
+    pixels = batch.targets.chessboard_px - batch.windows[:, None, :2]
+    row, corner = np.nonzero(batch.visible[:, None] & np.isfinite(pixels[..., 0]))
+    places = [
+        batch.targets.targets[i].chessboard_m[k]
+        for i, k in zip(row.tolist(), corner.tolist(), strict=True)
+    ]
+    return _repeated(images.loc[:, ["image"]], row, {
+        "corner": corner,
+        **dict(zip(("x", "y"), pixels[row, corner].T, strict=True)),
+        **dict(zip(("X_m", "Y_m", "Z_m"), np.reshape(places, (-1, 3)).T, strict=True)),
+    })
 
 
 COCO_INFO = {
@@ -370,15 +399,17 @@ def _coco(table: pd.DataFrame) -> str:
     records = table.to_dict("records")
     markers = [(row["dictionary"], row["id"]) for row in records]
     categories = {marker: number for number, marker in enumerate(dict.fromkeys(markers), 1)}
+    images = {row["image"]: row for row in records}
+    numbers = {name: number for number, name in enumerate(images)}
     content = {
         "info": COCO_INFO,
         "images": [
-            {"id": number, "file_name": f"images/{row['image']}", "width": row["width_px"],
+            {"id": numbers[name], "file_name": f"images/{name}", "width": row["width_px"],
              "height": row["height_px"]}
-            for number, row in enumerate(records)
+            for name, row in images.items()
         ],
         "annotations": [
-            _coco_annotation(row, number, categories[marker])
+            _coco_annotation(row, number, numbers[row["image"]], categories[marker])
             for number, (row, marker) in enumerate(zip(records, markers, strict=True))
         ],
         "categories": [
@@ -390,17 +421,19 @@ def _coco(table: pd.DataFrame) -> str:
     return json.dumps(content)
 
 
-def _coco_annotation(row: dict[Any, Any], number: int, category: int) -> dict[str, Any]:
+def _coco_annotation(
+    row: dict[Any, Any], number: int, image: int, category: int
+) -> dict[str, Any]:
     points = np.array([row[name] for name in CORNERS]).reshape(4, 2)
     size = np.array([row["width_px"], row["height_px"]])
     least, extent = points.min(axis=0), np.ptp(points, axis=0)
-    seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=1)  # COCO's 2: visible
+    seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=1) & bool(row["visible"])
     flat = points.ravel().tolist()
     return {
-        "id": number, "image_id": number, "category_id": category, "iscrowd": 0,
+        "id": number, "image_id": image, "category_id": category, "iscrowd": 0,
         "bbox": [*least.tolist(), *extent.tolist()],
-        "area": row["marker_area_px"], "segmentation": [flat],
-        "keypoints": np.column_stack([points, 2 * seen]).ravel().tolist(),
+        "area": float(abs(signed_areas(points[None])[0])), "segmentation": [flat],
+        "keypoints": np.column_stack([points, 2 * seen]).ravel().tolist(),  # COCO's 2: visible
         "num_keypoints": int(seen.sum()),
         "rvec": [row[name] for name in POSE[:3]], "tvec_m": [row[name] for name in POSE[3:]],
     }

@@ -27,7 +27,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.polygon import side_lengths
-from sweep.plugins.recording import REJECTED, SUFFIX, Recording
+from sweep.plugins.recording import OF_TARGET, REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers
 
@@ -62,15 +62,13 @@ def hints(
     if not len(chosen):
         return []
     image = answers.image[chosen]
-    batch = image_batch(pipeline, numbers[image])
-    scenes = batch.scenes
-    right = answers.marker_id[chosen] == np.array(scenes.marker_id)
-    truth = scenes.corners_px - origins[image][:, None]
-    lines = []
-    known = right & np.isfinite(answers.corners[chosen]).all(axis=(1, 2))
-    if known.sum() >= MIN_MARKERS:
-        lines += _of_corners(answers.corners[chosen][known], truth[known], conventions)
-    return lines
+    targets = image_batch(pipeline, numbers[image]).targets
+    same = answers.marker_id[chosen, None] == targets.marker_id
+    known = same.any(axis=1) & np.isfinite(answers.corners[chosen]).all(axis=(1, 2))
+    if known.sum() < MIN_MARKERS:
+        return []
+    truth = targets.corners_px[known, same[known].argmax(axis=1)] - origins[image[known]][:, None]
+    return _of_corners(answers.corners[chosen][known], truth, conventions)
 
 
 def _of_corners(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]:
@@ -304,13 +302,15 @@ def _write_recording(path: Path, content: bytes) -> None:
 
 def _summary(label: str, answers: Answers, images: int, with_pose: bool) -> list[str]:
     """Return what answers hold, in lines."""
-    decoded = int((answers.marker_id != REJECTED).sum())
-    if not decoded:
+    decoded = int((answers.marker_id >= 0).sum())
+    of_targets = int((answers.marker_id == OF_TARGET).sum())
+    if not decoded + of_targets:
         return [f"{label}: no marker: each of {images:,} images counts as searched in vain"]
-    rejected = len(answers.marker_id) - decoded
+    rejected = len(answers.marker_id) - decoded - of_targets
+    apart = f" and {of_targets:,} poses of targets" if of_targets else ""
     more = f", {rejected:,} candidates not decoded" if rejected else ""
     found = len(np.unique(answers.image[answers.marker_id != REJECTED]))
-    poses = ", with poses" if with_pose else ""
+    poses = apart or (", with poses" if with_pose else "")
     return [f"{label}: {decoded:,} markers{poses} in {found:,} of {images:,} images{more}"]
 
 

@@ -36,12 +36,11 @@ from sweep.sampling.rules import Decider, Decision, by_scene
 from sweep.store.blocks import (
     RunStore,
     begin_block,
+    commit_block,
     receipt_of,
-    recommit_block,
     region,
     withdraw_block,
     write_block,
-    write_unneeded,
 )
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
@@ -181,31 +180,10 @@ def compute_blocks(
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
 ) -> list[Receipt]:
-    """Compute blocks as :func:`compute_block` does; return their receipts.
-
-    Those of which nothing is needed are written together, and then the others one after another.
-    """
-    settled = {} if decision is None else _settled(url, run_id, blocks, decision)
+    """Compute blocks one after another as :func:`compute_block` does; return their receipts."""
     return [
-        settled.get(block)
-        or compute_block(url, run_id, block, reuse, time_limit_s, quota, decision)
-        for block in blocks
+        compute_block(url, run_id, block, reuse, time_limit_s, quota, decision) for block in blocks
     ]
-
-
-def _settled(
-    url: str, run_id: str, blocks: Sequence[Block], decision: Decision
-) -> dict[Block, Receipt]:
-    """Commit those blocks of which nothing is needed, unless they were committed before."""
-    with _local_faults(url):
-        store = _opened(url, run_id)
-        decider = _decider(url, run_id, decision.rule)
-        unneeded = [
-            block for block in blocks
-            if not decider.needed(block, decision).any() and receipt_of(store, block) is None
-        ]
-        return dict(zip(
-            unneeded, write_unneeded(store, unneeded, decision.basis), strict=True))
 
 
 @contextlib.contextmanager
@@ -296,9 +274,8 @@ def _compute_begun(
     own = None if before is None else own_cells(store, block)
     if before is not None and own is not None:
         if (needed == own.needed).all():
-            receipt = dataclasses.replace(before, basis=basis, computed=_NOTHING)
-            recommit_block(store, receipt)
-            return receipt
+            return commit_block(
+                store, block, dataclasses.replace(before, basis=basis, computed=_NOTHING))
         need[own.whole] = False
     if reuse and need.any():
         sources = [_source(url, store.run_id, old) for old in reuse]
@@ -337,7 +314,8 @@ def _compute_begun(
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
         seconds=seconds if before is None else _summed(before.seconds, seconds),
-        failures=recorded(cells.failures if cells is not None else [], rows.tolist(), quota),
+        failures=recorded(
+            pipeline, block, [] if cells is None else cells.failures, rows.tolist(), quota),
         wall_s=time.perf_counter() - start,
         written=time.time(),
         basis=basis,

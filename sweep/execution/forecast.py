@@ -505,13 +505,10 @@ def demand_of(
 ) -> Demand:
     """Return what the ``left`` of a run's blocks take, if a share of their poses is needed.
 
-    A block has a file for each variable, and its receipt; one of which nothing is needed has the
-    flags alone.
+    A block has a file for each variable, and its receipt.
     """
     poses = math.ceil(share * pipeline.size(Stage.scene) * left / max(blocks, 1))
-    variables = variables_of(pipeline)
-    flags = sum(variable.flags is not None for variable in variables)
-    files = left * (flags + 1) + math.ceil(share * left) * (len(variables) - flags)
+    files = left * (len(variables_of(pipeline)) + 1)
     return Demand(poses * scene_s / workers, workers, bytes_per_block(pipeline, poses), files)
 
 
@@ -579,11 +576,8 @@ EFFECT_SCENES = 24
 PILOT_SHARE = 0.6
 """Share of the time for effects in which a pilot computes poses."""
 
-START_S = 3.0
+START_S = 1.5
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
-
-SMALL_START_S = 1.2
-"""The same of a small run, which is computed in one child process without a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -606,7 +600,7 @@ class Forecast:
     workers, seconds
         Number of workers, and how long they would take.
     small
-        Whether the run is so small that one process computes it, without a cluster.
+        Whether the run is so small that one process computes it.
     pilot
         Of a run to a precision, what it is expected to need of the poses, after which ``seconds``
         are estimated; None of a run of fixed trials, or if poses take too long for a pilot.
@@ -691,7 +685,7 @@ def forecast(
         sampled=timing.sampled,
         over=timing.over,
         workers=count,
-        seconds=(SMALL_START_S if small else START_S) + demand.seconds,
+        seconds=START_S + demand.seconds,
         small=small,
         pilot=expected,
     ), costs

@@ -27,13 +27,11 @@ FAULT_WINDOW = 10
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 
-# Small runs (`sweep.execution.engines`)
+# This machine (`sweep.execution.engines`)
 
 SMALL_RUN_S = 3.0
-"""Work up to which a run needs no cluster, which takes about as long to start and to end."""
-
-SMALL_RUN_LIMIT_S = 10.0
-"""Seconds after which the rest of a run that was taken for a small one goes to a cluster."""
+"""Work up to which one child is enough: each imports packages for a second of a processor. What
+takes longer than was measured is divided among several."""
 
 # Time limits
 

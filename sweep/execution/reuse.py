@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.block import GEOMETRY
+from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Block, scene_axes, scene_values
 from sweep.experiment.parameters import Stage

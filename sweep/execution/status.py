@@ -28,19 +28,16 @@ from sweep.store.blocks import (
     receipts,
 )
 from sweep.store.lifecycle import finish, open_store, reopen
-from sweep.store.locations import is_remote
 from sweep.store.lock import changing, is_written
 from sweep.store.outcome import (
     MAX_ROWS,
-    FailedCell,
     FailureGroup,
-    failed_cells,
     failure_table,
     first_cell,
     outcome_of,
     outcome_of_finished,
 )
-from sweep.store.receipt import Receipt
+from sweep.store.receipt import FailedCell, Receipt
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -76,7 +73,7 @@ def close(store: RunStore) -> None:
         for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):
             for flag, count in enumerate(flags):
                 counts[name][flag] += count
-        for cell in failed_cells(store, number, receipt):
+        for cell in receipt.failures:
             kept[cell.kind] += 1
             if kept[cell.kind] <= MAX_ROWS:
                 cells.append(cell)
@@ -374,7 +371,7 @@ class Status:
     finished
         Whether every block is committed and the store is closed.
     being_written
-        Whether a process writes it; of a remote store, whether one did in the last minute.
+        Whether a process writes it; on S3 also one that was killed less than two minutes ago.
     blocks, blocks_done, poses, poses_done
         Sizes of the grid, and how much of it is committed.
     detection, estimate
@@ -437,7 +434,7 @@ def status(url: str) -> Status:
     cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
     processors: Counter[str] = Counter()
     done = poses = needed = 0
-    for number, receipt in receipts(store, check_whole(store)):
+    for _, receipt in receipts(store, check_whole(store)):
         done += 1
         poses += receipt.scenes
         needed += receipt.scenes_needed
@@ -449,13 +446,11 @@ def status(url: str) -> Status:
             for flag, count in zip(flags, counts, strict=False):
                 counter[flag.name] += count
         written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
-        for cell in failed_cells(store, number, receipt):
+        for cell in receipt.failures:
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
-    recent = max((block.at for block in written), default=0.0) > time.time() - RATE_S
-    writing = not store.finished and (
-        recent if is_remote(url) else is_written(store.storage))
+    writing = not store.finished and is_written(store.storage)
     rate = poses_per_second(written)
     outcome = outcome_of(
         url, [detection[flag.name] for flag in DetectionStatus],

@@ -25,7 +25,6 @@ from sweep.model.board_kinds import (
     is_solid,
     used_by,
 )
-from sweep.model.effects import GEOMETRIC
 from sweep.model.image_file import read_regular
 from sweep.model.renderers import MAX_BITMAP_PX, MAX_BITMAP_SIDE, bitmap_shape
 from sweep.model.scene import RENDERERS, is_renderer
@@ -193,7 +192,14 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
                        "delete it")
     reading.refuse_values(
         "renderer", f"{RENDERERS}, for boards", lambda name: not is_renderer(name))
-    reading.refuse_values("detector", "a detector that searches images, for boards", is_recording)
+    if any(map(is_recording, reading.values("detector"))):
+        for name, value, expected in (
+            ("points", "chessboard",
+             "markers beside recorded detections, which have no corners of chessboards"),
+            ("refineDetectedMarkers", True,
+             "false beside recorded detections: no image is searched"),
+        ):
+            reading.refuse_values(name, expected, lambda given, value=value: given == value)
     if "solver" not in reading.given:
         reading.faults.append(
             f"{reading.source}: estimator.solver: missing; a board needs one of "
@@ -237,10 +243,11 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
         )
 
 
-IN_ONE_PLANE = tuple(
-    name for name in GEOMETRIC if name not in ("blur_px", "marker_scale", "sharpening")
-)
-"""Switches of effects that boards in several planes cannot have."""
+IN_ONE_PLANE = {
+    "curvature_per_m": "a bend is that of one sheet",
+    "occlusion": "the sheet that hides lies in the target's plane",
+}
+"""Switches of effects that targets in several planes cannot have, and why."""
 
 
 def _several_planes(reading: Reading) -> None:
@@ -250,9 +257,9 @@ def _several_planes(reading: Reading) -> None:
     if target and {"markers", "chessboard"}.intersection(reading.values_of("points")):
         reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, {why}",
                               lambda name: name in SOLVERS and SOLVERS[name].planar_only)
-    for name in IN_ONE_PLANE:
+    for name, reason in IN_ONE_PLANE.items():
         if reading.is_active(name):
-            reading.refuse(name, f"it absent, {why}")
+            reading.refuse(name, f"it absent, {why}: {reason}")
     reading.refuse_values("renderer", f"exact, {why}", lambda name: name != "exact")
     if target and any(reading.values_of("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -381,7 +381,7 @@ class Experiment:
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return ",".join(_text(item) for item in value)
+        return ",".join("" if item is None else _text(item) for item in value)
     return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
 
 

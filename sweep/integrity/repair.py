@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Collection
 
-from sweep.errors import StoreError
 from sweep.execution.runner import recompute
 from sweep.execution.status import close
-from sweep.integrity.recomputation import Damage, IntegrityReport, computable
-from sweep.integrity.verification import SAMPLE, damaged_store, report_on
+from sweep.integrity.recomputation import computable
+from sweep.integrity.verification import SAMPLE, IntegrityReport, damaged_store, report_on
 from sweep.store.blocks import RunStore, drop_block
 from sweep.store.files import delete_files, sync, write_files
 from sweep.store.layout import documents, planned_arrays
-from sweep.store.lifecycle import MEASURED, linked_arrays, open_store, write_root
+from sweep.store.lifecycle import MEASURED, open_store, write_root
 from sweep.store.locations import translate_errors
 from sweep.store.lock import changing
 
@@ -48,20 +48,16 @@ def repair(
     """
     store = damaged_store(url, "r+")
     before = report_on(store, sample)
-    lasting = [each for each in before.damage if each.lasting]
-    if len(lasting) == len(before.damage) and not before.left_over:
+    lasting = [each for each in before.damage if before.unstable and each.where == before.unstable]
+    if before.damage == lasting and not before.left_over:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
-    if links := linked_arrays(store):
-        raise StoreError(
-            f"{url}: {links[0]} is a link: nothing is written through it; put the folder in its "
-            "place"
-        )
     if numbers:
         computable(store)
     with changing(url, store.storage):
         with translate_errors(url, "written"):
-            _rewrite_files(store, before.damage, before.left_over)
+            delete_files(store.storage, before.left_over)
+            _rewrite(store, {each.where for each in before.damage if each.block is None})
         store = open_store(url, "r+")
         for number in numbers:
             drop_block(store, store.blocks[number])
@@ -71,31 +67,27 @@ def repair(
             close(store)
     after = report_on(damaged_store(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
-    after.retried = before.retried
-    after.damage += lasting
+    after.unstable, after.damage = before.unstable, after.damage + lasting
     remaining = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in remaining]
     return after
 
 
-def _rewrite_files(
-    store: RunStore, damage: Sequence[Damage], left_over: Sequence[str]
-) -> None:
-    """Write the damaged files that belong to no block, and delete those that are left over."""
-    storage = store.storage
-    keys = {each.where for each in damage if each.kind == "file" and each.block is None}
+def _rewrite(store: RunStore, keys: Collection[str]) -> None:
+    """Write the files of these keys that follow from the pipeline; delete those of tables.
+
+    A finished store's tables are written when it is closed again.
+    """
     planned = planned_arrays(store.pipeline, store.blocks.extents)
-    expected = documents(planned)
-    write_files(storage, {
-        key: content.to_bytes() for key, content in expected.items() if key in keys})
+    write_files(store.storage, {
+        key: json.dumps(content).encode() for key, content in documents(planned).items()
+        if key in keys})
     for array in planned:
-        written = {f"{array.path}/zarr.json", *(chunk for chunk, _, _ in array.pieces())}
-        if array.values is not None and written & keys:
+        if array.values is not None and any(key.startswith(f"{array.path}/") for key in keys):
             array.create(store.group)
     for group in MEASURED:
         if any(key.startswith(f"{group}/") for key in keys):
-            sync(storage.delete_dir(group))
-    restored = [key for key in keys if key.startswith(("cost/", "failures/"))]
-    delete_files(storage, (*left_over, *restored))
-    if not store.finished:  # a finished one is closed again
+            sync(store.storage.delete_dir(group))
+    delete_files(store.storage, [key for key in keys if key.startswith(("cost/", "failures/"))])
+    if not store.finished:
         write_root(store, store.run_metadata)

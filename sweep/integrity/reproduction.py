@@ -127,7 +127,7 @@ def reproduce(
     exact = stored is not None and stored.same_processor and not changes
     difference = "" if stored is None else compare(
         recomputed, stored.values, store.variables, same_processor=exact
-    ).difference
+    )
     full_at = selection_text(pipeline.cell_at(index))
     cell_pipeline = cell(pipeline, full_at)
     inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)

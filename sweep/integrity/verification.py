@@ -1,201 +1,144 @@
-"""Verification of a store: files, blocks, flags, failures, and what of it is damaged."""
+"""Verification of a store: every file is read and checked, a sample of scenes recomputed."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.errors import ArgumentError, SweepError
+from sweep.evaluation.results import CellsResult, to_dataset_layout
+from sweep.execution.limits import TIME_LIMIT_S
+from sweep.execution.progress import InWaves
+from sweep.experiment.cell_selection import selection_text
+from sweep.experiment.grid import Block, detector_settings, estimators, scene_axes
+from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LOST, UNSEEN, VARIABLES, Variable, with_description
 from sweep.integrity.recomputation import (
-    Damage,
-    IntegrityReport,
-    SoundBlock,
-    check_scenes,
-    is_doubtful,
+    StoredValues,
+    compare,
+    computable,
+    is_same,
+    stored_scene,
 )
-from sweep.measure.flags import (
-    BoundStatus,
-    DetectionStatus,
-    EstimateStatus,
-    Flipped,
-    present_values,
-)
-from sweep.sampling.rules import Decider, Decision, scenes_needed
-from sweep.store.blocks import (
-    BEGUN,
-    RunStore,
-    committed,
-    names_written,
-    parsed_receipt,
-)
+from sweep.isolation.crash_isolation import run_cells_isolated
+from sweep.measure.detectors import OPENCV
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plugins.declared import PluginSetting
+from sweep.processor import processor
+from sweep.sampling.rules import make_rule, scenes_needed
+from sweep.store.blocks import BEGUN, UNPARSED, RunStore, committed, parsed_receipt
 from sweep.store.chunks import receipt_key
-from sweep.store.files import absent_files, parsed, read_files, read_json, sync
-from sweep.store.layout import PlannedArray, checksum_of, documents, planned_arrays
-from sweep.store.lifecycle import GROUPS, read_attributes, root_attributes, schema_faults, store_of
+from sweep.store.files import read_files, read_json, sync
+from sweep.store.layout import checksum_of, documents, is_sound, planned_arrays
+from sweep.store.lifecycle import (
+    GROUPS,
+    changed_coordinates,
+    read_attributes,
+    root_attributes,
+    schema_faults,
+    store_of,
+)
 from sweep.store.locations import open_storage
-from sweep.store.lock import KEY, is_written
+from sweep.store.lock import LOCKS, is_written
 from sweep.store.provenance import environment
-from sweep.store.receipt import Receipt, decoded
-from sweep.typing import Masks
+from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
-# Whether a block's flags and numbers agree: a number exists exactly where its flag says so.
-#
-# Which flag governs which number is declared with the variables (``Variable.present_when``), and
-# beside which flags numbers exist with the flags (``Flag.present``).
-
-Values = Mapping[str, NDArray[Any]]
+# What a verification finds, in one record that each check adds to.
 
 
-def contradiction(
-    pipeline: Pipeline, variables: Sequence[Variable], values: Values, receipt: Receipt
-) -> str:
-    """Return the first contradiction within a block; empty if there is none.
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """What is damaged.
 
-    Parameters
+    Attributes
     ----------
-    pipeline
-        The store's.
-    variables
-        The variables that the store has.
-    values
-        The block's values by variable.
-    receipt
-        The block's, with the counts of its flags.
+    where
+        A key, an array, a block's name, a scene as ``sweep repro`` takes it, or a part's name.
+    what
+        What is wrong.
+    block
+        Number of the block that is damaged, None if none is.
     """
-    for variable in variables:
-        if variable.flags is not None:
-            unknown = ~np.isin(values[variable.name], [int(flag) for flag in variable.flags])
-            if unknown.any():
-                return f"{variable.name}: unknown flag {values[variable.name][unknown][0]}"
-    for name, counts in (("detection", receipt.detection), ("estimate", receipt.estimate)):
-        if np.bincount(values[name].ravel()).tolist() != list(counts):
-            return f"{name}: flags other than its receipt counts"
-    unneeded = values["detection"] == DetectionStatus.not_needed
-    if unneeded.any() and (fault := _not_needed_fault(pipeline, variables, values, unneeded)):
-        return fault
-    for variable in variables:
-        if fault := _number_fault(pipeline, variable, values):
-            return f"{variable.name}: {fault}"
-    return _flag_contradiction(pipeline, values)
+
+    where: str
+    what: str
+    block: int | None = None
 
 
-def _number_fault(pipeline: Pipeline, variable: Variable, values: Values) -> str:
-    """Return how a variable's numbers contradict the flag that governs them."""
-    rule = variable.present_when
-    if rule is None:
-        return ""
-    governing = VARIABLES[rule.flag]
-    if governing.flags is None:
-        raise AssertionError(rule)
-    numbers, flags = values[variable.name], values[rule.flag]
-    if rule.number in ("unless_lost", "if_seen"):
-        without = LOST if rule.number == "unless_lost" else UNSEEN
-        computed = _any_configuration(pipeline, governing, variable, ~np.isin(flags, without))
-        computed = computed.reshape(computed.shape + (1,) * len(variable.inner))
-        missing = ~np.isfinite(numbers) & computed
-        return "no number" if missing.any() else ""
-    present = _spread(
-        pipeline, governing, np.isin(flags, present_values(governing.flags)), variable
-    )
-    if rule.number == "always" and (~np.isfinite(numbers) & present).any():
-        return f"no number although {rule.flag} says that there is one"
-    if (~np.isnan(numbers) & ~present).any():
-        return f"a number although {rule.flag} says that there is none"
-    return ""
+@dataclass(slots=True)
+class IntegrityReport:
+    """The result of a verification.
 
+    Attributes
+    ----------
+    store
+        The store's URL.
+    finished
+        Whether the store is finished.
+    blocks, blocks_done
+        Blocks of the grid, and how many are committed.
+    files, bytes
+        Stored files that belong to the store, and their size.
+    sampled
+        Scenes that were recomputed.
+    not_sampled
+        Why none was, if none was.
+    damage
+        What is damaged; empty for a sound store.
+    unstable
+        The name of what gives other answers from call to call, or with the other scenes of a call,
+        if recomputed scenes differ for that reason: no block is damaged. It is last in ``damage``.
+    repaired
+        What was damaged and has been repaired.
+    left_over
+        Files that do not belong to the store, such as those that a killed process was writing.
+    processors
+        Features of the processors that computed the blocks -> how many blocks.
+    """
 
-def _not_needed_fault(
-    pipeline: Pipeline, variables: Sequence[Variable], values: Values, unneeded: Masks
-) -> str:
-    """Return what contradicts that scenes were not needed: nothing of them may be there."""
-    detection = VARIABLES["detection"]
-    scenes = _any_configuration(pipeline, detection, VARIABLES["bound"], unneeded)
-    for variable in variables:
-        found = _spread(pipeline, VARIABLES["bound"], scenes, variable)
-        if variable.flags is None:
-            if (found & ~np.isnan(values[variable.name])).any():
-                return f"{variable.name}: a number of a scene that was not needed"
-        elif ((values[variable.name] == variable.not_needed) != found).any():
-            return f"{variable.name}: contradicts that scenes were not needed"
-    return ""
+    store: str
+    finished: bool
+    blocks: int
+    blocks_done: int
+    files: int = 0
+    bytes: int = 0
+    sampled: int = 0
+    not_sampled: str = ""
+    damage: list[Damage] = field(default_factory=list)
+    unstable: str = ""
+    repaired: list[Damage] = field(default_factory=list)
+    left_over: list[str] = field(default_factory=list)
+    processors: dict[str, int] = field(default_factory=dict)
 
-
-def _flag_contradiction(pipeline: Pipeline, values: Values) -> str:
-    """Return how the flags of different stages contradict each other."""
-    detection, estimate = VARIABLES["detection"], VARIABLES["estimate"]
-    needed = values["estimate"] != EstimateStatus.not_needed
-    solved = values["estimate"] == EstimateStatus.solved
-    flipped_exists = np.isin(values["flipped"], present_values(Flipped))
-    no_estimate = values["flipped"] == Flipped.no_estimate
-    if ((flipped_exists != solved) | (needed & (no_estimate == solved))).any():
-        return "flipped: contradicts estimate"
-    detected = _spread(
-        pipeline, detection,
-        np.isin(values["detection"], present_values(DetectionStatus)), estimate,
-    )
-    if (np.isin(values["estimate"], present_values(EstimateStatus)) & ~detected).any():
-        return "estimate: a pose although nothing was detected"
-    if (needed & ((values["estimate"] == EstimateStatus.no_detection) == detected)).any():
-        return "estimate: contradicts detection"
-    if (values["detection"] == DetectionStatus.not_run).any():
-        return "detection: not run"
-    computed = _any_configuration(
-        pipeline, detection, VARIABLES["bound"], ~np.isin(values["detection"], LOST)
-    )
-    demanded = pipeline.fixed.get("bound", "none") != "none"
-    if demanded and ((values["bound"] == BoundStatus.not_run) & computed).any():
-        return "bound: not run"
-    return ""
-
-
-def _spread(
-    pipeline: Pipeline, variable: Variable, values: NDArray[Any], wanted: Variable
-) -> NDArray[Any]:
-    """Return values of one variable's dimensions, shaped to broadcast to those of another."""
-    names = variable.dimensions(pipeline)
-    return values.reshape([
-        values.shape[names.index(name)] if name in names else 1
-        for name in wanted.dimensions(pipeline)
-    ])
-
-
-def _any_configuration(
-    pipeline: Pipeline, variable: Variable, wanted: Variable, truth: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Return for each scene whether ``truth`` holds in any configuration."""
-    kept = wanted.dimensions(pipeline)
-    others = tuple(
-        k for k, name in enumerate(variable.dimensions(pipeline)) if name not in kept
-    )
-    return np.asarray(truth.any(axis=others))
+    def to_json(self) -> dict[str, Any]:
+        """Return the report as ``sweep verify --json`` prints it."""
+        return asdict(self)
 
 
 # --------------------------------------------------------------------------------------------------
-# The check of a store's blocks: checksums of their chunks, and flags against numbers.
+# Blocks: every chunk fits the checksum at its end, and the receipt lists the same.
 
 THREADS, WINDOW = 4, 256
-"""Blocks that are read and decoded at a time, and that are submitted at a time."""
+"""Blocks that are read and checked at a time, and that are submitted at a time."""
 
 CHANGED = "changed: does not fit its checksum"
 
 
 def check_blocks(
     store: RunStore, numbers: Sequence[int], report: IntegrityReport
-) -> dict[int, SoundBlock]:
-    """Check blocks in several threads; return those without damage, by number."""
-    sound: dict[int, SoundBlock] = {}
+) -> dict[int, Receipt]:
+    """Check blocks in several threads; return the receipts of those without damage, by number."""
+    sound: dict[int, Receipt] = {}
     processors: Counter[str] = Counter()
     with ThreadPoolExecutor(THREADS) as pool:
         # A window at a time: there may be very many.
@@ -207,256 +150,289 @@ def check_blocks(
                 report.damage += damage
                 if receipt is not None and not damage:
                     processors.update(receipt.processors)
-                    sound[number] = SoundBlock(
-                        tuple(receipt.processors), receipt.scenes_needed, is_doubtful(receipt))
+                    sound[number] = receipt
     report.processors = dict(processors)
     return sound
 
 
 def _checked_block(store: RunStore, number: int) -> tuple[int, Receipt | None, list[Damage]]:
     """Return the size of a block's files, its receipt if that is sound, and what is damaged."""
-    key = receipt_key(number)
-    chunks = store.chunks.keys(number)
-    keys = [key, *chunks.values()]
-    contents = dict(zip(keys, read_files(store.storage, keys), strict=True))
-    faults = {key: "missing" for key, content in contents.items() if content is None}
-    receipt: Receipt | None = None
-    if (content := contents[key]) is not None:
-        try:
-            receipt = parsed_receipt(store, number, decoded(content))
-        except Exception:  # decoding a damaged chunk may raise anything
-            faults[key] = CHANGED
-    values: dict[str, NDArray[Any]] = {}
-    written = store.variable_names if receipt is None else names_written(store, receipt)
-    for name, chunk in chunks.items():
-        content = contents[chunk]
-        if name not in written:
-            faults.pop(chunk, None)
-            if content is not None:
-                faults[chunk] = "numbers of a block of which none was needed"
-            values[name] = store.chunks.fill(name, number)
-        elif content is not None:
-            try:
-                if receipt is not None and checksum_of(content) != receipt.checksums[name]:
-                    raise ValueError("checksum")
-                values[name] = store.chunks.decoded(name, number, content)
-            except (ValueError, RuntimeError):
-                faults[chunk] = CHANGED
-    damage = [Damage("file", key, what, number) for key, what in faults.items()]
-    if not faults and receipt is not None and (
-        fault := contradiction(store.pipeline, store.variables, values, receipt)
-    ):
-        damage.append(Damage("block", f"block {store.blocks[number]}", fault, number))
-    return sum(len(content or b"") for content in contents.values()), receipt, damage
+    key, chunks = receipt_key(number), store.chunks.keys(number)
+    content, *contents = read_files(store.storage, [key, *chunks.values()])
+    receipt, faults = None, {}
+    try:
+        receipt = parsed_receipt(store, number, content)
+    except UNPARSED as error:
+        faults[key] = "missing" if content is None else f"changed: {error}"
+    for (name, chunk), values in zip(chunks.items(), contents, strict=True):
+        if values is None:
+            faults[chunk] = "missing"
+        elif not is_sound(values) or (
+            receipt is not None and receipt.checksums.get(name) != checksum_of(values)
+        ):
+            faults[chunk] = CHANGED
+    size = sum(len(each or b"") for each in (content, *contents))
+    return size, receipt, [Damage(key, what, number) for key, what in faults.items()]
+
+
+def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport) -> None:
+    """Find blocks of a finished store that follow from other results of earlier waves than it has.
+
+    Which of their scenes were needed is not what the rule says.
+    """
+    rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
+    numbers = range(len(store.blocks))
+    if rule is None or sampling is None or not all(number in sound for number in numbers):
+        return
+    current = InWaves(store, rule, sampling).current
+    report.damage += [
+        Damage(f"block {store.blocks[number]}", "was computed for other results of earlier trials",
+               number)
+        for number in numbers if number not in current
+    ]
 
 
 # --------------------------------------------------------------------------------------------------
-# The check of a store's files outside its blocks: metadata, coordinates, tables of the run.
+# Files outside the blocks: metadata, coordinates, tables of the run.
 
 TABLES = ("cost", "failures")
 """Groups that a finished store has."""
 
 
-class FileCheck:
-    """Checks the files of a store that belong to no block.
+def check_files(store: RunStore, report: IntegrityReport) -> set[str]:
+    """Check the files that belong to the store and to no block; return their keys."""
+    planned = planned_arrays(store.pipeline, store.blocks.extents)
+    root = read_json(store.storage, "zarr.json") or {}
+    copies = _copies(root)
+    groups = [name for name in GROUPS if report.finished or name not in TABLES]
+    tables = [path for path in copies if path.startswith(tuple(f"{name}/" for name in TABLES))]
+    paths = list(dict.fromkeys([*(each.path for each in planned), *groups, *tables]))
+    stored = {path: read_json(store.storage, f"{path}/zarr.json") for path in paths}
 
-    Parameters
-    ----------
-    store
-        The store, which may be damaged.
-    report
-        Takes what is damaged.
+    # Another version of sweep or of Zarr may word documents otherwise.
+    own = store.run_metadata["environment"].get("sweep") == environment()["sweep"]
+    expected = documents(planned) if own else {}
+    faults = schema_faults(store)
+    for path, document in stored.items():
+        wanted = expected.get(f"{path}/zarr.json", copies.get(path, document))
+        if document is None or document != wanted:
+            faults.setdefault(path, "missing or changed")
+    found = {f"{path}/zarr.json" if path in stored else path: fault
+             for path, fault in faults.items()}
 
-    Attributes
-    ----------
-    keys
-        Keys of the files that belong to the store and to no block.
-    """
+    attributes = root_attributes(store.pipeline, planned, store.run_metadata)
+    if own and any(root["attributes"].get(name) != value for name, value in attributes.items()):
+        found["zarr.json"] = "its attributes differ from the pipeline's"
+    elif report.finished and not faults and any(
+        copies.get(path) != document for path, document in stored.items()
+    ):
+        found["zarr.json"] = "its copy of the metadata differs from the arrays' own"
 
-    def __init__(self, store: RunStore, report: IntegrityReport) -> None:
-        self._store, self._storage, self._report = store, store.storage, report
-        self._planned = planned_arrays(store.pipeline, store.blocks.extents)
-        self._expected = {key: parsed(each.to_bytes())
-                          for key, each in documents(self._planned).items()}
-        self._root = read_json(self._storage, "zarr.json") or {}
-        # Another version of sweep may word the attributes otherwise.
-        self._same_version = (
-            store.run_metadata["environment"].get("sweep") == environment()["sweep"])
-        self._copies = self._consolidated()
-        self.keys = {"zarr.json"}
-
-    def run(self) -> None:
-        """Check the files."""
-        self._check_root()
-        faults = schema_faults(self._store)
-        for planned in self._planned:
-            self._check_array(planned, faults.pop(planned.path, ""))
-        self._report.damage += [
-            Damage("array", path, fault) for path, fault in faults.items() if path not in GROUPS]
-        for name in GROUPS:
-            if self._report.finished or name not in TABLES:
-                self._check_group(name)
-        contents = read_files(self._storage, sorted(self.keys))
-        self._report.bytes += sum(len(content or b"") for content in contents)
-
-    def _add(self, key: str, what: str) -> None:
-        self._report.damage.append(Damage("file", key, what))
-
-    def _consolidated(self) -> dict[str, Any] | None:
-        """Return the root's copy of all metadata; None if it has none, as an unfinished store."""
-        try:
-            copies = dict(self._root["consolidated_metadata"]["metadata"])
-            return {
-                path: {key: value for key, value in copy.items() if key != "consolidated_metadata"}
-                for path, copy in copies.items()
-            }
-        except (AttributeError, KeyError, TypeError, ValueError):
-            return None
-
-    def _check_root(self) -> None:
-        store = self._store
-        expected = root_attributes(store.pipeline, self._planned, store.run_metadata)
-        attributes = self._root["attributes"]
-        if self._same_version and any(
-            attributes.get(name) != value for name, value in expected.items() if name != "sweep"
-        ):
-            self._add("zarr.json", "its attributes differ from the pipeline's")
-        elif self._report.finished and self._copies is None:
-            self._add("zarr.json", "lacks its copy of the metadata")
-
-    def _check_array(self, planned: PlannedArray, fault: str) -> None:
-        key = f"{planned.path}/zarr.json"
-        self.keys.add(key)
-        document = read_json(self._storage, key)
-        array = None if fault or document is None else self._store.array(planned.path)
-        if not fault and self._same_version:
-            attributes = with_description(planned.path, (document or {}).get("attributes") or {})
-            if attributes != planned.attributes:
-                fault = "its attributes differ from the schema's"
-        if fault or not self._fits_copy(key, document):
-            self._add(key, fault or "changed")
-        for chunk, part, values in planned.pieces():
-            self.keys.add(chunk)
-            if list(absent_files(self._storage, [chunk], planned.path)):
-                self._add(chunk, "missing")
-            elif array is not None and (fault := _value_fault(array, part, values)):
-                self._add(chunk, fault)
-
-    def _fits_copy(self, key: str, document: dict[str, Any] | None) -> bool:
-        """Return whether a document is as the root's copy has it, or the copy alone is wrong."""
-        if self._copies is None:
-            return document is not None
-        if self._copies.get(key.removesuffix("/zarr.json")) == document:
-            return True
-        if document is not None and document == self._expected.get(key):
-            self._add("zarr.json", f"its copy of {key} differs from that document")
-            self._copies = None
-            return True
-        return False
-
-    def _check_group(self, name: str) -> None:
-        """Check a group's document and, of a finished store's tables, all arrays and chunks."""
-        paths = [name]
-        if name in TABLES and self._copies is not None:
-            paths += [path for path in self._copies if path.startswith(f"{name}/")]
-        for path in paths:
-            key = f"{path}/zarr.json"
-            self.keys.add(key)
-            document = read_json(self._storage, key)
-            if document is None or not self._fits_copy(key, document):
-                self._add(key, "missing or changed")
-            elif document.get("node_type") == "array":
-                self._check_table(path)
-
-    def _check_table(self, path: str) -> None:
-        """Check that every chunk of an array is there and can be read."""
-        array: Any = self._store.group[path]
-        counts = [math.ceil(size / chunk) for size, chunk in zip(
-            array.shape, array.chunks, strict=True)]
-        for number in itertools.product(*map(range, counts)):
-            key = f"{path}/{array.metadata.encode_chunk_key(number)}"
-            self.keys.add(key)
-            if list(absent_files(self._storage, [key], path)):
-                self._add(key, "missing")
-                continue
-            try:
-                array.get_block_selection(number) if number else array[...]
-            except Exception as error:
-                # Decoding a damaged chunk may raise anything.
-                self._add(key, f"unreadable: {type(error).__name__}")
+    sound = [each for each in planned if each.path not in faults]
+    chunks = {key for each in planned for key, _, _ in each.pieces()}
+    found |= changed_coordinates(store, sound)
+    for path in tables:
+        if path not in faults and (stored[path] or {}).get("node_type") == "array":
+            read = dict(_read_table(store, path))
+            chunks |= read.keys()
+            found |= {key: fault for key, fault in read.items() if fault}
+    keys = {"zarr.json", *(f"{path}/zarr.json" for path in stored), *chunks}
+    report.damage += [Damage(key, fault) for key, fault in found.items()]
+    report.bytes += sum(len(each or b"") for each in read_files(store.storage, sorted(keys)))
+    return keys
 
 
-def _value_fault(array: zarr.Array[Any], part: Any, values: Any) -> str:
-    """Return how a part of a coordinate differs from the pipeline's; empty if it does not."""
+def _copies(root: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the root's copy of all metadata by path; empty of an unfinished store."""
     try:
-        stored = np.asarray(array[part])
-    except Exception as error:
-        return f"unreadable: {type(error).__name__}"
-    if stored.shape != values.shape or not (stored == values).all():
-        return "its values differ from the pipeline's"
-    return ""
+        copies = dict(root["consolidated_metadata"]["metadata"])
+        return {path: {key: value for key, value in copy.items() if key != "consolidated_metadata"}
+                for path, copy in copies.items()}
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _read_table(store: RunStore, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the key of each chunk of an array of a table, and how it is damaged if it is."""
+    array: Any = store.group[path]
+    counts = [math.ceil(size / chunk) for size, chunk in zip(
+        array.shape, array.chunks, strict=True)]
+    for number in itertools.product(*map(range, counts)):
+        key = f"{path}/{array.metadata.encode_chunk_key(number)}"
+        (content,) = read_files(store.storage, [key])
+        yield key, "missing" if content is None else "" if is_sound(content) else CHANGED
 
 
 # --------------------------------------------------------------------------------------------------
-# The check of what was not needed: the rule of stopping is applied to the stored results again.
+# Scenes of sound blocks that are recomputed and compared.
 
-def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport) -> None:
-    """Find blocks whose scenes were needed, or not, against the rule of their pipeline.
+MAX_OUTSIDE = 0.1
+"""Largest share of the scenes recomputed on another processor that may differ."""
 
-    A group is followed as far as its blocks are sound.
+MIN_OUTSIDE = 2
+"""That many scenes may differ however few were recomputed on another processor."""
+
+REPEATED = 128
+"""Scenes that are recomputed, in turns, where a recomputed one differs. They are searched and
+solved in calls of several scenes, where the first time each scene has calls of its own."""
+
+CRASHED = {"detection": DetectionStatus.crashed, "estimate": EstimateStatus.crashed}
+"""Flags of scenes that are not recomputed: they ended their process."""
+
+Scene = tuple[int, int]
+"""Number of a block, and of a scene within it."""
+
+
+def check_scenes(
+    store: RunStore, sample: int, sound: Mapping[int, Receipt], report: IntegrityReport
+) -> None:
+    """Recompute up to ``sample`` scenes of sound blocks.
+
+    Raises
+    ------
+    MachineFaultError
+        If this machine cannot compute them.
     """
-    rule = store.pipeline.stopping
-    if rule is None:
+    if not sample or not sound:
+        report.not_sampled = (
+            "there is no sound block" if sample else "a sample of 0 scenes was asked for")
         return
     try:
-        decider = Decider.of(store, rule)
-    except (PipelineError, ValueError) as error:
-        report.damage.append(Damage(
-            "block", f"block {store.blocks[0]}", f"no rule of stopping: {error}", 0))
+        pipeline = computable(store)
+    except SweepError as error:
+        report.not_sampled = str(error).splitlines()[-1].strip()
         return
-    waves = decider.waves
-    for group in range(waves.groups):
-        for wave in range(len(waves.ends)):
-            numbers = list(waves.numbers(group, wave))
-            if not all(number in sound for number in numbers):
-                break
-            # Bases only have to differ from wave to wave: one process reads a store as it is.
-            decision = Decision(rule, wave, tuple(range(wave)))
-            damage = [
-                Damage("block", f"block {store.blocks[number]}", fault, number)
-                for number in numbers
-                if (fault := _needed_fault(store, decider, decision, number))
-            ]
-            report.damage += damage
-            if damage:
-                break
+    drawn = {scene: stored_scene(store, *scene) for scene in _drawn(store, sample, sound)}
+    scenes = {
+        scene: values for scene, values in drawn.items()
+        if not any((values[name] == flag).any() for name, flag in CRASHED.items())
+    }
+    report.sampled = len(scenes)
+    if not scenes:
+        report.not_sampled = "every scene that was drawn had crashed"
+        return
+    computed = _recomputed(store, pipeline, list(scenes))
+    damage = _compared(store, pipeline, scenes, computed, sound)
+    if damage:
+        report.unstable, example = _unstable(store, pipeline, list(scenes), computed)
+        if report.unstable:
+            damage = [Damage(report.unstable,
+                             f"not deterministic: {report.unstable}: scenes that were recomputed "
+                             f"twice on the same images differ, such as {example}")]
+    report.damage += damage
 
 
-def _needed_fault(store: RunStore, decider: Decider, decision: Decision, number: int) -> str:
-    """Return how the scenes of a block that were needed differ from the rule's; else nothing."""
-    block = store.blocks[number]
-    stored = scenes_needed(store, block)
-    try:
-        needed = decider.needed(block, decision) if decision.wave else np.ones_like(stored)
-    except StoreError as error:
-        return str(error)
-    wrong = int((stored != needed).sum())
-    what = f"{wrong:,} scenes are not flagged as the results of earlier trials demand"
-    return what if wrong else ""
+def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Scene]:
+    """Draw needed scenes, each with the same probability, without repetitions."""
+    generator = np.random.default_rng()
+    sizes = np.array([receipt.scenes_needed for receipt in sound.values()])
+    if not sizes.any():
+        return []
+    numbers = generator.choice(np.array(list(sound)), size=count, p=sizes / sizes.sum())
+    return sorted({
+        (number, int(generator.choice(np.flatnonzero(scenes_needed(store, store.blocks[number])))))
+        for number in numbers.tolist()
+    })
+
+
+def _recomputed(store: RunStore, pipeline: Pipeline, scenes: Sequence[Scene]) -> CellsResult:
+    """Recompute scenes in child processes."""
+    cells = [store.blocks[block].cell(number) for block, number in scenes]
+    indices = [np.array(index, dtype=np.intp) for index in zip(*cells, strict=True)]
+    shape = (len(scenes), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    return run_cells_isolated(pipeline, indices, np.ones(shape, dtype=bool), TIME_LIMIT_S)
+
+
+def _compared(
+    store: RunStore, pipeline: Pipeline, scenes: Mapping[Scene, StoredValues],
+    computed: CellsResult, sound: Mapping[int, Receipt],
+) -> list[Damage]:
+    """Return the recomputed scenes that differ from the stored ones.
+
+    On another processor few of them may.
+    """
+    damage: list[Damage] = []
+    elsewhere: list[Damage] = []
+    other_processor = 0
+    axes = scene_axes(pipeline)
+    one = Block((0,) * len(axes), (1,) * len(axes))
+    for row, (scene, stored) in enumerate(scenes.items()):
+        values = {
+            variable.name: to_dataset_layout(
+                variable, pipeline, one,
+                [column[row : row + 1] for column in computed.columns[variable.name]])
+            for variable in store.variables
+        }
+        same_processor = tuple(sound[scene[0]].processors) == (processor(),)
+        other_processor += not same_processor
+        difference = compare(values, stored, store.variables, same_processor=same_processor)
+        if difference:
+            (damage if same_processor else elsewhere).append(Damage(
+                _at(store, scene), f"recomputed, it differs: {difference}", scene[0]))
+    few = len(elsewhere) <= max(MIN_OUTSIDE, MAX_OUTSIDE * other_processor)
+    return damage if few else damage + elsewhere
+
+
+def _unstable(
+    store: RunStore, pipeline: Pipeline, scenes: list[Scene], computed: CellsResult
+) -> tuple[str, str]:
+    """Recompute scenes again and again; return the parts whose answers change, and a scene.
+
+    Both are empty if none do. A detector or solver may change from call to call, or with the other
+    scenes of a call; what comes after it changes, too.
+    """
+    rows = np.resize(np.arange(len(scenes)), REPEATED)
+    again = _recomputed(store, pipeline, [scenes[row] for row in rows])
+    for stage in Stage:
+        changed = {
+            configuration: int(rows[np.argmax(differ)])
+            for variable in store.variables if variable.stage is stage
+            for configuration, (first, second) in enumerate(zip(
+                computed.columns[variable.name], again.columns[variable.name], strict=True))
+            if (differ := _differing(first[rows], second)).any()
+        }
+        if changed:
+            names = [_part(pipeline, stage, configuration) for configuration in sorted(changed)]
+            return ", ".join(dict.fromkeys(names)), _at(store, scenes[min(changed.values())])
+    return "", ""
+
+
+def _differing(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return (N,) which rows of two arrays (N, ...) differ; NaN is equal to NaN."""
+    return np.asarray(~is_same(first, second).reshape(len(first), -1).all(axis=1))
+
+
+def _part(pipeline: Pipeline, stage: Stage, configuration: int) -> str:
+    """Return the name of what computes a configuration of a stage, as far as can be told."""
+    if stage is Stage.estimation:
+        settings = estimators(pipeline)
+        return settings[configuration % len(settings)].solver
+    if stage is Stage.detection:
+        setting = detector_settings(pipeline)[configuration]
+        if isinstance(setting, PluginSetting):
+            return setting.plugin.name
+    drawing = [each.name for each in pipeline.plugins if each.kind in {"effect", "renderer"}]
+    return " or ".join(drawing) or (OPENCV if stage is Stage.detection else "the renderer")
+
+
+def _at(store: RunStore, scene: Scene) -> str:
+    """Return a scene as ``sweep repro`` takes it."""
+    block, number = scene
+    return "--at " + selection_text({
+        axis.name: axis.values[index] for axis, index in zip(
+            scene_axes(store.pipeline), store.blocks[block].cell(number), strict=True)
+    })
 
 
 # --------------------------------------------------------------------------------------------------
-# Verification of a store: every file is read and checked, a sample of scenes recomputed.
+# Verification of a store: its files, its blocks, and a sample.
 
 SAMPLE = 20
 """Scenes that are recomputed by default."""
 
 
 def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
-    """Check every file by its checksum, flags against numbers, and recompute a sample.
-
-    All scenes that are flagged ``failed`` are recomputed, too, unless the sample is 0: those that
-    succeed now are damage of their block.
+    """Check every file by its checksum, metadata by the pipeline, and recompute a sample.
 
     Parameters
     ----------
@@ -482,25 +458,22 @@ def damaged_store(url: str, mode: str = "r") -> RunStore:
 
 
 def report_on(store: RunStore, sample: int) -> IntegrityReport:
-    """Check a store, and recompute up to ``sample`` scenes and all that failed.
-
-    With a sample of 0, nothing is recomputed.
-    """
+    """Check a store, and recompute up to ``sample`` scenes; none with a sample of 0."""
     done = committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
     numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
     listed, left = sync(_listed(store, numbers if report.finished else done))
-    files = FileCheck(store, report)
-    files.run()
-    left -= {KEY, *files.keys}
+    left -= check_files(store, report)
+    left = {key for key in left if not key.startswith(f"{LOCKS}/")}
     report.files = listed - len(left)
     sound = check_blocks(store, numbers, report)
-    check_needed(store, sound, report)
+    if report.finished:
+        check_needed(store, sound, report)
     check_scenes(store, sample, sound, report)
     if not is_written(store.storage):
         report.left_over = sorted(
             key for key in left
-            if not _of_unfinished_block(store, key, done, finished=report.finished)
+            if report.finished or not _of_unfinished_block(store, key, done)
         )
     return report
 
@@ -519,12 +492,10 @@ async def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[st
     return count, others
 
 
-def _of_unfinished_block(
-    store: RunStore, key: str, done: Container[int], finished: bool
-) -> bool:
+def _of_unfinished_block(store: RunStore, key: str, done: Container[int]) -> bool:
     """Return whether a key belongs to a block that a run will write again."""
-    if key.startswith(f"{BEGUN}/"):
-        number = key.removeprefix(f"{BEGUN}/")
-        return number.isdecimal() and int(number) not in done
-    written = store.chunks.number(key)
-    return written is not None and not finished and written not in done
+    number = store.chunks.number(key)
+    begun = key.removeprefix(f"{BEGUN}/")
+    if number is None and begun.isdecimal():
+        number = int(begun)
+    return number is not None and number not in done

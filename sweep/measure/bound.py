@@ -35,6 +35,7 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.model import coverage
+from sweep.model.board import moving_edges, own_sheets, side_m, visible_prints
 from sweep.model.derivatives import (
     LEVELS,
     POSE,
@@ -42,12 +43,11 @@ from sweep.model.derivatives import (
     normal_equations,
     work_space,
 )
-from sweep.model.effects import IN_BOUND, NEUTRAL
+from sweep.model.effects import IN_BOUND
+from sweep.model.exposure import solid_planes
 from sweep.model.polygon import Optics, Projection
-from sweep.model.printed import moving_edges, own_sheets, side_m, visible_prints
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
-from sweep.model.scene_sheet import solid_planes
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -217,11 +217,11 @@ def outside_model(scenes: Scenes, row: int) -> BoundStatus:
 
     The pose does not matter to it.
     """
-    effects = scenes.effect(row) if scenes.affected[row] else NEUTRAL
+    effects = scenes.effects.of(row)
     noise, levels = effects["noise_grey"], scenes.levels[row] * effects["gain"]
     margin = CLIPPING_DEVIATIONS * noise
     if isinstance(scenes.background[row], str) or any(
-        name not in IN_BOUND for name in scenes.active(row)
+        each.switch not in IN_BOUND for each in scenes.effects.active_in(row)
     ):
         return BoundStatus.not_in_model
     if noise < MIN_NOISE:
@@ -258,7 +258,7 @@ def bounds(
     high = np.minimum(boxes[:, 2:] + BACKGROUND_MARGIN_PX, frames)
     for i, row in enumerate(rows.tolist()):
         noise, gain, blur = (
-            (scenes.effect(row) if scenes.affected[row] else NEUTRAL)[name]
+            scenes.effects.of(row)[name]
             for name in ("noise_grey", "gain", "blur_px")
         )
         levels = scenes.levels[row] * gain

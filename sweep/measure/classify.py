@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
-from sweep.model.board import Board
+from sweep.model.board import Board, unseen_markers
+from sweep.model.exposure import solid_planes
 from sweep.model.extent import outside_of_frame
 from sweep.model.pose import transform_points
-from sweep.model.printed import unseen_markers
 from sweep.model.scene import Scenes
-from sweep.model.scene_sheet import solid_planes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -43,6 +42,11 @@ class TargetScenes:
     corners_px: Floats
     chessboard_px: Floats
     flags: NDArray[np.uint8]
+
+    @property
+    def are_markers(self) -> bool:
+        """Whether each target is a marker alone."""
+        return all(target.is_marker for target in self.targets)
 
 
 def target_scenes(

@@ -227,7 +227,7 @@ SOLVERS: dict[str, Solver] = {
     ),
     "recorded": Solver(
         "the poses that came with the detections which `sweep score` recorded",
-        lambda setting: RecordedPose(setting.reprojection_limit), recorded=True,
+        lambda setting: RecordedPose(setting.reprojection_limit), recorded=True, of_boards=True,
     ),
 }
 """Name in pipeline files -> the solver; choices, messages and reference follow from it."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import choose_when_compiled, compiled
-from sweep.model.board import Board
+from sweep.model.board import Board, extent_of, target_edges, unit_m
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
     LEVELS,
@@ -22,7 +22,6 @@ from sweep.model.derivatives import (
 )
 from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotations, vectors
-from sweep.model.printed import extent_of, target_edges, unit_m
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------

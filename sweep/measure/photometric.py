@@ -62,12 +62,11 @@ from sweep.measure.solver import (
     reprojection_px,
 )
 from sweep.measure.surroundings import BoardMarker
-from sweep.model.board import Board
+from sweep.model.board import Board, box_corners, extent_of, unit_m
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.model.printed import box_corners, extent_of, unit_m
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.board import Board
+from sweep.model.board import Board, target_edges
 from sweep.model.coverage import MarkerEdges
 from sweep.model.marker import BLACK, OUTSIDE, module_count
-from sweep.model.printed import target_edges
 from sweep.typing import Floats, Integers
 
 

@@ -1,7 +1,8 @@
-"""A target: a marker, or a board of them; and the edges of all that is printed on it."""
+"""A target: a marker, or a board of them, in one plane or in several; the edges of its prints."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +10,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges
 from sweep.model.marker import (
+    BLACK,
+    OCCLUDER,
     OUTSIDE,
     WHITE,
     cell_edges,
@@ -20,6 +25,7 @@ from sweep.model.marker import (
     module_count,
     overhang,
 )
+from sweep.model.polygon import half_plane
 from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers, Masks
 
@@ -320,3 +326,480 @@ def sheets_overlap(one: Floats, others: Floats) -> Masks:
         gap = np.maximum(b.min(axis=1) - a.max(axis=1), a.min(axis=1) - b.max(axis=1))
         separation = np.maximum(separation, gap)
     return np.asarray(coplanar & (separation < -TOUCHING * side))
+
+
+# --------------------------------------------------------------------------------------------------
+# What a scene shows in one plane: a marker, or a board of several; its edges and its extent.
+#
+# Lengths are in units: modules of a marker, those of its first one for a board. Columns count to
+# the right and rows downwards, from the top left corner of a marker's square or from a board's
+# origin.
+
+class Extent(NamedTuple):
+    """Where a print's parts end, in units.
+
+    Attributes
+    ----------
+    sheet
+        Left, top, right, bottom of all that is printed, the white around it included.
+    target
+        The same without what stands beside a board.
+    ink
+        The same of a marker's black square, or of a board's markers and squares.
+    modules_beyond
+        How far data extends beyond ``ink``.
+    origin, middle
+        (2,) each: the pose's origin, and the middle of the target.
+    modules
+        Units along the black square's side.
+    """
+
+    sheet: Floats
+    target: Floats
+    ink: Floats
+    modules_beyond: float
+    origin: Floats
+    middle: Floats
+    modules: float
+
+
+@lru_cache(maxsize=8192)
+def extent_of(target: Board) -> Extent:
+    """Return where the parts of a target end."""
+    n = float(module_count(target.dictionary))
+    if target.margin is not None:
+        margin, middle = target.margin, np.array([n / 2, n / 2])
+        sheet = np.array([-margin, -margin, n + margin, n + margin])
+        ink = np.array([0.0, 0.0, n, n])
+        return Extent(sheet, sheet, ink, float(overhang(target.dictionary)), middle, middle, n)
+    outline = target_edges(target)
+    black = (outline.sides == BLACK).any(axis=1)
+    own = _box(outline.ends)
+    return Extent(
+        _box(edges_of(target).ends), own, _box(outline.ends[black]), 0.0, np.zeros(2),
+        (own[:2] + own[2:]) / 2, n,
+    )
+
+
+def _box(ends: Floats) -> Floats:
+    """Return left, top, right, bottom of edges with ends (E, 4)."""
+    points = ends.reshape(-1, 2)
+    return np.concatenate([points.min(axis=0), points.max(axis=0)])
+
+
+def box_corners(boxes: Floats) -> Floats:
+    """Return the corners (n, 4, 3) of boxes (n, 4): TL, TR, BR, BL; x right, y up."""
+    left, top, right, bottom = boxes.T
+    across = np.stack([left, right, right, left], axis=1)
+    up = -np.stack([top, top, bottom, bottom], axis=1)
+    return np.stack([across, up, np.zeros_like(up)], axis=2)
+
+
+def unit_m(target: Board) -> float:
+    """Return the unit in metres: a module of the first marker; in sides of a marker alone."""
+    side = float(np.linalg.norm(target.corners_m[0, 1] - target.corners_m[0, 0]))
+    return side / module_count(target.dictionary)
+
+
+def side_m(target: Board, size_m: float) -> float:
+    """Return the side of a target's first marker in metres: ``size_m`` unless it has its own."""
+    if target.is_marker:
+        return size_m
+    side = unit_m(target) * module_count(target.dictionary)
+    return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
+
+
+def sides_m(targets: Sequence[Board], number: NDArray[np.intp], size_m: Floats) -> Floats:
+    """Return :func:`side_m` of N targets, ``targets[number]`` with sizes (N,)."""
+    if all(each.is_marker for each in targets):
+        return size_m
+    each = zip(number.tolist(), size_m.tolist(), strict=True)
+    return np.array([side_m(targets[k], size) for k, size in each])
+
+
+@lru_cache(maxsize=8192)
+def target_edges(target: Board) -> MarkerEdges:
+    """Return the edges of a target, without what stands beside it, in units."""
+    if target.is_marker:
+        return target.prints[0].edges
+    outline = target.edges()
+    return MarkerEdges(outline.ends / unit_m(target), outline.sides)
+
+
+@lru_cache(maxsize=8192)
+def edges_of(target: Board) -> MarkerEdges:
+    """Return the edges of all that is printed, beside a board too, in units."""
+    own = target_edges(target)
+    if not target.distractors:
+        return own
+    beside = beside_edges(target)
+    return MarkerEdges(
+        np.concatenate([own.ends, beside.ends]), np.concatenate([own.sides, beside.sides])
+    )
+
+
+def beside_edges(target: Board) -> MarkerEdges:
+    """Return the edges of what stands beside a target, in units."""
+    beside = edges_on_sheet(target.distractors)
+    return MarkerEdges(beside.ends / unit_m(target), beside.sides)
+
+
+@lru_cache(maxsize=64)
+def edge_table(targets: tuple[Board, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
+    """Return the edges of K targets in one table, and (K, 2) first and last + 1 row of each."""
+    each = [edges_of(target) for target in targets]
+    stops = np.cumsum([len(outline.ends) for outline in each])
+    starts = np.concatenate([[0], stops[:-1]])
+    table = MarkerEdges(
+        np.concatenate([outline.ends for outline in each]),
+        np.concatenate([outline.sides for outline in each]),
+    )
+    return table, np.stack([starts, stops], axis=1).astype(np.int64)
+
+
+@lru_cache(maxsize=8192)
+def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> MarkerEdges:
+    """Return the edges of a target under a sheet that hides everything beyond a straight line.
+
+    Parts of edges under the sheet are projected onto its edge at a right angle: they then enclose
+    the visible part of their area, since the projection moves nothing else. The sheet ends where
+    the target does.
+    """
+    extent = extent_of(target)
+    angle = math.radians(occlusion_deg)
+    towards = np.array([math.cos(angle), -math.sin(angle)])
+    # Rows count downwards; the sheet's edge lies where towards · (column, row) = limit.
+    hideable = extent.ink[2:] - extent.ink[:2] + 2 * extent.modules_beyond
+    middle = (extent.ink[:2] + extent.ink[2:]) / 2
+    width = float(hideable @ np.abs(towards))
+    limit = float(towards @ middle) + width * (0.5 - occlusion)
+
+    def split(edge: Sequence[float], hidden: bool) -> list[list[float]]:
+        """Return the parts of an edge beside the sheet, and those under it projected (or not)."""
+        a, b = np.array(edge[:2], dtype=np.float64), np.array(edge[2:], dtype=np.float64)
+        deep = float(towards @ a - limit), float(towards @ b - limit)
+        cuts = [a, b]
+        if min(deep) < 0 < max(deep):
+            cuts = [a, a + deep[0] / (deep[0] - deep[1]) * (b - a), b]
+        parts = []
+        for start, stop in itertools.pairwise(cuts):
+            inside = float(towards @ (start + stop) / 2 - limit) * (-1 if hidden else 1)
+            ends = [
+                point - max(sign * float(towards @ point - limit), 0.0) * sign * towards
+                if inside > 0 else point
+                for point in (start, stop) for sign in (-1.0 if hidden else 1.0,)
+            ]
+            parts.append([*ends[0], *ends[1]])
+        return parts
+
+    ends: list[list[float]] = []
+    sides: list[tuple[int, int]] = []
+    plain = edges_of(target)
+    for edge, codes in zip(plain.ends.tolist(), plain.sides.tolist(), strict=True):
+        parts = split(edge, hidden=False)
+        ends += parts
+        sides += [tuple(codes)] * len(parts)
+    left, top, right, bottom = extent.sheet.tolist()
+    # Down, right, up, left: the sheet is at greater x of the edge that goes down.
+    around = ((left, top), (left, bottom), (right, bottom), (right, top), (left, top))
+    for start, stop in itertools.pairwise(around):
+        parts = split([*start, *stop], hidden=True)
+        ends += parts
+        sides += [(OUTSIDE, OCCLUDER)] * len(parts)
+    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+
+
+# --------------------------------------------------------------------------------------------------
+# Targets that are not in one plane: which markers are seen, and what of them others hide.
+#
+# Each marker has a convex sheet of its own, or all of them one; what stands beside them has its
+# own. The image is the sum of the visible parts of all sheets that face the camera. What a sheet
+# in front hides of another is subtracted: of the part of an area inside a half plane the edges
+# are those inside, and those outside projected onto its line, which enclose the same area (as
+# those under an occluding sheet above). Of several sheets in front, by
+# inclusion and exclusion.
+
+_NEGLIGIBLE = 1e-12
+"""Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
+
+
+class _Face(NamedTuple):
+    """A sheet before the camera.
+
+    Attributes
+    ----------
+    number
+        Of :func:`sheets_of` the board.
+    plane
+        (3, 3) takes (column, row, 1) to the camera frame.
+    corners
+        (4, 3) of the sheet, in the camera frame.
+    normals
+        (4, 3) of the planes through the camera and the sheet's sides; inwards.
+    """
+
+    number: int
+    plane: Floats
+    corners: Floats
+    normals: Floats
+
+
+@lru_cache(maxsize=64)
+def sheets_of(board: Board) -> tuple[Print, ...]:
+    """Return what is printed on each sheet: a board's own, or its markers', then distractors'."""
+    of_each = len(board.prints) == len(board)
+    own = board.prints if of_each else (Print(board.edges(), 1.0, 0.0),)
+    return own + board.distractors
+
+
+def sheet_planes(board: Board, rotation: Floats, translation: Floats, scale: float) -> Floats:
+    """Return the planes (P, 3, 3) of a board's sheets, printed ``scale`` times as large."""
+    planes = np.array([each.plane(rotation, translation) for each in sheets_of(board)])
+    planes[:, :, 2] = translation + scale * (planes[:, :, 2] - translation)
+    planes[:, :, :2] *= scale
+    return planes
+
+
+@lru_cache(maxsize=64)
+def sheet_boxes(board: Board) -> Floats:
+    """Return left, top, right, bottom (P, 4) of each of a board's sheets in its own units."""
+    return np.array([_box(each.edges.ends) for each in sheets_of(board)])
+
+
+@lru_cache(maxsize=64)
+def _corners(board: Board) -> Floats:
+    """Return the corners (P, 4, 3) of each of a board's sheets as (column, row, 1)."""
+    left, top, right, bottom = sheet_boxes(board).T
+    return np.stack([
+        np.stack([left, right, right, left], axis=1), np.stack([top, top, bottom, bottom], axis=1),
+        np.ones((len(left), 4)),
+    ], axis=2)
+
+
+@lru_cache(maxsize=64)
+def sheets_m(board: Board) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the board's frame."""
+    return np.array([
+        corners @ each.plane(np.eye(3), np.zeros(3)).T
+        for corners, each in zip(_corners(board), sheets_of(board), strict=True)
+    ])
+
+
+def outlines(board: Board, planes: Floats) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the camera frame."""
+    return np.array([
+        corners @ plane.T for corners, plane in zip(_corners(board), planes, strict=True)
+    ])
+
+
+def own_sheets(board: Board) -> int:
+    """Return how many of a board's sheets are its own."""
+    return len(sheets_of(board)) - len(board.distractors)
+
+
+def facing(board: Board, planes: Floats) -> Masks:
+    """Return (P,) which sheets show their printed side to the camera, and are not behind it."""
+    # Columns run right and rows down, so that their cross product points away from the viewer.
+    away = np.cross(planes[:, :, 0], planes[:, :, 1])
+    shown = np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0
+    return np.asarray(shown & (outlines(board, planes)[..., 2] > 0).any(axis=1))
+
+
+def _faces(board: Board, planes: Floats) -> list[_Face]:
+    """Return the sheets that face the camera."""
+    numbers = np.flatnonzero(facing(board, planes))
+    around = outlines(board, planes)[numbers]
+    normals = np.cross(around, np.roll(around, -1, axis=1))
+    normals /= np.linalg.norm(normals, axis=2)[..., None]
+    normals *= np.sign(np.einsum("pkj,pj->pk", normals, around.mean(axis=1)))[..., None]
+    return [
+        _Face(k, planes[k], each, inwards)
+        for k, each, inwards in zip(numbers.tolist(), around, normals, strict=True)
+    ]
+
+
+def _common(one: _Face, other: _Face) -> Floats:
+    """Return the corners (n, 3) of that part of a sheet which the other's outline encloses."""
+    polygon = one.corners
+    for normal in other.normals:
+        polygon = half_plane(polygon, polygon @ normal)
+        if len(polygon) < 3:
+            return np.empty((0, 3))
+    return polygon
+
+
+def _hides(front: _Face, behind: _Face) -> bool:
+    """Return whether a sheet hides a part of another."""
+    common = _common(behind, front)
+    if not len(common):
+        return False
+    rays = common / np.linalg.norm(common, axis=1)[:, None]
+    spread = np.cross(rays[1:] - rays[0], np.roll(rays, -1, axis=0)[1:] - rays[0])
+    if not np.abs(spread).max() > _NEGLIGIBLE:
+        return False
+    ray = rays.mean(axis=0)
+    distances = []
+    for face in (front, behind):
+        normal = np.cross(face.plane[:, 0], face.plane[:, 1])
+        distances.append(float(normal @ face.plane[:, 2]) / float(normal @ ray))
+    return distances[0] < distances[1]
+
+
+def _occluders(faces: list[_Face]) -> list[list[_Face]]:
+    """Return for each sheet those that hide a part of it."""
+    if not faces:
+        return []
+    corners = np.array([face.corners for face in faces])
+    before: Masks = np.asarray((corners[..., 2] > 0).all(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = corners[..., :2] / corners[..., 2:]
+    low, high = (np.where(before[:, None], end, sign * np.inf) for end, sign in (
+        (flat.min(axis=1), -1), (flat.max(axis=1), 1)
+    ))
+    # Without this, sheets that lie far from each other in the image cost most of the time.
+    near: Masks = np.asarray(((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2))
+    np.fill_diagonal(near, val=False)
+    return [
+        [faces[k] for k in np.flatnonzero(near[i]).tolist() if _hides(faces[k], behind)]
+        for i, behind in enumerate(faces)
+    ]
+
+
+class VisiblePrint(NamedTuple):
+    """What is seen of a sheet's print.
+
+    Attributes
+    ----------
+    number
+        Of :func:`sheets_of` the board.
+    edges, plane
+        Its edges, and what takes (column, row, 1) to the camera frame, (3, 3).
+    mover
+        (E,) the number of the sheet with which the image of each edge moves: of an edge at which
+        another sheet hides this one, the other's.
+    """
+
+    number: int
+    edges: MarkerEdges
+    plane: Floats
+    mover: Integers
+
+
+def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[VisiblePrint]:
+    """Return what is seen of the print of each sheet, from number ``first`` on."""
+    seen = []
+    sheets = sheets_of(board)
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        if face.number < first:
+            continue
+        outline = sheets[face.number].edges
+        own = np.full(len(outline.ends), face.number)
+        parts, movers = [outline], [own]
+        for count in range(1, len(fronts) + 1):
+            for some in itertools.combinations(fronts, count):
+                part, mover = outline, own
+                for front in some:
+                    for line in front.normals @ face.plane:
+                        part, mover = _within(part, line, mover, front.number)
+                parts.append(
+                    MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
+                )
+                movers.append(mover)
+        edges = MarkerEdges(
+            np.concatenate([part.ends for part in parts]),
+            np.concatenate([part.sides for part in parts]),
+        )
+        seen.append(VisiblePrint(face.number, edges, face.plane, np.concatenate(movers)))
+    return seen
+
+
+def moving_edges(seen: VisiblePrint, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
+    """Return the edges of a print, each in the plane of the sheet that it moves with, and these.
+
+    The image is the same: an edge at which a sheet in front ends lies on the sheet's outline.
+    """
+    groups = []
+    for number in np.unique(seen.mover).tolist():
+        ends, sides = (each[seen.mover == number] for each in seen.edges)
+        if number != seen.number:
+            points = np.column_stack([ends.reshape(-1, 2), np.ones(2 * len(ends))])
+            moved = points @ np.linalg.solve(planes[number], seen.plane).T
+            ends = np.ascontiguousarray((moved[:, :2] / moved[:, 2:]).reshape(-1, 4))
+        groups.append((MarkerEdges(ends, sides), planes[number]))
+    return groups
+
+
+def _within(
+    outline: MarkerEdges, line: Floats, mover: Integers, front: int
+) -> tuple[MarkerEdges, Integers]:
+    """Return the edges of the part of all areas where line · (column, row, 1) is not negative.
+
+    And with which sheet each moves: those on the line with ``front``, others as ``mover`` says.
+    """
+    length = float(line[:2] @ line[:2])
+    if length == 0.0:
+        kept = slice(None) if line[2] >= 0 else slice(0)
+        return MarkerEdges(outline.ends[kept], outline.sides[kept]), mover[kept]
+    start, stop = outline.ends[:, :2], outline.ends[:, 2:]
+    a, b = start @ line[:2] + line[2], stop @ line[:2] + line[2]
+    crossing = (a < 0) != (b < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = np.where(crossing[:, None], start + (a / (a - b))[:, None] * (stop - start), stop)
+
+    def projected(points: Floats, value: Floats) -> Floats:
+        return points - np.minimum(value, 0.0)[:, None] / length * line[:2]
+
+    first = np.hstack([projected(start, a), np.where(
+        crossing[:, None], cut, projected(stop, b)
+    )])
+    second = np.hstack([cut, projected(stop, b)])[crossing]
+    moved = np.where(a < 0, front, mover), np.where(b < 0, front, mover)[crossing]
+    return MarkerEdges(
+        np.concatenate([first, second]),
+        np.concatenate([outline.sides, outline.sides[crossing]]),
+    ), np.concatenate(moved)
+
+
+def unseen_markers(board: Board, planes: Floats) -> Masks:
+    """Return (M,) which markers show their back, or are wholly behind another's sheet."""
+    unseen = np.ones(len(board), dtype=bool)
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        for number, square in _squares(board)[face.number]:
+            corners = square @ face.plane.T
+            unseen[number] = any((corners @ front.normals.T >= 0).all() for front in fronts)
+    return unseen
+
+
+@lru_cache(maxsize=64)
+def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
+    """Return the markers of each sheet: number, and corners (4, 3) as (column, row, 1)."""
+    squares: list[list[tuple[int, Floats]]] = [[] for _ in sheets_of(board)]
+    if len(board.prints) > len(board):
+        squares[0] = list(enumerate(board.corners_m * [1.0, -1.0, 0.0] + [0.0, 0.0, 1.0]))
+        return squares
+    for number, printed in enumerate(board.prints):
+        side = 2 * printed.half_m / printed.unit_m
+        squares[number] = [(number, np.array([
+            [0.0, 0.0, 1.0], [side, 0.0, 1.0], [side, side, 1.0], [0.0, side, 1.0]
+        ]))]
+    return squares
+
+
+def boxes_px(
+    board: Board, camera: Cameras, rotation: Floats, translation: Floats, scale: float
+) -> Floats:
+    """Return rectangles (2, 4, 2) in px about the images of a solid board's sheets, and of all.
+
+    Of those that face the camera, if any does; NaN if a part of one is not before it.
+    """
+    planes = sheet_planes(board, rotation, translation, scale)
+    boxes = []
+    for count in (own_sheets(board), len(planes)):
+        seen, corners = facing(board, planes)[:count], outlines(board, planes)[:count]
+        corners = corners[seen if seen.any() else slice(None)]
+        pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        boxes.append([low, [high[0], low[1]], high, [low[0], high[1]]])
+    return np.array(boxes)

@@ -20,7 +20,10 @@ from sweep.model.board import (
     corners_of,
     first_overlap,
     marker_print,
+    own_sheets,
     rectangles_print,
+    sheets_m,
+    sheets_of,
     sheets_overlap,
     solid_print,
 )
@@ -36,7 +39,6 @@ from sweep.model.marker import (
     overhang,
 )
 from sweep.model.marker import Marker as SingleMarker
-from sweep.model.printed import own_sheets, sheets_m, sheets_of
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

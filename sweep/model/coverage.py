@@ -13,14 +13,15 @@ from sweep.model.polygon import (
     ModuleEdge,
     Optics,
     Projection,
-    chord_count,
+    Sheet,
     chords_within_tolerance,
     clip,
     distance_from_chord,
-    distorted_point,
+    flat_sheet,
     homogeneous_pixel,
+    piece_count,
+    sheet_pixel,
 )
-from sweep.model.sheet import Sheet, piece_count, sheet_pixel
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -315,65 +316,11 @@ def _add_spread(
 
 
 @compiled
-def accumulate(
-    cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
-    sigma: float,
-) -> None:
-    """Add a marker's edges to ``cover`` (height, width + 2).
-
-    Parameters
-    ----------
-    cover
-        The accumulator of the box whose top left pixel is (``left``, ``top``).
-    edges
-        The marker's edges.
-    levels
-        (3,) grey levels of outside, black and white; (4,) if a sheet occludes the marker.
-    projection
-        The marker's plane, and the camera.
-    sigma
-        Standard deviation in pixels of a Gaussian point spread; 0 for none.
-    """
-    intrinsics = projection.optics.intrinsics
-    shift_x, shift_y = intrinsics[2] + (0.5 - left), intrinsics[3] + (0.5 - top)
-    ends, sides = edges.ends, edges.sides
-    for e in range(ends.shape[0]):
-        jump = levels[sides[e, 1]] - levels[sides[e, 0]]
-        if jump == 0.0:
-            continue
-        edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
-        if not projection.optics.distorted:
-            x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, edge.column, edge.row)
-            x1, y1, z1 = homogeneous_pixel(
-                projection, shift_x, shift_y, edge.to_column, edge.to_row
-            )
-            if sigma > 0.0:
-                _add_blurred(cover, jump, sigma, Segment(x0, y0, z0, x1, y1, z1))
-            else:
-                _add_projected(cover, jump, Segment(x0, y0, z0, x1, y1, z1))
-            continue
-        u0, v0 = distorted_point(0.0, projection, edge)
-        u1, v1 = distorted_point(1.0, projection, edge)
-        chords = chord_count(projection, edge)
-        x, y = u0 + (0.5 - left), v0 + (0.5 - top)
-        for chord in range(1, chords + 1):
-            u, v = u1, v1
-            if chord < chords:
-                u, v = distorted_point(chord / chords, projection, edge)
-            u, v = u + (0.5 - left), v + (0.5 - top)
-            if sigma > 0.0:
-                _add_blurred(cover, jump, sigma, Segment(x, y, 1.0, u, v, 1.0))
-            else:
-                _add_projected(cover, jump, Segment(x, y, 1.0, u, v, 1.0))
-            x, y = u, v
-
-
-@compiled
 def accumulate_curved(
     cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
     sigma: float, sheet: Sheet,
 ) -> None:
-    """As :func:`accumulate`, of a sheet that is bent or shifted.
+    """As :func:`accumulate`, of a sheet that is bent or shifted, or seen through a lens.
 
     Each edge is divided into pieces, and each piece into chords of which none is farther from the
     edge's image than 1e-4 px.
@@ -415,6 +362,45 @@ def accumulate_curved(
                 else:
                     _add_projected(cover, jump, segment)
                 x, y = u, v
+
+
+@compiled
+def accumulate(
+    cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
+    sigma: float,
+) -> None:
+    """Add a marker's edges to ``cover`` (height, width + 2).
+
+    Parameters
+    ----------
+    cover
+        The accumulator of the box whose top left pixel is (``left``, ``top``).
+    edges
+        The marker's edges.
+    levels
+        (3,) grey levels of outside, black and white; (4,) if a sheet occludes the marker.
+    projection
+        The marker's plane, and the camera.
+    sigma
+        Standard deviation in pixels of a Gaussian point spread; 0 for none.
+    """
+    if projection.optics.distorted:
+        accumulate_curved(cover, edges, levels, projection, left, top, sigma, flat_sheet())
+        return
+    intrinsics = projection.optics.intrinsics
+    shift_x, shift_y = intrinsics[2] + (0.5 - left), intrinsics[3] + (0.5 - top)
+    ends, sides = edges.ends, edges.sides
+    for e in range(ends.shape[0]):
+        jump = levels[sides[e, 1]] - levels[sides[e, 0]]
+        if jump == 0.0:
+            continue
+        x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, ends[e, 0], ends[e, 1])
+        x1, y1, z1 = homogeneous_pixel(projection, shift_x, shift_y, ends[e, 2], ends[e, 3])
+        segment = Segment(x0, y0, z0, x1, y1, z1)
+        if sigma > 0.0:
+            _add_blurred(cover, jump, sigma, segment)
+        else:
+            _add_projected(cover, jump, segment)
 
 
 @compiled

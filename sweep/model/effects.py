@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.errors import PluginError
-from sweep.model.sensor import METHODS, PATTERNS, standard_normals
+from sweep.model.sensor import BLOCK_PX, METHODS, PATTERNS, REACH_PX, standard_normals
 from sweep.plugins.loading import call, real_numbers
 from sweep.typing import Floats
 
@@ -90,6 +90,13 @@ class Effect:
     worsens
         What it makes worse for the search of windows, where another effect brings it: coarse noise
         needs twice the margin of noise, steep uneven light the whole frame.
+    spread_px
+        Standard deviation of the point spread that it adds, in px, by its parameters, the focal
+        length in px and inverse depths (...) in 1/m; those of several add in quadrature. Printed
+        edges reach so far beyond their place that their windows are widened by it.
+    reach_px, block_px
+        How far around a pixel it mixes pixels, and the side of the blocks, counted from the frame's
+        corner, of which it changes all pixels: windows are widened by them.
     apply
         Of a pointwise effect: a function of levels (h, w) and their :class:`Patch` that returns
         the levels after it. Applied at its ``step``, "light" or "signal", after the built-in
@@ -105,6 +112,9 @@ class Effect:
     in_bound: bool = False
     widens: Literal["nothing", "noise", "uneven light"] = "nothing"
     worsens: tuple[Literal["noise", "uneven light"], ...] = ()
+    spread_px: Callable[[Mapping[str, float], float, Floats], Floats] | None = None
+    reach_px: int = 0
+    block_px: int = 1
     apply: Callable[[Floats, Patch], Floats] | None = None
 
     @property
@@ -171,6 +181,17 @@ VELOCITIES = (
     "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
     "rotation_x_deg_s", "rotation_y_deg_s", "rotation_z_deg_s",
 )
+
+
+def _defocus_px(values: Mapping[str, float], focal_px: float, inverse_depth: Floats) -> Floats:
+    """Return the point spread of a thin lens.
+
+    The circle of confusion has the diameter fx · aperture · |1/focus - 1/z| in pixels; a disk's
+    standard deviation along an axis is a quarter of its diameter.
+    """
+    aperture_px = focal_px * values["aperture_mm"] * 1e-3
+    return np.asarray(aperture_px * (1 / values["focus_distance_m"] - inverse_depth) / 4)
+
 
 EFFECTS: tuple[Effect, ...] = (
     Effect(
@@ -288,7 +309,7 @@ EFFECTS: tuple[Effect, ...] = (
                 high=1000, drawable=True,
             ),
         },
-        in_bound=True,
+        in_bound=True, spread_px=lambda values, _, depth: np.full(depth.shape, values["blur_px"]),
     ),
     Effect(
         "defocus", "edges",
@@ -306,6 +327,7 @@ EFFECTS: tuple[Effect, ...] = (
         needs={
             "aperture_mm": ("focus_distance_m",), "focus_distance_m": ("aperture_mm",),
         },
+        spread_px=_defocus_px,
     ),
     Effect(
         "image shift", "edges",
@@ -337,6 +359,8 @@ EFFECTS: tuple[Effect, ...] = (
             ),
         },
         needs={"sharpening_px": ("sharpening",)},
+        # That of the image that is subtracted.
+        spread_px=lambda values, _, depth: np.full(depth.shape, values["sharpening_px"]),
     ),
     Effect(
         "bloom", "light",
@@ -424,6 +448,7 @@ EFFECTS: tuple[Effect, ...] = (
             ),
         },
         needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
+        reach_px=REACH_PX,
     ),
     Effect(
         "gamma", "signal",
@@ -484,7 +509,7 @@ EFFECTS: tuple[Effect, ...] = (
                 low=0, high=100,
             ),
         },
-        worsens=("noise", "uneven light"),
+        worsens=("noise", "uneven light"), block_px=BLOCK_PX,
     ),
 )
 """Every effect, in physical order."""

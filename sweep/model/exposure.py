@@ -1,8 +1,10 @@
-"""The image under blur, motion, rolling shutter and occlusion, exact or by brute force."""
+"""The exact image of a target under blur, defocus, motion, rolling shutter and occlusion."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -10,26 +12,471 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import coverage
-from sweep.model.coverage import NODES, REACH, WEIGHTS, mixed
-from sweep.model.extent import (
-    MovingMarker,
-    corner_depths,
-    moved_plane,
-    moving_marker,
-    outline_extent,
-    path_px,
-    spread_px,
+from sweep.model.board import (
+    beside_edges,
+    edges_of,
+    extent_of,
+    facing,
+    occluded_edges,
+    own_sheets,
+    sheet_boxes,
+    sheet_planes,
+    sheets_m,
+    unit_m,
+    visible_prints,
 )
-from sweep.model.lens import undistort
-from sweep.model.polygon import Optics, Projection
-from sweep.model.printed import edges_of, occluded_edges
+from sweep.model.coverage import NODES, REACH, WEIGHTS, MarkerEdges
+from sweep.model.lens import distort, jacobian
+from sweep.model.polygon import (
+    PIECE_LENGTHS,
+    Projection,
+    Sheet,
+    bent_point,
+    flat_sheet,
+    fold_cells,
+    folds_over,
+    plane_normal,
+    sheet_pixels,
+)
 from sweep.model.scene import Box, Scenes
-from sweep.model.scene_sheet import accumulate_solid, scene_sheet
-from sweep.model.sheet import FLAT, Sheet
+from sweep.model.sensor import standard_normals
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
-# The exact image of a marker under blur, motion, rolling shutter and occlusion, unquantised.
+# A target that moves at constant linear and angular velocity while its image is taken.
+
+class Motion(NamedTuple):
+    """A marker's motion in the camera frame.
+
+    Attributes
+    ----------
+    translation
+        (3,) position of its centre at time 0, in metres.
+    velocity
+        (6,) linear in m/s and angular in rad/s.
+    """
+
+    translation: Floats
+    velocity: Floats
+
+
+class MovingMarker(NamedTuple):
+    """A moving marker seen by a camera.
+
+    Attributes
+    ----------
+    projection
+        The camera, and the marker's plane at time 0.
+    motion
+        How the marker moves.
+    outline
+        (M, 3) points of its outline: column, row, and height over the plane in modules.
+    flat
+        Whether it has a back, which has no image.
+    """
+
+    projection: Projection
+    motion: Motion
+    outline: Floats
+    flat: bool
+
+
+@compiled
+def moved_plane(plane: Floats, motion: Motion, time_s: float) -> Floats:
+    """Return the plane (3, 3) of a marker after ``time_s``.
+
+    ``plane`` takes module coordinates to the camera frame. The rotation about the centre is
+    Rodrigues' formula for the vector angular velocity · time.
+    """
+    translation, velocity = motion
+    x, y, z = velocity[3] * time_s, velocity[4] * time_s, velocity[5] * time_s
+    angle = math.sqrt(x * x + y * y + z * z)
+    sine, versine = 1.0, 0.5
+    if angle > 0.0:
+        half = math.sin(angle / 2) / angle
+        sine, versine = math.sin(angle) / angle, 2 * half * half
+    after = np.empty((3, 3))
+    for k in range(3):
+        px, py, pz = plane[0, k], plane[1, k], plane[2, k]
+        if k == 2:
+            px, py, pz = px - translation[0], py - translation[1], pz - translation[2]
+        cx, cy, cz = y * pz - z * py, z * px - x * pz, x * py - y * px
+        dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+        after[0, k] = px + sine * cx + versine * dx
+        after[1, k] = py + sine * cy + versine * dy
+        after[2, k] = pz + sine * cz + versine * dz
+    for k in range(3):
+        after[k, 2] += translation[k] + velocity[k] * time_s
+    return after
+
+
+VISIBLE, BEHIND, MEANINGLESS = 0, 1, 2
+"""States of a moving marker: in front of the camera; wholly behind it; or without a meaningful
+image, since it crosses the camera's plane, shows its back, or lies where the lens folds."""
+
+
+@compiled
+def outline_extent(
+    projection: Projection, outline: Floats, extent: Floats
+) -> tuple[int, bool]:
+    """Write left, top, right, bottom in px of an outline's image to ``extent`` (4,).
+
+    The extent is that of the points (M, 3), in modules, that are in front of the camera.
+    Returns how many are behind it, and whether the lens folds at one of the others.
+    """
+    plane, optics = projection.plane, projection.optics
+    intrinsics, lens = optics.intrinsics, optics.lens
+    behind, folds = 0, False
+    extent[0] = extent[1] = math.inf
+    extent[2] = extent[3] = -math.inf
+    normal = plane_normal(plane)
+    for j in range(len(outline)):
+        height = outline[j, 2]
+        z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
+        z += height * normal[2]
+        if not z > 0.0:
+            behind += 1
+            continue
+        x = plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]
+        y = plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]
+        x, y = (x + height * normal[0]) / z, (y + height * normal[1]) / z
+        if optics.distorted:
+            a, b, c, d = jacobian(x, y, lens)
+            folds = folds or not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0)
+            x, y = distort(x, y, lens)
+        u, v = intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
+        extent[0], extent[2] = min(extent[0], u), max(extent[2], u)
+        extent[1], extent[3] = min(extent[1], v), max(extent[3], v)
+    return behind, folds
+
+
+@compiled
+def track(marker: MovingMarker, times_s: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the extents (T, 4) left, top, right, bottom in px of a marker, and its states (T,)."""
+    projection, motion = marker.projection, marker.motion
+    extents = np.empty((len(times_s), 4))
+    states = np.zeros(len(times_s), dtype=np.int64)
+    for k in range(len(times_s)):
+        p = moved_plane(projection.plane, motion, times_s[k])
+        behind, folds = outline_extent(
+            Projection(p, projection.optics), marker.outline, extents[k]
+        )
+        if folds:
+            states[k] = MEANINGLESS
+        # The sign of the line of sight along the normal, which is the columns' cross product.
+        facing = 0.0
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            normal = p[a, 0] * p[b, 1] - p[b, 0] * p[a, 1]
+            facing += normal * (motion.translation[i] + motion.velocity[i] * times_s[k])
+        if behind == len(marker.outline):
+            states[k] = BEHIND
+        elif behind > 0 or (marker.flat and not facing > 0.0):
+            states[k] = MEANINGLESS
+    return extents, states
+
+
+MIN_INSTANTS = 65
+"""Least number of instants at which a moving target's extent is computed."""
+
+
+def row_times(
+    top: int, bottom: int, height: int, exposure_s: float, row_time_s: float
+) -> tuple[float, float]:
+    """Return when the exposure of rows [top, bottom) begins and ends.
+
+    Time 0 is the middle of the middle row's exposure.
+    """
+    middle = (height - 1) / 2
+    return (
+        row_time_s * (top - middle) - exposure_s / 2,
+        row_time_s * (bottom - 1 - middle) + exposure_s / 2,
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Shifts of an image that vary slowly over the frame.
+#
+# They are a Gaussian random field with the covariance s² exp(-d² / (2 l²)), made of plane waves
+# (Rahimi and Recht, "Random features for large-scale kernel machines", 2007): a smooth function
+# of the pixel, whatever part of the frame is computed.
+
+WAVES = 32
+"""Waves of each coordinate's shift. Given their directions, the field is exactly Gaussian; their
+directions are drawn, so that the covariance of one frame deviates from the formula by 1/8 of its
+height."""
+
+_STREAM = np.uint64(int.from_bytes(sha256(b"geometry_px").digest()[:8], "little"))
+
+
+def shift_waves(std_px: float, length_px: float, key: np.uint64) -> Floats:
+    """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.sheet.Sheet`).
+
+    Parameters
+    ----------
+    std_px, length_px
+        Standard deviation of each coordinate's shift, and its correlation length.
+    key
+        Of the frame's random numbers.
+    """
+    normals = np.empty((8, WAVES))
+    standard_normals(np.uint64(key ^ _STREAM), 0, 0, 0, normals)
+    waves = np.stack([normals[:4].T, normals[4:].T])
+    waves[:, :, :2] /= length_px
+    waves[:, :, 2:] *= std_px / math.sqrt(WAVES)
+    return waves
+
+# --------------------------------------------------------------------------------------------------
+# The sheets of scenes: where they are, how they are bent, and how their image is shifted.
+
+CHORDS_PER_SIDE = 32
+"""Points of a side at which a curved outline is sampled for its extent: between them it bulges by
+less than 1/1000 of the side's bulge, well inside the 2 px that are added around it."""
+
+
+class SeenSheet(NamedTuple):
+    """A sheet that faces the camera: left, top, right, bottom (4,) in units, and its plane."""
+
+    number: int
+    box: Floats
+    plane: Floats
+
+    @property
+    def depths(self) -> Floats:
+        """The depths (4,) in metres of its corners."""
+        (corners,) = rectangles(self.box[None], 1)
+        return np.asarray(corners @ self.plane[2, :2] + self.plane[2, 2])
+
+
+def rectangles(boxes: Floats, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along boxes (n, 4): left, top, right, bottom."""
+    t = np.arange(per_side) / per_side
+    left, top, right, bottom = (np.repeat(side[:, None], per_side, 1) for side in boxes.T)
+    columns = np.concatenate(
+        [left + t * (right - left), right, right - t * (right - left), left], axis=1
+    )
+    lines = np.concatenate(
+        [top, top + t * (bottom - top), bottom, bottom - t * (bottom - top)], axis=1
+    )
+    return np.stack([columns, lines], axis=2)
+
+
+def solid_planes(scenes: Scenes, row: int) -> Floats:
+    """Return the planes (P, 3, 3) of the sheets of one scene's board."""
+    return sheet_planes(
+        scenes.target(row), scenes.rotation[row], scenes.translation[row],
+        float(scenes.effects["marker_scale"][row]),
+    )
+
+
+def seen_sheets(scenes: Scenes, row: int) -> list[SeenSheet]:
+    """Return the sheets of one scene that face the camera: one of a target in one plane."""
+    target = scenes.target(row)
+    if target.is_flat:
+        return [SeenSheet(0, extent_of(target).sheet, scenes.plane[row])]
+    planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
+    return [
+        SeenSheet(k, boxes[k], planes[k]) for k in np.flatnonzero(facing(target, planes)).tolist()
+    ]
+
+
+def scene_sheet(scenes: Scenes, row: int) -> Sheet:
+    """Return how the sheets of one scene are bent, in modules, and how their image is shifted."""
+    effect, flat = scenes.effects.of(row), flat_sheet()
+    waves, length_px = flat.waves, math.inf
+    if effect["geometry_px"] != 0:
+        length_px = effect["geometry_length_px"]
+        waves = shift_waves(effect["geometry_px"], length_px, scenes.effects.noise_key[row])
+    x, y = extent_of(scenes.target(row)).origin.tolist()
+    direction = math.radians(effect["bend_deg"])
+    return Sheet(
+        x, y, effect["curvature_per_m"] * float(np.linalg.norm(scenes.plane[row][:, 0])),
+        math.cos(direction), -math.sin(direction),
+        scenes.effects.meaning("bend", effect) == "saddle", waves,
+        float(np.hypot(waves[:, :, 2], waves[:, :, 3]).sum(axis=1).max(initial=0.0)),
+        PIECE_LENGTHS * length_px,
+    )
+
+
+def is_curved(sheet: Sheet) -> bool:
+    """Return whether a sheet is bent or its image shifted."""
+    return sheet.curvature != 0 or sheet.waves.shape[1] > 0
+
+
+def sheet_outline_px(scenes: Scenes, row: int) -> Floats:
+    """Return points (M, 2) along the images of the sheets; NaN if not before the camera."""
+    optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
+    return np.concatenate([np.empty((0, 2)), *(
+        sheet_pixels(rectangles(each.box[None], CHORDS_PER_SIDE)[0],
+                     Projection(each.plane, optics), bend)
+        for each in seen_sheets(scenes, row)
+    )])
+
+
+def sheet_folds(scenes: Scenes, row: int) -> bool:
+    """Return whether a part of a sheet of one scene hides another, or is not before the camera.
+
+    Also if shifts that vary too steeply fold the image.
+    """
+    bend, optics = scene_sheet(scenes, row), scenes.cameras.optics(row)
+    extent = float(np.ptp(scenes.outline_px[row], axis=0).max()) if len(bend.waves[0]) else 0.0
+    for each in seen_sheets(scenes, row):
+        low, high = each.box[:2], each.box[2:]
+        cells = fold_cells(bend, float((high - low).max()), extent)
+        if folds_over(low, high, cells, Projection(each.plane, optics), bend):
+            return True
+    return False
+
+
+def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
+    """Return the target of one scene with a velocity (6,) as compiled functions take it.
+
+    Its outline are its sheets' corners, or more points under a lens or on a bent sheet.
+    """
+    target, bend = scenes.target(row), scene_sheet(scenes, row)
+    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or is_curved(bend) else 1
+    if target.is_flat:
+        (points,) = rectangles(extent_of(target).sheet[None], per_side)
+        outline = np.array([bent_point(column, line, bend) for column, line in points.tolist()])
+    else:
+        corners = (sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0])[:, :, None]
+        t = np.arange(per_side)[:, None] / per_side
+        outline = (corners + t * (np.roll(corners, -1, axis=1) - corners)).reshape(-1, 3)
+    return MovingMarker(
+        scenes.projection(row), Motion(scenes.translation[row], velocity), outline, target.is_flat
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# The point spread, and the path of what moves.
+
+def spread_px(
+    scenes: Scenes, row: int, inverse_depth: Floats, blurred: bool = False
+) -> Floats:
+    """Return the point spread's standard deviation in px at inverse depths (...) in 1/m.
+
+    With ``blurred`` that of the image that sharpening subtracts.
+    """
+    effect, focal_px = scenes.effects.of(row), float(scenes.cameras.view[row, 0])
+    spread = np.zeros(inverse_depth.shape)
+    for each in scenes.effects.active_in(row):
+        if each.spread_px is not None and (blurred or each.switch != "sharpening"):
+            spread = np.hypot(spread, each.spread_px(effect, focal_px, inverse_depth))
+    return spread
+
+
+def largest_spread_px(scenes: Scenes, row: int) -> float:
+    """Return the largest point spread on the target, at a corner of a sheet, with sharpening's."""
+    depths = np.concatenate([[], *(each.depths for each in seen_sheets(scenes, row))])
+    return float(spread_px(scenes, row, 1 / depths, blurred=True).max(initial=0.0))
+
+
+def defocus_px(
+    scenes: Scenes, row: int, sheet: SeenSheet, box: Box, blurred: bool = False
+) -> Floats:
+    """Return the point spread's standard deviation (height, width) at a sheet's depth.
+
+    The depth is that of the sheet's plane (of a bent one, the tangent plane at its centre) in each
+    pixel's direction; its inverse is linear in the image.
+    """
+    fx, fy, cx, cy = scenes.cameras.view[row]
+    normal = np.cross(sheet.plane[:, 0], sheet.plane[:, 1])
+    x = (np.arange(box[0], box[2]) - cx) / fx
+    y = (np.arange(box[1], box[3]) - cy) / fy
+    inverse = (normal[0] * x + normal[1] * y[:, None] + normal[2]) / (normal @ sheet.plane[:, 2])
+    # Beyond the sheet its plane may come near the camera, or end; nothing is blurred there.
+    depth = sheet.depths
+    return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()), blurred)
+
+
+def _path_px(
+    scenes: Scenes, row: int, velocity: Floats, begin: float, end: float
+) -> float:
+    """Return the longest path of a corner, in px, from a time to another."""
+    marker = moving_marker(scenes, row, velocity * np.array([1.0, 1, 1, 0, 0, 0]))
+    extents, states = track(marker, np.linspace(begin, end, MIN_INSTANTS))
+    extents = extents[states != BEHIND]
+    if not len(extents):
+        return 0.0
+    along = np.hypot(*np.abs(np.diff(extents, axis=0)).reshape(-1, 2, 2).max(axis=1).T).sum()
+    around = np.hypot(*(extents[:, 2:] - extents[:, :2]).max(axis=0)) * (end - begin)
+    return float(along + np.linalg.norm(velocity[3:]) * around)
+
+
+# --------------------------------------------------------------------------------------------------
+# What is seen of the target's prints while its image is taken.
+
+class Layer(NamedTuple):
+    """What is seen of one sheet during a part of the exposure.
+
+    Attributes
+    ----------
+    sheet
+        The sheet at time 0.
+    edges
+        Those of what is seen of its print.
+    outline
+        (M, 3) points around it, as :class:`MovingMarker` has them.
+    begin_s, end_s
+        The part of the time.
+    """
+
+    sheet: SeenSheet
+    edges: MarkerEdges
+    outline: Floats
+    begin_s: float
+    end_s: float
+
+
+OCCLUSION_PX = 0.5
+"""Path of a target in several planes between the instants at which is computed which sheets hide
+which: an edge of a shadow lies where it does in the middle of the time, so that half of this times
+the share by which one sheet moves against the other is its largest error."""
+
+MAX_SHADOWS = 512
+
+
+def _layers(
+    scenes: Scenes, row: int, velocity: Floats, begin_s: float, end_s: float, beside: bool
+) -> list[Layer]:
+    """Return what is seen of one scene from a time to another; ``beside``: of distractors alone."""
+    target, effect = scenes.target(row), scenes.effects.of(row)
+    if target.is_flat:
+        (sheet,) = seen_sheets(scenes, row)
+        edges = (
+            beside_edges(target) if beside
+            else occluded_edges(target, effect["occlusion"], effect["occlusion_deg"])
+            if effect["occlusion"] > 0 else edges_of(target)
+        )
+        outline = moving_marker(scenes, row, velocity).outline
+        return [Layer(sheet, edges, outline, -math.inf, math.inf)]
+    planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
+    motion = Motion(scenes.translation[row], velocity)
+    count = 1
+    if velocity.any():
+        path = _path_px(scenes, row, velocity, begin_s, end_s)
+        count = min(max(math.ceil(path / OCCLUSION_PX), 1), MAX_SHADOWS)
+    times = np.linspace(begin_s, end_s, count + 1)
+    times[0], times[-1] = -math.inf, math.inf
+    middles = begin_s + (np.arange(count) + 0.5) / count * (end_s - begin_s)
+    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
+    layers = []
+    for (start, stop), middle in zip(itertools.pairwise(times), middles, strict=True):
+        moved = planes
+        if velocity.any():
+            moved = np.array([moved_plane(each, motion, middle) for each in planes])
+        for seen in visible_prints(target, moved, own_sheets(target) if beside else 0):
+            box, plane = boxes[seen.number], planes[seen.number]
+            (points,) = rectangles(box[None], per_side)
+            layers.append(Layer(
+                SeenSheet(seen.number, box, plane), seen.edges,
+                np.column_stack([points, np.zeros(len(points))]), start, stop,
+            ))
+    return layers
+
+
+# --------------------------------------------------------------------------------------------------
+# The exact image, unquantised.
 
 SHARP_PANEL_PX = 3 / 16
 """Path of a corner between groups of three instants: the error at kinks of the mean over the
@@ -67,86 +514,86 @@ class Shutter(NamedTuple):
     middle_row: float
     panels: int
 
-
 def marker_exposure(
-    scenes: Scenes, row: int, box: Box, levels: Floats, added_px: float = 0.0
+    scenes: Scenes, row: int, box: Box, levels: Floats, blurred: bool = False, beside: bool = False
 ) -> Floats:
     """Return the levels (height, width) of ``box``, from levels (4,) of the four areas.
 
-    The areas are outside, black, white and the occluding sheet. ``added_px`` is a Gaussian's
-    standard deviation that the point spread is widened by, in quadrature.
+    The areas are outside, black, white and the occluding sheet. With ``blurred`` it is the image
+    that sharpening subtracts; with ``beside`` only what stands beside the target is drawn. Each
+    sheet has the point spread of its own depth: where one hides another, the spreads of both meet
+    at the edge.
     """
-    effect = scenes.effect(row)
-    if scenes.solid[row]:
-        return _solid_exposure(scenes, row, box, levels, math.hypot(effect["blur_px"], added_px))
-    key = scenes.target(row)
-    outlines = (
-        occluded_edges(key, effect["occlusion"], effect["occlusion_deg"])
-        if effect["occlusion"] > 0 else edges_of(key)
-    )
-    motion = scenes.motion(row)
-    wanted = defocus_px(scenes, row, box, added_px)
-    spread, varies = _spreads(wanted)
-    even = not varies and math.isnan(effect["aperture_mm"])
-    sheet = scene_sheet(scenes, row)
-    if motion is None and even and sheet is not None:
-        image = np.empty((box[3] - box[1], box[2] - box[0]))
-        cover = np.zeros((image.shape[0], image.shape[1] + 2))
-        coverage.accumulate_curved(
-            cover, outlines, levels, scenes.projection(row), box[0], box[1], spread[0], sheet
-        )
-        coverage.sum_levels(cover, levels[0], image)
-        return image
-    if motion is None and even and not scenes.cameras.distorted[row]:
-        # The same blur everywhere: without the functions of moving markers, and compiling them.
-        image = np.empty((box[3] - box[1], box[2] - box[0]))
-        cover = np.zeros((image.shape[0], image.shape[1] + 2))
-        coverage.accumulate(
-            cover, outlines, levels, scenes.projection(row), box[0], box[1], spread[0]
-        )
-        coverage.sum_levels(cover, levels[0], image)
-        return image
-    path = path_px(scenes, row, box)
-    shape = (len(spread), box[3] - box[1], box[2] - box[0])
-    images = np.empty(shape)
-    cover = np.zeros((shape[1], shape[2] + 2))
-    exposure_s, row_time_s, velocity = (0.0, 0.0, np.zeros(6)) if motion is None else motion
-    marker = moving_marker(scenes, row, velocity)
-    for image, sigma in zip(images, spread, strict=True):
-        panel = max(SHARP_PANEL_PX, 1.5 * sigma)
-        panels = math.ceil(min(path / panel, MAX_PANELS if row_time_s == 0 else MAX_ROW_PANELS))
-        shutter = Shutter(exposure_s, row_time_s, (scenes.frame[row, 1] - 1) / 2, panels)
-        _expose(
-            cover, marker, outlines, levels, shutter, box[0], box[1], sigma,
-            FLAT if sheet is None else sheet, sheet is not None,
-        )
-        coverage.sum_levels(cover, levels[0], image)
-    if not varies:
-        return np.asarray(images[0])
-    return _focused(images, np.array(spread), wanted)
-
-
-def _solid_exposure(
-    scenes: Scenes, row: int, box: Box, levels: Floats, blur_px: float
-) -> Floats:
-    """As :func:`marker_exposure`, of a board in several planes at rest, blurred evenly."""
     shape = (box[3] - box[1], box[2] - box[0])
-    wanted = np.full(shape, blur_px)
-    spread, varies = _spreads(wanted)
-    images = np.empty((len(spread), *shape))
-    for image, sigma in zip(images, spread, strict=True):
-        cover = np.zeros((shape[0], shape[1] + 2))
-        accumulate_solid(cover, scenes, row, levels[:3], box, sigma)
-        coverage.sum_levels(cover, levels[0], image)
-    return _focused(images, np.array(spread), wanted) if varies else np.asarray(images[0])
+    if 0 in shape:
+        return np.empty(shape)
+    optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
+    curved = is_curved(bend)
+    exposure_s, row_time_s, velocity = scenes.motion(row) or (0.0, 0.0, np.zeros(6))
+    moves, height = bool(velocity.any()), int(scenes.frame[row, 1])
+    motion = Motion(scenes.translation[row], velocity)
+    layers = _layers(
+        scenes, row, velocity, *row_times(box[1], box[3], height, exposure_s, row_time_s), beside
+    )
+    path = 0.0
+    if exposure_s > 0:
+        path = max(
+            _path_px(scenes, row, velocity,
+                     *row_times(line, line + 1, height, exposure_s, row_time_s))
+            for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1)
+        )
+    cover = np.zeros((shape[0], shape[1] + 2))
+
+    def draw(some: list[Layer], sigma: float, outside: float) -> Floats:
+        """Return the image of layers with one point spread, over the level outside."""
+        most = MAX_PANELS if row_time_s == 0 else MAX_ROW_PANELS
+        panels = math.ceil(min(path / max(SHARP_PANEL_PX, 1.5 * sigma), most))
+        shutter = Shutter(exposure_s, row_time_s, (height - 1) / 2, panels)
+        for layer in some:
+            projection = Projection(layer.sheet.plane, optics)
+            if moves:
+                _expose(
+                    cover, MovingMarker(projection, motion, layer.outline, flat=True), layer.edges,
+                    levels, shutter, (layer.begin_s, layer.end_s), box[0], box[1], sigma, bend,
+                    curved,
+                )
+            elif curved:
+                coverage.accumulate_curved(
+                    cover, layer.edges, levels, projection, box[0], box[1], sigma, bend
+                )
+            else:
+                coverage.accumulate(
+                    cover, layer.edges, levels, projection, box[0], box[1], sigma
+                )
+        image = np.empty(shape)
+        coverage.sum_levels(cover, outside, image)
+        return image
+
+    def focused(some: list[Layer], wanted: Floats, outside: float) -> Floats:
+        """Return the image of layers whose point spreads (height, width) are ``wanted``."""
+        spreads, varies = _spreads(wanted)
+        images = np.array([draw(some, sigma, outside) for sigma in spreads])
+        return _focused(images, np.array(spreads), wanted) if varies else images[0]
+
+    if math.isnan(scenes.effects["aperture_mm"][row]):
+        even = np.full(shape, spread_px(scenes, row, np.zeros(1), blurred)[0])
+        return focused(layers, even, float(levels[0]))
+    sheets = {layer.sheet.number: layer.sheet for layer in layers}
+    parts: list[Floats] = []
+    for number, sheet in sheets.items():
+        some = [layer for layer in layers if layer.sheet.number == number]
+        wanted = defocus_px(scenes, row, sheet, box, blurred)
+        parts.append(focused(some, wanted, 0.0 if parts else float(levels[0])))
+    return np.sum(parts, axis=0) if parts else np.full(shape, levels[0])
 
 
 @compiled
 def _expose(
     cover: Floats, marker: MovingMarker, edges: coverage.MarkerEdges, levels: Floats,
-    shutter: Shutter, left: int, top: int, sigma: float, sheet: Sheet, curved: bool,
+    shutter: Shutter, during: tuple[float, float], left: int, top: int, sigma: float,
+    sheet: Sheet, curved: bool,
 ) -> None:
-    """Add a marker's edges to ``cover``, averaged over each row's exposure.
+    """Add a marker's edges to ``cover``, averaged over each row's exposure, as far as ``during``.
 
     By three Gauss-Legendre nodes on each part of the exposure. Instants at which the exposed rows
     see no part of the marker cost next to nothing.
@@ -162,6 +609,8 @@ def _expose(
                 if panels == 0:
                     offset, weight = 0.5, 1.0
                 instant = begin + shutter.exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
+                if not during[0] <= instant < during[1]:
+                    continue
                 plane = (
                     moved_plane(projection.plane, marker.motion, instant) if instant != 0.0
                     else projection.plane
@@ -195,25 +644,6 @@ def _is_seen(
         and extent[2] - left > -margin and extent[0] - left < width + margin
         and extent[3] - top > -margin and extent[1] - top < height + margin
     )
-
-
-def defocus_px(scenes: Scenes, row: int, box: Box, added_px: float = 0.0) -> Floats:
-    """Return the point spread's standard deviation (height, width) at the marker's depth.
-
-    The depth is that of the marker's plane (of a bent one, the tangent plane at its centre) in each
-    pixel's direction; its inverse is linear in the
-    image. ``added_px`` widens the point spread, in quadrature.
-    """
-    fx, fy, cx, cy = scenes.cameras.view[row]
-    normal = scenes.rotation[row][:, 2]
-    x = (np.arange(box[0], box[2]) - cx) / fx
-    y = (np.arange(box[1], box[3]) - cy) / fy
-    inverse = (normal[0] * x + normal[1] * y[:, None] + normal[2]) / (
-        normal @ scenes.translation[row]
-    )
-    # Beyond the marker its plane may come near the camera, or end; nothing is blurred there.
-    depth = corner_depths(scenes, row)
-    return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()), added_px)
 
 
 def _spreads(wanted: Floats) -> tuple[list[float], bool]:
@@ -251,118 +681,3 @@ def _focused(images: Floats, spread: Floats, wanted: Floats) -> Floats:
         share = np.minimum(wanted / spread[1], 1.0)
         image = (1 - share) * images[0] + share * image
     return image
-
-
-# --------------------------------------------------------------------------------------------------
-# The image by brute force: N x N samples a pixel, each traced back through lens and pose.
-
-class SampledMarker(NamedTuple):
-    """A marker or a board as its samples see it.
-
-    Attributes
-    ----------
-    modules
-        (n, n) True for white; (0, 0) of a board.
-    quiet
-        Width of the quiet zone in modules.
-    outlines
-        (E, 6) of a board: ends of its edges, and the code of the areas on their two sides.
-    prints
-        (P, 6) of a board: first and past-the-end row of each print's edges, and left, top, right,
-        bottom of the print.
-    levels
-        (3,) grey levels of outside, black and white.
-    inverse
-        (3, 3) takes undistorted normalised image coordinates to module coordinates.
-    optics
-        The camera.
-    """
-
-    modules: NDArray[np.bool_]
-    quiet: float
-    outlines: Floats
-    prints: Floats
-    levels: Floats
-    inverse: Floats
-    optics: Optics
-
-
-@compiled
-def _unit(key: int) -> float:
-    """Return a number in [0, 1) that depends on ``key`` alone."""
-    bits = mixed(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15))
-    return np.float64(bits >> np.uint64(11)) * 2.0**-53
-
-
-@compiled
-def _on_board(column: float, line: float, marker: SampledMarker) -> tuple[float, float]:
-    """Return the level of a board's point, beside the board 0, and whether the board has it.
-
-    The sum of the jumps at the edges to the left of the point, of the prints around it.
-    """
-    levels = marker.levels
-    level, inside = 0.0, 0.0
-    for each in marker.prints:
-        if not (each[2] <= column < each[4] and each[3] <= line < each[5]):
-            continue
-        for k in range(int(each[0]), int(each[1])):
-            x0, y0, x1, y1 = marker.outlines[k, :4]
-            if not min(y0, y1) <= line < max(y0, y1):
-                continue
-            if x0 + (x1 - x0) * (line - y0) / (y1 - y0) <= column:
-                down = 1.0 if y1 > y0 else -1.0
-                a, b = int(marker.outlines[k, 4]), int(marker.outlines[k, 5])
-                level += down * ((levels[b] if b > 0 else 0.0) - (levels[a] if a > 0 else 0.0))
-                inside += down * (min(b, 1) - min(a, 1))
-    return level, inside
-
-
-@compiled
-def supersample(
-    mean: Floats, share: Floats, marker: SampledMarker, per_side: int, jittered: bool, left: int,
-    top: int,
-) -> None:
-    """Write the mean level of the marker's samples to ``mean`` and their share to ``share``.
-
-    Both are (height, width), of the box whose top left pixel is (``left``, ``top``). ``mean``
-    counts samples beside the marker as level 0, so that a pixel's level is
-    ``mean + (1 - share) * background``. Samples lie in the middle of N x N cells of the pixel or,
-    if ``jittered``, at random within them.
-    """
-    modules, quiet, _, _, levels, inverse, optics = marker
-    intrinsics, lens = optics.intrinsics, optics.lens
-    n = modules.shape[0]
-    total = per_side * per_side
-    for i in range(mean.shape[0]):
-        for j in range(mean.shape[1]):
-            level, hits = 0.0, 0.0
-            for k in range(total):
-                offset_x, offset_y = 0.5, 0.5
-                if jittered:
-                    key = (((top + i) * 131072 + left + j) * total + k) * 2 + 1
-                    offset_x, offset_y = _unit(key), _unit(key + 1)
-                u = left + j - 0.5 + (k % per_side + offset_x) / per_side
-                v = top + i - 0.5 + (k // per_side + offset_y) / per_side
-                x, y = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1]
-                if optics.distorted:
-                    x, y, converged = undistort(x, y, lens)
-                    if not converged:
-                        continue
-                w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-                if not w > 0.0:
-                    continue
-                column = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
-                line = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
-                if n == 0:
-                    seen, inside = _on_board(column, line, marker)
-                    level, hits = level + seen, hits + inside
-                    continue
-                if not (-quiet <= column < n + quiet and -quiet <= line < n + quiet):
-                    continue
-                hits += 1
-                white = True
-                if 0.0 <= column < n and 0.0 <= line < n:
-                    white = modules[int(line), int(column)]
-                level += levels[2] if white else levels[1]
-            mean[i, j] = level / total
-            share[i, j] = hits / total

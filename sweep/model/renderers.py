@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import threading
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.compilation import compiled
 from sweep.model import coverage, lens
-from sweep.model import coverage as drawing
-from sweep.model.board import Board, edges_on_sheet
+from sweep.model.board import Board, edge_table, edges_of, edges_on_sheet, extent_of, unit_m
 from sweep.model.effects import POINTWISE, SWITCHES, MarkerView, Patch, apply_pointwise, is_coded
-from sweep.model.exposure import SampledMarker, marker_exposure, supersample
+from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
 from sweep.model.polygon import Optics, Projection
-from sweep.model.printed import edge_table, edges_of, extent_of, own_sheets, unit_m
 from sweep.model.scene import RENDERERS, SUPERSAMPLE, Box, Scenes
-from sweep.model.scene_sheet import accumulate_solid
 from sweep.model.sensor import (
     BLOCK_PX,
-    REACH_PX,
     Light,
     Readout,
     add_noise,
@@ -61,16 +58,16 @@ PROCESSING = {
 def sensed_window(scenes: Scenes, row: int, window: Box) -> Box:
     """Return the pixels that must be computed for those of ``window`` to be the frame's own.
 
-    Whole blocks of JPEG, counted from the frame's corner, and around them what demosaicing needs,
-    from an even column and row on; clipped at the frame.
+    Whole blocks of the effects that have them, counted from the frame's corner, and around them
+    what demosaicing needs, from an even column and row on; clipped at the frame.
     """
-    effect = scenes.effect(row)
-    if effect["jpeg_quality"] > 0:
-        window = _aligned(scenes, row, window, BLOCK_PX)
-    if effect["bayer"] > 0:
-        left, top, right, bottom = window
-        padded = left - REACH_PX, top - REACH_PX, right + REACH_PX, bottom + REACH_PX
-        window = _aligned(scenes, row, padded, 2)
+    for effect in reversed(scenes.effects.active_in(row)):
+        if effect.reach_px or effect.block_px > 1:
+            left, top, right, bottom = window
+            window = _aligned(scenes, row, (
+                left - effect.reach_px, top - effect.reach_px,
+                right + effect.reach_px, bottom + effect.reach_px,
+            ), max(effect.block_px, 2))
     return window
 
 
@@ -96,13 +93,13 @@ def sensed(
 
     ``computed`` is :func:`sensed_window` of ``window``. Both arrays are overwritten.
     """
-    effect = scenes.effect(row)
+    effect = scenes.effects.of(row)
     left, top = computed[:2]
     _fall_off(levels, scenes, row, effect, left, top)
-    plugged = (*POINTWISE, *scenes.plugins.effects)
+    plugged = (*POINTWISE, *scenes.effects.plugins.effects)
     patch = Patch(
         effect, left, top, (int(scenes.frame[row, 0]), int(scenes.frame[row, 1])),
-        scenes.cameras.view[row], scenes.noise_key[row],
+        scenes.cameras.view[row], scenes.effects.noise_key[row],
     )
     if overshoot is not None:
         _fall_off(overshoot, scenes, row, effect, left, top)
@@ -111,8 +108,8 @@ def sensed(
         overshoot = sharp - apply_pointwise(plugged, "light", levels, patch)
     levels = apply_pointwise(plugged, "light", levels, patch)
     readout = Readout(
-        scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],
-        effect["noise_grey"], int(effect["bit_depth"]),
+        scenes.effects.noise_key[row], effect["full_well_e"], effect["read_noise_e"],
+        effect["gain"], effect["noise_grey"], int(effect["bit_depth"]),
     )
     image = np.empty(levels.shape, dtype=np.uint8)
     processed = any(effect[name] != off for name, off in PROCESSING.items())
@@ -175,7 +172,8 @@ def _rendition(
     effect = patch.values
     if effect["bayer"] > 0:
         levels = demosaiced(
-            levels, scenes.meaning("bayer", effect), scenes.meaning("demosaic", effect),
+            levels, scenes.effects.meaning("bayer", effect),
+            scenes.effects.meaning("demosaic", effect),
             effect["bayer_red"], effect["bayer_blue"],
         )
     if overshoot is not None:
@@ -184,7 +182,7 @@ def _rendition(
     if tone != (1.0, 0.0, 0.0):
         apply_tone(levels, *tone)
     if effect["noise_table"] > 0:
-        spread = deviations(levels, scenes.meaning("noise_table", effect))
+        spread = deviations(levels, scenes.effects.meaning("noise_table", effect))
         field = normal_field(
             patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
             effect["noise_correlation"],
@@ -209,7 +207,7 @@ def background_image(path: str) -> Grey:
 
 
 def quantise(levels: NDArray[np.float64]) -> Grey:
-    """Return grey levels rounded to 8 bits (half up, as ``drawing.sum_grey``) and clipped."""
+    """Return grey levels rounded to 8 bits (half up, as ``coverage.sum_grey``) and clipped."""
     shifted = levels + (0.5 + coverage.ROUNDING_SNAP)
     return np.clip(shifted, 0.0, 255.0).astype(np.uint8)
 
@@ -246,7 +244,7 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
     """Return the image of a scene with any renderer and any background."""
     asked = window[0], window[1], window[2], window[3]
     left, top, right, bottom = computed = (
-        sensed_window(scenes, row, asked) if scenes.affected[row] else asked
+        sensed_window(scenes, row, asked) if scenes.effects.active[row] else asked
     )
     x0, y0, x1, y1 = box
     inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
@@ -260,17 +258,17 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
         image = background_image(background)[top:bottom, left:right].copy()
     else:
         image = np.full((bottom - top, right - left), quantise(np.array(background)))
-    if scenes.affected[row]:
+    if scenes.effects.active[row]:
         behind = image if isinstance(background, str) else float(background)
         levels = np.empty(image.shape)
         levels[:] = behind
         overshoot = None
-        effect = scenes.effect(row)
+        effect = scenes.effects.of(row)
         if x1 > x0:
             marker_box = (x0, y0, x1, y1)
             plain = _exposed(scenes, row, marker_box, levels[inner])
             if effect["sharpening"] != 0:
-                wide = _exposed(scenes, row, marker_box, levels[inner], effect["sharpening_px"])
+                wide = _exposed(scenes, row, marker_box, levels[inner], blurred=True)
                 overshoot = np.zeros(image.shape)
                 overshoot[inner] = effect["sharpening"] * (plain - wide)
             levels[inner] = plain
@@ -289,22 +287,16 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
 
 
 def _exposed(
-    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64], added_px: float = 0.0
+    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64], blurred: bool = False
 ) -> NDArray[np.float64]:
     """Return the levels (h, w) of ``box`` over those ``behind`` it, with the effects on edges.
 
-    ``added_px`` is a Gaussian's standard deviation by which the marker is blurred once more.
+    With ``blurred`` those that sharpening subtracts.
     """
-    if scenes.renderer[row] != "exact":
-        mean, share = marker_levels(scenes, row, box)
-    else:
-        _, black, white = scenes.levels[row].tolist()
-        sheet = scenes.effect(row)["occluder"]
-        if not isinstance(scenes.background[row], str):
-            areas = np.array([scenes.levels[row, 0], black, white, sheet])
-            return marker_exposure(scenes, row, box, areas, added_px)
-        mean = marker_exposure(scenes, row, box, np.array([0.0, black, white, sheet]), added_px)
-        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]), added_px)
+    if scenes.renderer[row] == "exact" and not isinstance(scenes.background[row], str):
+        areas = np.array([*scenes.levels[row], scenes.effects["occluder"][row]])
+        return marker_exposure(scenes, row, box, areas, blurred)
+    mean, share = marker_levels(scenes, row, box, blurred)
     return np.asarray(mean + (1.0 - share) * behind)
 
 
@@ -318,13 +310,13 @@ def _draw(
     images = np.empty(stops[-1], dtype=np.uint8)
     box = boxes[:, 2:] - boxes[:, :2]
     scratch = _scratch(int(((box[:, 0] + 2) * box[:, 1]).max()))
-    table, spans = edge_table(scenes.markers)
+    table, spans = edge_table(scenes.targets.boards)
     cameras = scenes.cameras
-    drawing.draw_greys(
-        drawing.Canvas(images, starts, windows, boxes, scratch),
-        drawing.DrawnScenes(
-            table, spans, scenes.marker, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
-            cameras.distorted,
+    coverage.draw_greys(
+        coverage.Canvas(images, starts, windows, boxes, scratch),
+        coverage.DrawnScenes(
+            table, spans, scenes.targets.number, scenes.levels, scenes.plane, cameras.view,
+            cameras.lenses, cameras.distorted,
         ),
         rows,
     )
@@ -347,7 +339,7 @@ def _scratch(size: int) -> NDArray[np.float64]:
 
 
 def marker_levels(
-    scenes: Scenes, row: int, box: Box
+    scenes: Scenes, row: int, box: Box, blurred: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the marker's levels before quantisation, and its share of each pixel of ``box``.
 
@@ -355,13 +347,13 @@ def marker_levels(
     """
     renderer = scenes.renderer[row]
     height, width = box[3] - box[1], box[2] - box[0]
-    if renderer in scenes.plugins.renderers:
-        return scenes.plugins.renderers[renderer](_marker_view(scenes, row, box))
+    if renderer in scenes.effects.plugins.renderers:
+        return scenes.effects.plugins.renderers[renderer](_marker_view(scenes, row, box))
     mean, share = np.empty((height, width)), np.empty((height, width))
     if renderer == "exact":
-        levels = np.array([0.0, scenes.levels[row, 1], scenes.levels[row, 2]])
-        coverage.sum_levels(_cover(scenes, row, box, levels), 0.0, mean)
-        coverage.sum_levels(_cover(scenes, row, box, np.array([0.0, 1.0, 1.0])), 0.0, share)
+        areas = np.array([0.0, *scenes.levels[row, 1:], scenes.effects["occluder"][row]])
+        mean = marker_exposure(scenes, row, box, areas, blurred)
+        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]), blurred)
     elif renderer == "warp":
         _warp_levels(scenes, row, box, mean, share)
     else:
@@ -384,13 +376,13 @@ def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
     key = scenes.target(row)
     inverse = np.linalg.inv(scenes.plane[row])
     levels, optics = scenes.levels[row], scenes.cameras.optics(row)
-    if not key.is_marker:
+    if key.margin is None:
         return SampledMarker(_NO_MODULES, 0.0, *_board_table(key), levels, inverse, optics)
     beyond = overhang(key.dictionary)
     inverse[:2] += beyond * inverse[2]
     bits = modules(key.dictionary, key.marker_ids[0])
     return SampledMarker(
-        bits, float(scenes.margin[row] - beyond), _NO_EDGES, _NO_EDGES, levels, inverse, optics
+        bits, key.margin - beyond, _NO_EDGES, _NO_EDGES, levels, inverse, optics
     )
 
 
@@ -412,29 +404,15 @@ def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
     """Return the marker of a scene as renderers of plug-ins get it."""
     _, black, white = scenes.levels[row].tolist()
     distorted = bool(scenes.cameras.distorted[row])
-    beyond = overhang(scenes.dictionary[row])
+    key = scenes.target(row)
+    beyond = overhang(key.dictionary)
     from_whole = np.array([[1.0, 0.0, -beyond], [0.0, 1.0, -beyond], [0.0, 0.0, 1.0]])
     return MarkerView(
-        np.array(modules(scenes.dictionary[row], scenes.marker_id[row])),
-        float(scenes.margin[row]) - beyond, black, white, scenes.plane[row] @ from_whole,
+        np.array(modules(key.dictionary, key.marker_ids[0])),
+        (key.margin or 0.0) - beyond, black, white, scenes.plane[row] @ from_whole,
         scenes.cameras.matrix(row), scenes.cameras.lenses[row, :14].copy() if distorted else None,
-        box, {name: float(scenes.plugin_values[name][row]) for name in scenes.plugins.settings},
+        box, {name: float(column[row]) for name, column in scenes.effects.settings.items()},
     )
-
-
-def _cover(
-    scenes: Scenes, row: int, box: Box, levels: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
-    cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
-    if scenes.solid[row]:
-        accumulate_solid(cover, scenes, row, levels, box, 0.0)
-        return cover
-    outlines = edges_of(scenes.target(row))
-    coverage.accumulate(
-        cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0
-    )
-    return cover
 
 
 @lru_cache(maxsize=1024)
@@ -551,6 +529,121 @@ def _warp_levels(
 
 
 # --------------------------------------------------------------------------------------------------
+# The image by brute force: N x N samples a pixel, each traced back through lens and pose.
+
+class SampledMarker(NamedTuple):
+    """A marker or a board as its samples see it.
+
+    Attributes
+    ----------
+    modules
+        (n, n) True for white; (0, 0) of a board.
+    quiet
+        Width of the quiet zone in modules.
+    outlines
+        (E, 6) of a board: ends of its edges, and the code of the areas on their two sides.
+    prints
+        (P, 6) of a board: first and past-the-end row of each print's edges, and left, top, right,
+        bottom of the print.
+    levels
+        (3,) grey levels of outside, black and white.
+    inverse
+        (3, 3) takes undistorted normalised image coordinates to module coordinates.
+    optics
+        The camera.
+    """
+
+    modules: NDArray[np.bool_]
+    quiet: float
+    outlines: Floats
+    prints: Floats
+    levels: Floats
+    inverse: Floats
+    optics: Optics
+
+
+@compiled
+def _unit(key: int) -> float:
+    """Return a number in [0, 1) that depends on ``key`` alone."""
+    bits = coverage.mixed(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15))
+    return np.float64(bits >> np.uint64(11)) * 2.0**-53
+
+
+@compiled
+def _on_board(column: float, line: float, marker: SampledMarker) -> tuple[float, float]:
+    """Return the level of a board's point, beside the board 0, and whether the board has it.
+
+    The sum of the jumps at the edges to the left of the point, of the prints around it.
+    """
+    levels = marker.levels
+    level, inside = 0.0, 0.0
+    for each in marker.prints:
+        if not (each[2] <= column < each[4] and each[3] <= line < each[5]):
+            continue
+        for k in range(int(each[0]), int(each[1])):
+            x0, y0, x1, y1 = marker.outlines[k, :4]
+            if not min(y0, y1) <= line < max(y0, y1):
+                continue
+            if x0 + (x1 - x0) * (line - y0) / (y1 - y0) <= column:
+                down = 1.0 if y1 > y0 else -1.0
+                a, b = int(marker.outlines[k, 4]), int(marker.outlines[k, 5])
+                level += down * ((levels[b] if b > 0 else 0.0) - (levels[a] if a > 0 else 0.0))
+                inside += down * (min(b, 1) - min(a, 1))
+    return level, inside
+
+
+@compiled
+def supersample(
+    mean: Floats, share: Floats, marker: SampledMarker, per_side: int, jittered: bool, left: int,
+    top: int,
+) -> None:
+    """Write the mean level of the marker's samples to ``mean`` and their share to ``share``.
+
+    Both are (height, width), of the box whose top left pixel is (``left``, ``top``). ``mean``
+    counts samples beside the marker as level 0, so that a pixel's level is
+    ``mean + (1 - share) * background``. Samples lie in the middle of N x N cells of the pixel or,
+    if ``jittered``, at random within them.
+    """
+    modules, quiet, _, _, levels, inverse, optics = marker
+    intrinsics, distortion = optics.intrinsics, optics.lens
+    n = modules.shape[0]
+    total = per_side * per_side
+    for i in range(mean.shape[0]):
+        for j in range(mean.shape[1]):
+            level, hits = 0.0, 0.0
+            for k in range(total):
+                offset_x, offset_y = 0.5, 0.5
+                if jittered:
+                    key = (((top + i) * 131072 + left + j) * total + k) * 2 + 1
+                    offset_x, offset_y = _unit(key), _unit(key + 1)
+                u = left + j - 0.5 + (k % per_side + offset_x) / per_side
+                v = top + i - 0.5 + (k // per_side + offset_y) / per_side
+                x, y = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1]
+                if optics.distorted:
+                    x, y, converged = lens.undistort(x, y, distortion)
+                    if not converged:
+                        continue
+                w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+                if not w > 0.0:
+                    continue
+                column = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
+                line = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
+                if n == 0:
+                    seen, inside = _on_board(column, line, marker)
+                    level, hits = level + seen, hits + inside
+                    continue
+                if not (-quiet <= column < n + quiet and -quiet <= line < n + quiet):
+                    continue
+                hits += 1
+                white = True
+                if 0.0 <= column < n and 0.0 <= line < n:
+                    white = modules[int(line), int(column)]
+                level += levels[2] if white else levels[1]
+            mean[i, j] = level / total
+            share[i, j] = hits / total
+
+
+# --------------------------------------------------------------------------------------------------
 # Which pixels show what stands beside a target.
 
 _SHARE = 1e-9
@@ -566,26 +659,6 @@ def beside_pixels(scenes: Scenes, row: int, box: Box) -> Masks:
     key = scenes.target(row)
     if not key.distractors:
         return np.zeros((box[3] - box[1], box[2] - box[0]), dtype=bool)
-    if scenes.solid[row]:
-        sigma = scenes.effect(row)["blur_px"] if scenes.affected[row] else 0.0
-        cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
-        area = np.array([0.0, 1.0, 1.0])
-        accumulate_solid(cover, scenes, row, area, box, sigma, own_sheets(key))
-        share = np.empty((box[3] - box[1], box[2] - box[0]))
-        coverage.sum_levels(cover, 0.0, share)
-        return _touched(share)
-    alone = dataclasses.replace(key, prints=key.distractors, distractors=())
-    others = dataclasses.replace(
-        scenes, renderer=["exact"] * len(scenes),
-        markers=tuple(alone if each is key else each for each in scenes.markers),
-    )
-    if scenes.affected[row]:
-        share = marker_exposure(others, row, box, np.array([0.0, 1.0, 1.0, 0.0]))
-    else:
-        _, share = marker_levels(others, row, box)
-    return _touched(share)
-
-
-def _touched(share: Floats) -> Masks:
+    share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 0.0]), beside=True)
     touched = (np.abs(share) > _SHARE).astype(np.uint8)
     return np.asarray(cv2.dilate(touched, np.ones((3, 3), dtype=np.uint8)) > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,19 +13,20 @@ from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.model import lens as lens_model
-from sweep.model.board import Board, single_marker
-from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
-from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, Effect, ScenePlugins
-from sweep.model.marker import marker_corners, overhang
-from sweep.model.polygon import Projection
-from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import (
+from sweep.model.board import (
+    Board,
     box_corners,
     boxes_px,
     extent_of,
     side_m,
     sides_m,
+    single_marker,
 )
+from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
+from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, Effect, ScenePlugins
+from sweep.model.marker import marker_corners, overhang
+from sweep.model.polygon import Projection
+from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -99,88 +100,72 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Scenes:
-    """N scenes as arrays.
+class Targets:
+    """What N scenes show: the distinct targets, and (N,) the number of each scene's."""
+
+    boards: tuple[Board, ...]
+    number: NDArray[np.int64]
+
+    def __getitem__(self, row: int) -> Board:
+        return self.boards[int(self.number[row])]
+
+    def each(self, read: Callable[[Board], Any]) -> NDArray[Any]:
+        """Return (N, ...) a property of each scene's target."""
+        return np.array([read(board) for board in self.boards])[self.number]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneEffects:
+    """The effects of N scenes: exposure, sensor and light.
 
     Attributes
     ----------
-    frame
-        (N, 2) width and height in pixels.
-    dictionary, marker_id, margin, renderer, background
-        One value for each scene. The margin is how far the marker extends beyond the square, in
-        modules: data outside it, and the quiet zone unless the background has its level.
-    markers, marker
-        The distinct targets, markers and boards, and (N,) the index of each
-        scene's.
-    modules
-        (N,) modules along the black square's side.
-    sheet, ink, origin
-        (N, 4) and (N, 2) in modules, as :class:`sweep.model.printed.Extent` has them.
-    size_m
-        (N,) side of the black square; of a board, of markers without a side of their own.
-    rotation, translation
-        (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
-    plane
-        (N, 3, 3) takes module coordinates (column, row, 1) of the printed marker, or a board's, to
-        the camera frame; of a bent one those of its tangent plane at the centre.
-    levels
-        (N, 3) grey levels of the background (0 if it is an image), black and white.
-    plain
-        (N,) whether the image is exact, on a background of one level, without effects.
-    effects, affected, noise_key
-        (N,) each: every parameter of the effects, NaN if not given (``effects`` is None if no
-        effect is active in any of the scenes), whether one is active, and the key of the noise.
+    values
+        (N,) each: every parameter of the effects, NaN if not given.
     coded
-        Parameter of an effect that is text or a list -> the values that the numbers in ``effects``
+        Parameter of an effect that is text or a list -> the values that the numbers in ``values``
         stand for.
-    plugins, plugin_values
+    active
+        (N,) whether an effect is active.
+    noise_key
+        (N,) keys of the noise.
+    plugins, settings
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
-    corners_px, outline_px
-        (N, 4, 2) images of the corners of the black square of ``size_m`` (of a board, of what is
-        black) and of all that is printed, beside a board too, both flat; NaN at z <= 0.
-    outline_m
-        (N, 4, 3) the latter's corners in the camera frame.
-    solid
-        (N,) whether markers are in several planes: the corners are of a rectangle about the image.
     """
 
-    cameras: Cameras
-    frame: NDArray[np.int64]
-    dictionary: Sequence[str]
-    marker_id: Sequence[int]
-    margin: Floats
-    markers: tuple[Board, ...]
-    marker: NDArray[np.int64]
-    modules: Floats
-    sheet: Floats
-    ink: Floats
-    origin: Floats
-    size_m: Floats
-    rotation: Floats
-    translation: Floats
-    plane: Floats
-    levels: Floats
-    corners_px: Floats
-    outline_px: Floats
-    outline_m: Floats
-    solid: NDArray[np.bool_]
-    renderer: Sequence[str]
-    background: Sequence[float | str]
-    plain: NDArray[np.bool_]
-    effects: Mapping[str, Floats] | None
-    affected: NDArray[np.bool_]
+    values: Mapping[str, Floats]
+    coded: Mapping[str, Sequence[Any]]
+    active: NDArray[np.bool_]
     noise_key: NDArray[np.uint64]
-    coded: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    plugins: ScenePlugins = NO_PLUGINS
-    plugin_values: Mapping[str, Floats] = field(default_factory=dict)
+    plugins: ScenePlugins
+    settings: Mapping[str, Floats]
 
-    def __len__(self) -> int:
-        return len(self.frame)
+    def __getitem__(self, name: str) -> Floats:
+        return self.values[name]
+
+    def of(self, row: int) -> dict[str, float]:
+        """Return the parameters of one scene."""
+        return {name: float(column[row]) for name, column in self.values.items()}
+
+    def meaning(self, name: str, effect: Mapping[str, float]) -> Any:
+        """Return the text or list that a number of :meth:`of` stands for."""
+        return self.coded[name][int(effect[name])]
+
+    def active_in(self, row: int) -> list[Effect]:
+        """Return the effects that are active in one scene."""
+        if not self.active[row]:
+            return []
+        return [
+            each for each in self.plugins.all_effects
+            if each.is_active(self.values[each.switch][row])
+        ]
 
     @property
     def noise_coarseness(self) -> NDArray[np.int64]:
         """0 for scenes without noise of pixels, 1 with it, 2 with coarse noise, (N,)."""
-        return self._any_active("noise") * (1 + self._any_worse("noise").astype(np.int64))
+        noisy = self._any_active(lambda effect: effect.widens == "noise")
+        coarse = self._any_active(lambda effect: "noise" in effect.worsens)
+        return noisy * (1 + coarse.astype(np.int64))
 
     @property
     def uneven_gain(self) -> Floats:
@@ -188,59 +173,104 @@ class Scenes:
 
         Infinite beside an effect that makes it steeper.
         """
-        if self.effects is None:
-            return np.zeros(len(self))
-        uneven = self._any_active("uneven light")
-        steep = self._any_worse("uneven light")
-        gain = np.where(steep, np.inf, np.maximum(self.effects["gain"], 1.0))
-        return np.where(uneven, gain, 0.0)
+        uneven = self._any_active(lambda effect: effect.widens == "uneven light")
+        steep = self._any_active(lambda effect: "uneven light" in effect.worsens)
+        return np.where(
+            uneven, np.where(steep, np.inf, np.maximum(self.values["gain"], 1.0)), 0.0
+        )
 
-    def _any_active(self, widens: str) -> NDArray[np.bool_]:
-        """Return whether an effect that widens the windows in this way is active, (N,)."""
-        return self._active(lambda effect: effect.widens == widens)
-
-    def _any_worse(self, worsened: str) -> NDArray[np.bool_]:
-        """Return whether an effect is active that makes noise or uneven light worse, (N,)."""
-        return self._active(lambda effect: worsened in effect.worsens)
-
-    def _active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
+    def _any_active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
         """Return whether one of the effects that are concerned is active, (N,)."""
-        active = np.zeros(len(self), dtype=bool)
-        for effect in self.plugins.all_effects:
-            if self.effects is not None and concerned(effect):
-                active |= effect.is_active(self.effects[effect.switch])
+        active = np.zeros(len(self.active), dtype=bool)
+        for effect in filter(concerned, self.plugins.all_effects):
+            active |= effect.is_active(self.values[effect.switch])
         return active
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """N scenes as arrays: cameras, targets and their poses, surroundings and effects.
+
+    Attributes
+    ----------
+    cameras, frame
+        The cameras, and (N, 2) width and height of their frames in pixels.
+    targets
+        What the scenes show, markers and boards.
+    size_m
+        (N,) side of the black square; of a board, of markers without a side of their own.
+    rotation, translation
+        (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
+    plane
+        (N, 3, 3) takes module coordinates (column, row, 1) of the printed marker, or a board's, to
+        the camera frame; of a bent one those of its tangent plane at the centre.
+    corners_px, outline_px
+        (N, 4, 2) images of the corners of the black square of ``size_m`` (of a board, of what is
+        black) and of all that is printed, beside a board too, both flat; NaN at z <= 0. Of targets
+        in several planes the corners are of a rectangle about the image.
+    outline_m
+        (N, 4, 3) the latter's corners in the camera frame.
+    levels
+        (N, 3) grey levels of the background (0 if it is an image), black and white.
+    renderer, background
+        One value for each scene.
+    effects
+        Motion, optics, light, sensor and processing.
+    """
+
+    cameras: Cameras
+    frame: NDArray[np.int64]
+    targets: Targets
+    size_m: Floats
+    rotation: Floats
+    translation: Floats
+    plane: Floats
+    corners_px: Floats
+    outline_px: Floats
+    outline_m: Floats
+    levels: Floats
+    renderer: Sequence[str]
+    background: Sequence[float | str]
+    effects: SceneEffects
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def dictionary(self) -> list[str]:
+        """The dictionary of each scene's markers."""
+        return [self.targets[row].dictionary for row in range(len(self))]
+
+    @property
+    def marker_id(self) -> list[int]:
+        """The ID of each scene's first marker."""
+        return [self.targets[row].marker_ids[0] for row in range(len(self))]
+
+    @property
+    def solid(self) -> NDArray[np.bool_]:
+        """Whether markers, or what is beside them, are in several planes, (N,)."""
+        return ~self.targets.each(lambda board: board.is_flat)
+
+    @property
+    def plain(self) -> NDArray[np.bool_]:
+        """Whether images are exact, of one plane on one level, without effects, (N,)."""
+        exact = [
+            name == "exact" and not isinstance(behind, str)
+            for name, behind in zip(self.renderer, self.background, strict=True)
+        ]
+        return np.array(exact, dtype=bool) & ~self.solid & ~self.effects.active
 
     def target(self, row: int) -> Board:
         """Return what one scene shows."""
-        return self.markers[int(self.marker[row])]
+        return self.targets[row]
 
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
         return Projection(self.plane[row], self.cameras.optics(row))
 
-    def effect(self, row: int) -> dict[str, float]:
-        """Return the effects' parameters of one scene."""
-        if self.effects is None:
-            raise ValueError("no effect is active")
-        return {name: float(column[row]) for name, column in self.effects.items()}
-
-    def meaning(self, name: str, effect: Mapping[str, float]) -> Any:
-        """Return the text or list that a number of :meth:`effect` stands for."""
-        return self.coded[name][int(effect[name])]
-
-    def active(self, row: int) -> list[str]:
-        """Return the switches of the effects that are active in one scene."""
-        if not self.affected[row]:
-            return []
-        effect = self.effect(row)
-        return [
-            each.switch for each in self.plugins.all_effects if each.is_active(effect[each.switch])
-        ]
-
     def motion(self, row: int) -> tuple[float, float, Floats] | None:
         """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""
-        effect = self.effect(row)
+        effect = self.effects.of(row)
         velocity = np.array([effect[name] for name in VELOCITIES])
         velocity[3:] = np.radians(velocity[3:])
         if not velocity.any() or effect["exposure_s"] == effect["row_time_s"] == 0.0:
@@ -320,17 +350,14 @@ def build_scenes(
         "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
         "occlusion",
     )
-    markers, marker = distinct(keys)
-    extents = [extent_of(key) for key in markers]
-    modules = np.array([each.modules for each in extents])[marker]
-    margin = np.array([-each.sheet[0] for each in extents])[marker]
-    sheet, ink, origin = (np.array([getattr(each, name) for each in extents])[marker]
-                          for name in ("sheet", "ink", "origin"))
-    side = sides_m(markers, marker, size)
+    targets = Targets(*distinct(keys))
+    modules = targets.each(lambda board: extent_of(board).modules)
+    sheet = targets.each(lambda board: extent_of(board).sheet)
+    side = sides_m(targets.boards, targets.number, size)
     printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
-    on_board = np.array([not each.is_marker for each in markers])[marker]
-    half[on_board] = margin[on_board] = 0.0
+    on_board = targets.each(lambda board: not board.is_marker)
+    half[on_board] = 0.0
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
     plane[:, :, 1] = -rotation[:, :, 1] * module[:, None]
@@ -338,17 +365,18 @@ def build_scenes(
         translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
     )
     square_m = marker_corners(size)
-    around_m = marker_corners(printed * (1 + 2 * margin / modules))
-    square_m[on_board] = box_corners(ink[on_board]) * (side / modules)[on_board, None, None]
+    around_m = marker_corners(printed * (1 + 2 * -sheet[:, 0] / modules))
+    ink = targets.each(lambda board: extent_of(board).ink)[on_board]
+    square_m[on_board] = box_corners(ink) * (side / modules)[on_board, None, None]
     around_m[on_board] = box_corners(sheet[on_board]) * module[on_board, None, None]
     outline_m = transform_points(around_m, rotation, translation)
     corners_px = cameras.project(transform_points(square_m, rotation, translation))
     outline_px = cameras.project(outline_m)
-    solid = np.array([not each.is_flat for each in markers])[marker]
+    solid = ~targets.each(lambda board: board.is_flat)
     for row in np.flatnonzero(solid).tolist():
         camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
         corners_px[row], outline_px[row] = boxes_px(
-            markers[marker[row]], camera, rotation[row], translation[row], scale
+            targets[row], camera, rotation[row], translation[row], scale
         )
 
     levels = np.stack(
@@ -359,51 +387,33 @@ def build_scenes(
         ],
         axis=1,
     )
-    effects, affected = None, np.zeros(count, dtype=bool)
+    own = [name for each in plugins.effects for name in each.parameters]
+    effects = {name: numbers(name) for name in (*PLAIN, *own)}
     coded: dict[str, Sequence[Any]] = {}
-    every = plugins.all_effects
-    if any(column(each.switch).differs_from(each.off) for each in every):
-        own = [name for each in plugins.effects for name in each.parameters]
-        effects = {name: numbers(name) for name in (*PLAIN, *own)}
-        for name in CODED:
-            coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
-            effects[name] = number[1:].astype(np.float64)
-        for each in every:
-            affected |= each.is_active(effects[each.switch])
-    plain = np.array(
-        mapped(lambda name, level: name == "exact" and not isinstance(level, str),
-               "renderer", "background"), dtype=bool,
-    ) & ~solid
+    for name in CODED:
+        coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
+        effects[name] = number[1:].astype(np.float64)
+    active = np.zeros(count, dtype=bool)
+    for each in plugins.all_effects:
+        active |= each.is_active(effects[each.switch])
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
-        dictionary=[key.dictionary for key in keys],
-        marker_id=[key.marker_ids[0] for key in keys],
-        margin=margin,
-        markers=markers,
-        marker=marker,
-        modules=modules,
-        sheet=sheet,
-        ink=ink,
-        origin=origin,
+        targets=targets,
         size_m=size,
         rotation=rotation,
         translation=translation,
         plane=plane,
-        levels=levels,
         corners_px=corners_px,
         outline_px=outline_px,
         outline_m=outline_m,
-        solid=solid,
+        levels=levels,
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),
-        plain=plain & ~affected,
-        effects=effects,
-        affected=affected,
-        noise_key=column("noise_key").broadcast(count, np.uint64),
-        coded=coded,
-        plugins=plugins,
-        plugin_values={name: numbers(name) for name in plugins.settings},
+        effects=SceneEffects(
+            effects, coded, active, column("noise_key").broadcast(count, np.uint64), plugins,
+            {name: numbers(name) for name in plugins.settings},
+        ),
     )
 
 

@@ -26,6 +26,9 @@ SUFFIX = ".npz"
 REJECTED = -1
 """The ID of a candidate that was not decoded."""
 
+OF_TARGET = -2
+"""The ID of a pose that is of the target as a whole, not of one of its markers."""
+
 VERSION = 1
 
 _ARRAYS = {
@@ -47,11 +50,12 @@ class Recording:
     image
         (M,) sorted keys of the images with the markers.
     marker_id
-        (M,) IDs; :data:`REJECTED` for candidates that were not decoded.
+        (M,) IDs; :data:`REJECTED` for candidates that were not decoded, :data:`OF_TARGET` for poses
+        of the target as a whole.
     corners
         (M, 4, 2) px in the frame; NaN where only a pose was given.
     rotation, translation
-        (M, 3, 3) and (M, 3): poses, marker to camera, metres; NaN where only corners were given.
+        (M, 3, 3) and (M, 3): poses, target to camera, metres; NaN where only corners were given.
     """
 
     exported: NDArray[np.uint64]

@@ -533,7 +533,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
         # The store may be another machine's: as `sweep verify`, within the tolerances for those.
         difference = compare(inspected.values, stored, variables_of(data.pipeline),
-                             same_processor=False).difference
+                             same_processor=False)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")

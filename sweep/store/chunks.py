@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sweep.experiment.grid import Block, Blocks, scene_axes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import variables_of
-from sweep.store.layout import RECEIPTS, decoded_chunk, encoded_chunk
+from sweep.store.layout import RECEIPTS, packed
 
 
 def receipt_key(number: int) -> str:
@@ -85,42 +85,20 @@ class Chunks:
         inside = 0 <= number < len(self._blocks)
         return number if inside and self.key(name, number) == key else None
 
-    def encoded(self, name: str, number: int, values: NDArray[Any] | int) -> bytes:
-        """Return the content of a variable's chunk of a block, as Zarr writes it.
+    def encoded(self, name: str, values: NDArray[Any]) -> bytes:
+        """Return the content of a variable's chunk, as Zarr writes it.
 
-        ``values`` are the block's, in the variable's dimensions, or one for all of them. Beyond
-        the grid's end, a chunk has fill values.
+        ``values`` are the block's, in the variable's dimensions. Beyond the grid's end, a chunk has
+        fill values.
         """
         dtype, fill = self._types[name]
         shape = self._shapes[name]
         if np.shape(values) != shape:
             whole = np.full(shape, fill, dtype=dtype)
-            whole[self._within(name, number)] = values
+            whole[tuple(map(slice, np.shape(values)))] = values
             values = whole
-        return encoded_chunk(np.asarray(values, dtype=dtype))
-
-    def decoded(self, name: str, number: int, content: bytes) -> NDArray[Any]:
-        """Return the values of a block that a variable's chunk holds.
-
-        Raises
-        ------
-        ValueError, RuntimeError
-            If the chunk fails its checksum, or is of another size.
-        """
-        values = decoded_chunk(content, np.dtype(self._types[name][0]), self._shapes[name])
-        return values[self._within(name, number)]
-
-    def fill(self, name: str, number: int) -> NDArray[Any]:
-        """Return a block's values of a variable of which it has no chunk."""
-        dtype, fill = self._types[name]
-        return np.full(self._shapes[name], fill, dtype=dtype)[self._within(name, number)]
-
-    def _within(self, name: str, number: int) -> tuple[slice, ...]:
-        """Return the part of a variable's chunk that lies within the grid."""
-        part = [slice(length) for length in self._shapes[name]]
-        for at, length in zip(self._positions[name], self._blocks[number].shape, strict=True):
-            part[at] = slice(length)
-        return tuple(part)
+        little = np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<"))
+        return packed(little.tobytes())
 
     def _index(self, number: int) -> tuple[int, ...]:
         """Return a block's index along each scene axis."""

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import google_crc32c
 import numcodecs.zstd
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.buffer import cpu, default_buffer_prototype
 from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.metadata import ArrayV3Metadata
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
@@ -34,20 +35,20 @@ from sweep.experiment.schema import (
     with_description,
 )
 from sweep.model.image_file import IMAGE_SUFFIXES
-from sweep.store.files import sync
+from sweep.store.files import read_files, sync
 
-FORMAT = 6
+FORMAT = 7
 """Version of the layout of stores; another one is refused."""
 
 RECEIPTS = "commits/receipt"
 """Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
 
-DECODING_ATTRIBUTES = {
+READING_ATTRIBUTES = {
     "_ARRAY_DIMENSIONS", "_Encoding", "_FillValue", "_Unsigned", "add_offset", "bounds",
     "calendar", "cell_measures", "coordinates", "dtype", "formula_terms", "grid_mapping",
-    "missing_value", "scale_factor", "valid_max", "valid_min", "valid_range",
+    "missing_value", "scale_factor", "units", "valid_max", "valid_min", "valid_range",
 }
-"""Attributes by which xarray and other readers of CF data change the values that they return."""
+"""Attributes by which xarray, other readers of CF data, and people change the values they read."""
 
 COORDINATE_CHUNK = 1 << 20
 
@@ -113,60 +114,11 @@ class PlannedArray:
             stop = min(start + self.chunks[0], self.shape[0])
             yield f"{self.path}/c/{number}{rest}", slice(start, stop), self.values(start, stop)
 
-    def misfit(self, array: zarr.Array[Any]) -> str:
-        """Return how a stored array differs from this one; empty if it does not.
-
-        Of the attributes, only those are compared that change the values which readers return:
-        another version of sweep may write others, or word them otherwise.
-        """
-        metadata = array.metadata
-        if metadata.zarr_format != 3:
-            return "Zarr format 2, expected 3"
-        expected = {
-            "shape": self.shape,
-            "chunks": self.chunks,
-            "dtype": np.dtype(_dtype(self.dtype).to_native_dtype()),
-            "dimensions": self.dimensions,
-            "codecs": [codec.to_dict() for codec in codecs()],
-            "chunk keys": ("default", "/"),
-        }
-        keys = metadata.chunk_key_encoding.to_dict()
-        stored = {
-            "shape": array.shape,
-            "chunks": array.chunks if not array.shards else ("shards", array.shards),
-            "dtype": array.dtype,
-            "dimensions": tuple(metadata.dimension_names or ()),
-            "codecs": [codec.to_dict() for codec in metadata.codecs[1:]],
-            "chunk keys": (
-                keys["name"], cast("dict[str, Any]", keys.get("configuration", {})).get("separator")
-            ),
-        }
-        for name, value in expected.items():
-            if stored[name] != value:
-                return f"{name} {stored[name]}, expected {value}"
-        serializer = metadata.codecs[0].to_dict()
-        if serializer["name"] != ("vlen-utf8" if self.dtype == "string" else "bytes"):
-            return f"serializer {serializer['name']}"
-        if "big" in str(serializer.get("configuration")):
-            return "serializer big-endian, expected little"
-        decoding = dict(array.attrs).keys() & DECODING_ATTRIBUTES
-        if foreign := sorted(decoding - self.attributes.keys()):
-            return f"attribute {foreign[0]}: not one of a sweep store"
-        if array.attrs.get("units") != self.attributes.get("units"):
-            return f"units {array.attrs.get('units')}, expected {self.attributes.get('units')}"
-        if self.fill is not None and not _equal(metadata.fill_value, self.fill):
-            return f"fill value {metadata.fill_value}, expected {self.fill}"
-        return ""
-
 
 @cache
 def _dtype(name: str) -> Any:
     """Return Zarr's data type of a name; it looks through all that it knows, each time."""
     return parse_dtype(name, zarr_format=3)
-
-
-def _equal(a: Any, b: Any) -> bool:
-    return bool(a == b or (a != a and b != b))  # noqa: PLR0124  (NaN)
 
 
 def codecs() -> list[Any]:
@@ -179,30 +131,23 @@ def checksum_of(content: bytes) -> int:
     return int.from_bytes(content[-4:], "little")
 
 
-def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the values of a stored chunk of numbers.
-
-    Raises
-    ------
-    ValueError, RuntimeError
-        If it fails its checksum, or is of another size.
-    """
-    body = content[:-4]
-    if google_crc32c.value(body) != checksum_of(content):
-        raise ValueError("checksum")
-    values = np.empty(shape, dtype=dtype.newbyteorder("<"))
-    # Into memory of the right size, whatever size the content declares.
-    if numcodecs.zstd.decompress(body, values.reshape(-1)).nbytes != values.nbytes:
-        raise ValueError("size")
-    return values
+def packed(body: bytes) -> bytes:
+    """Return a chunk's content from its bytes before compression, as Zarr writes it."""
+    compressed = bytes(numcodecs.zstd.compress(body, ZSTD_LEVEL))
+    checksum: int = google_crc32c.value(compressed)
+    return compressed + checksum.to_bytes(4, "little")
 
 
-def encoded_chunk(values: NDArray[Any]) -> bytes:
-    """Return the content of a chunk of numbers, the same bytes as Zarr writes."""
-    little = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-    body = bytes(numcodecs.zstd.compress(little.reshape(-1), ZSTD_LEVEL))
-    checksum: int = google_crc32c.value(body)
-    return body + checksum.to_bytes(4, "little")
+def is_sound(content: bytes) -> bool:
+    """Return whether a chunk fits the checksum at its end."""
+    return bool(google_crc32c.value(content[:-4]) == checksum_of(content))
+
+
+def unpacked(content: bytes) -> bytes:
+    """Return the bytes that :func:`packed` took; ValueError or RuntimeError if damaged."""
+    if not is_sound(content):
+        raise ValueError("its checksum differs")
+    return bytes(numcodecs.zstd.decompress(content[:-4]))
 
 
 def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
@@ -356,19 +301,38 @@ def _fixed(fixed: FixedValue) -> PlannedArray:
     )
 
 
-def documents(planned: Iterable[PlannedArray]) -> dict[str, cpu.Buffer]:
+def documents(planned: Iterable[PlannedArray]) -> dict[str, dict[str, Any]]:
     """Return the metadata documents of a store with these arrays by key, except the root's."""
     memory = MemoryStore()
     group = zarr.open_group(memory, mode="w", zarr_format=3)
     for array in planned:
         array.create_empty(group)
 
-    async def gather() -> dict[str, cpu.Buffer]:
-        contents = {}
-        async for key in memory.list_prefix(""):
-            content = await memory.get(key, default_buffer_prototype())
-            if key.endswith("/zarr.json") and content is not None:
-                contents[key] = cpu.Buffer.from_bytes(content.to_bytes())
-        return contents
+    async def keys() -> list[str]:
+        return [key async for key in memory.list_prefix("") if key.endswith("/zarr.json")]
 
-    return sync(gather())
+    found = sync(keys())
+    return {key: json.loads(content or b"")
+            for key, content in zip(found, read_files(memory, found), strict=True)}
+
+
+def misfit(document: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
+    """Return how an array's metadata document differs from the expected one; empty if it fits.
+
+    Of the attributes, only those are compared that change the values which readers return:
+    another version of sweep may word the others differently.
+    """
+    try:
+        stored, wanted = (_schema(each) for each in (document, expected))
+    except Exception as error:  # a damaged or forged document may raise anything
+        return f"unreadable: {' '.join(str(error).split())[:200]}"
+    return next((f"{name} {stored.get(name)}, expected {wanted.get(name)}"
+                 for name in {**wanted, **stored} if stored.get(name) != wanted.get(name)), "")
+
+
+def _schema(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what decides how values are read, as this version of Zarr writes it."""
+    schema = ArrayV3Metadata.from_dict(dict(document)).to_dict()
+    attributes = dict(document.get("attributes", {}))
+    return {**schema, "attributes": {
+        name: attributes[name] for name in sorted(attributes.keys() & READING_ATTRIBUTES)}}

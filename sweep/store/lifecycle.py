@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import glob
 import json
@@ -21,7 +20,6 @@ import zarr
 import zarr.errors
 from zarr.abc.buffer import Buffer, BufferPrototype
 from zarr.abc.store import ByteRequest, Store
-from zarr.api import asynchronous
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
@@ -36,27 +34,35 @@ from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.blocks import (
     BEGUN,
     RunStore,
-    changed_draw,
     check_whole,
     committed,
     run_metadata_in,
 )
 from sweep.store.chunks import Chunks
 from sweep.store.files import (
-    absent_files,
     delete_files,
     list_folder,
+    parsed,
+    read_files,
     read_json,
     sync,
     write_document,
 )
-from sweep.store.layout import FORMAT, RECEIPTS, PlannedArray, codecs, planned_arrays
+from sweep.store.layout import (
+    FORMAT,
+    RECEIPTS,
+    PlannedArray,
+    codecs,
+    documents,
+    is_sound,
+    misfit,
+    planned_arrays,
+)
 from sweep.store.locations import (
     POINTER,
     check_writable,
     checked_url,
     is_remote,
-    is_run_id,
     not_a_store,
     open_group,
     open_storage,
@@ -66,7 +72,6 @@ from sweep.store.locations import (
 )
 from sweep.store.lock import changing, is_written
 from sweep.store.provenance import environment, fingerprint
-from sweep.store.receipt import are_counts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,62 +86,21 @@ GROUPS = ("commits", "cost", "failures")
 
 def schema_faults(store: RunStore) -> dict[str, str]:
     """Return the faults of a store's arrays by name: missing, unknown, or of another schema."""
-    planned = {
-        array.path: array
-        for array in planned_arrays(store.pipeline, store.blocks.extents)
-    }
+    expected = documents(planned_arrays(store.pipeline, store.blocks.extents))
+    arrays = {key.removesuffix("/zarr.json"): content for key, content in expected.items()}
+    listed = {key for key in sync(list_folder(store.storage, "")) if not key.startswith(".")}
+    names = sorted((listed | arrays.keys()) - {"zarr.json", *GROUPS})
+    contents = read_files(store.storage, [f"{name}/zarr.json" for name in names])
     faults: dict[str, str] = {}
-    present: set[str] = set()
-    with warnings.catch_warnings():
-        # Zarr warns of files that are not its own; they are no fault.
-        warnings.simplefilter("ignore")
-        keys = sync(list_folder(store.storage, ""))
-        names = sorted({key for key in keys if not key.startswith(".")} | {RECEIPTS})
-        for name, member in zip(names, sync(_members(store, names)), strict=True):
-            if isinstance(member, KeyError):
-                continue
-            present.add(name)
-            if isinstance(member, BaseException):
-                # A damaged or forged document may raise anything.
-                faults[name] = f"unreadable: {reason_of(member)}"
-            elif isinstance(member, zarr.AsyncGroup):
-                if name not in GROUPS:
-                    faults[name] = "not a group of a sweep store"
-            elif name not in planned:
-                faults[name] = "not an array of a sweep store"
-            elif misfit := _misfit(planned[name], zarr.Array(member)):
-                faults[name] = misfit
-    faults.update(dict.fromkeys(linked_arrays(store), "a link; a store holds its files itself"))
-    faults.update({name: "missing" for name in planned if name not in present})
+    for name, content in zip(names, contents, strict=True):
+        if name not in arrays:
+            if content is not None:
+                faults[name] = "not part of a sweep store"
+        elif content is None:
+            faults[name] = "missing"
+        elif fault := misfit(parsed(content) or {}, arrays[name]):
+            faults[name] = fault
     return faults
-
-
-async def _members(store: RunStore, names: Sequence[str]) -> list[Any]:
-    """Return the root group's members, or what reading them raises; all at once."""
-    group = await asynchronous.open_group(
-        store.storage, mode="r", zarr_format=3, use_consolidated=False
-    )
-    return await asyncio.gather(*map(group.getitem, names), return_exceptions=True)
-
-
-def linked_arrays(store: RunStore) -> list[str]:
-    """Return the arrays of a local store whose folder leads elsewhere, where nothing is written."""
-    if not isinstance(store.storage, LocalStore):
-        return []
-    root = Path(store.storage.root)
-    names = [each.path for each in planned_arrays(store.pipeline, store.blocks.extents)]
-    return [
-        name for name in names
-        if any(Path(root, *part).is_symlink() for part in (
-            name.split("/")[:1], name.split("/"), [name, "c"]))
-    ]
-
-
-def _misfit(planned: PlannedArray, array: zarr.Array[Any]) -> str:
-    try:
-        return planned.misfit(array)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        return f"unreadable: {reason_of(error)}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -179,19 +143,24 @@ def as_committed(store: RunStore, committed: Collection[int]) -> Store:
     return CommittedBlocks(store.storage, store.chunks, shown.tobytes())
 
 
-def changed_coordinate(store: RunStore) -> str:
-    """Return the key of a coordinate's chunk that is missing or changed; empty if there is none.
+def changed_coordinates(store: RunStore, planned: Iterable[PlannedArray]) -> dict[str, str]:
+    """Return the keys of chunks that are not as the pipeline has them, and why.
 
     Coordinates that are drawn for each scene are variables of the blocks.
     """
-    for planned in planned_arrays(store.pipeline, store.blocks.extents):
-        for key, part, values in planned.pieces():
-            if any(absent_files(store.storage, [key], planned.path)):
-                return key
-            stored = np.asarray(store.array(planned.path)[part])
-            if stored.shape != values.shape or not (stored == values).all():
-                return key
-    return ""
+    faults = {}
+    for array in planned:
+        for key, part, values in array.pieces():
+            (content,) = read_files(store.storage, [key])
+            if not content:
+                faults[key] = "missing"
+            elif not is_sound(content):
+                faults[key] = "changed: does not fit its checksum"
+            else:
+                stored = np.asarray(store.array(array.path)[part])
+                if stored.shape != values.shape or not (stored == values).all():
+                    faults[key] = "its values differ from the pipeline's"
+    return faults
 
 
 # --------------------------------------------------------------------------------------------------
@@ -205,13 +174,6 @@ UNREADABLE = (
     zarr.errors.BaseZarrError,
 )
 """Errors that reading a foreign, damaged or forged document may raise."""
-
-RUN_METADATA = {
-    "format": int, "name": str, "folder": str, "run_id": str, "block": list, "fingerprint": dict,
-    "environment": dict, "finished": bool,
-}
-"""What every store records of its run, and the types; a newer version may record more."""
-
 
 NEW_RUN = "run its pipeline into a new store: `sweep run PIPELINE --store NEW`"
 
@@ -274,29 +236,14 @@ def store_of(
             )
         if attributes.get(CHECKSUM) != _checksum(attributes):
             raise StoreError(f"{url}: damaged: zarr.json was changed; {NEW_RUN}")
-        for key, kind in RUN_METADATA.items():
-            if not isinstance(metadata[key], kind):
-                raise TypeError(key)
-        if metadata["finished"]:
-            for name in ("detection", "estimate"):
-                if not are_counts(metadata["counts"][name]):
-                    raise TypeError(name)
         pipeline = Pipeline.from_text(
             str(attributes["pipeline"]), name=metadata["name"],
             source=f"{url} (its pipeline)", folder=metadata["folder"],
             files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
-        lengths, extents = tuple(len(a) for a in scene_axes(pipeline)), tuple(metadata["block"])
-        if len(extents) != len(lengths) or not all(
-            type(extent) is int and 1 <= extent <= length
-            for extent, length in zip(extents, lengths, strict=True)
-        ):
-            raise ValueError(extents)
-        if not is_run_id(metadata["run_id"]):
-            raise ValueError(metadata["run_id"])
-        return RunStore(
-            url, open_group(storage, mode), pipeline, metadata["run_id"], Blocks(lengths, extents)
-        )
+        blocks = Blocks(
+            tuple(len(axis) for axis in scene_axes(pipeline)), tuple(metadata["block"]))
+        return RunStore(url, open_group(storage, mode), pipeline, metadata["run_id"], blocks)
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None
 
@@ -464,14 +411,10 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     finished = store.finished
     done = check_whole(store, finished=finished)
     try:
-        key, origin = changed_coordinate(store), "its pipeline has it"
-        if finished and not key:
-            key, origin = changed_draw(store), "its block's receipt has it"
-        if key:
+        planned = planned_arrays(store.pipeline, store.blocks.extents)
+        for key, fault in changed_coordinates(store, planned).items():
             raise StoreError(
-                f"{store.url}: damaged: {key} is not as {origin}; "
-                "`sweep verify --repair` repairs it"
-            )
+                f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
             storage = store.storage if finished else as_committed(store, done)

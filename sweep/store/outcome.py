@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.experiment.axes import Axis
 from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.grid import Block, scene_axes
 from sweep.experiment.parameters import Stage
@@ -19,7 +18,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain
 from sweep.processor import differing_processors
 from sweep.store.blocks import RunStore, committed, receipts
-from sweep.store.receipt import Receipt, RecordedFailure
+from sweep.store.receipt import FailedCell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,90 +36,39 @@ MAX_CHARACTERS = 4000
 """Characters that are kept of a traceback: its end."""
 
 
-@dataclass(frozen=True, slots=True)
-class FailedCell:
-    """One row of the table of failures: a scene, or a scene with a configuration.
-
-    Attributes
-    ----------
-    at
-        Its coordinates, as ``sweep repro --at`` takes them.
-    kind
-        "failed" (it raised) or "crashed" (its process died).
-    stage
-        "scene", "detection" or "estimation".
-    text
-        The traceback, or how the process died.
-    """
-
-    at: str
-    kind: str
-    stage: str
-    text: str
-
-    @property
-    def reason(self) -> str:
-        """The first line of the exception's message in a traceback; of other texts the last."""
-        lines = self.text.strip().splitlines()
-        frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
-        raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
-            if frames else iter(())
-        return next(raised, lines[-1] if lines else "")
-
-
 def recorded(
-    failures: Sequence[Any], rows: Sequence[int], quota: Mapping[str, int]
-) -> tuple[RecordedFailure, ...]:
+    pipeline: Pipeline, block: Block, failures: Sequence[Any], rows: Sequence[int],
+    quota: Mapping[str, int],
+) -> tuple[FailedCell, ...]:
     """Return the failures that a block's receipt keeps: at most ``quota`` of each kind.
 
     ``rows`` gives the number within the block of each scene that was computed.
     """
-    kept: list[RecordedFailure] = []
+    kept: list[FailedCell] = []
     left = {kind: min(count, MAX_PER_BLOCK) for kind, count in quota.items()}
     for failure in failures:
         kind = "crashed" if failure.crashed else "failed"
         if left[kind] <= 0:
             continue
         left[kind] -= 1
-        kept.append(RecordedFailure(
-            int(rows[failure.scene]), kind, failure.stage, failure.setting, failure.estimator,
+        kept.append(FailedCell(
+            _at(pipeline, block.cell(rows[failure.scene]), failure), kind, failure.stage,
             failure.text[-MAX_CHARACTERS:],
         ))
     return tuple(kept)
 
 
-def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[FailedCell]:
-    """Yield the failures that a block's receipt holds."""
-    if not receipt.failures:
-        return
-    block = store.blocks[number]
-    for failure in receipt.failures:
-        coordinates = _coordinates(store.pipeline, block, failure)
-        yield FailedCell(selection_text(coordinates), failure.kind, failure.stage, failure.text)
-
-
-def _coordinates(
-    pipeline: Pipeline, block: Block, failure: RecordedFailure
-) -> dict[str, Any]:
-    """Return the values that vary, in the order of the axes, of a failure's cell."""
-    indices = {
-        axis.name: index
-        for axis, index in zip(scene_axes(pipeline), block.cell(failure.scene), strict=True)
-    }
+def _at(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
+    """Return the coordinates of a failure's cell, as ``sweep repro --at`` takes them."""
+    indices = {axis.name: k for axis, k in zip(scene_axes(pipeline), cell, strict=True)}
     for number, stage in (
         (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
     ):
-        if number is not None:
-            indices |= _configuration(pipeline.axes_of(stage), number)
-    return pipeline.cell_at(indices)
-
-
-def _configuration(axes: Sequence[Axis], number: int) -> dict[str, int]:
-    """Return the index along each axis of a configuration."""
-    if not axes:
-        return {}
-    index = np.unravel_index(number, [len(axis) for axis in axes])
-    return {axis.name: int(i) for axis, i in zip(axes, index, strict=True)}
+        axes = pipeline.axes_of(stage)
+        if number is not None and axes:
+            index = np.unravel_index(number, [len(axis) for axis in axes])
+            indices |= {axis.name: int(k) for axis, k in zip(axes, index, strict=True)}
+    return selection_text(pipeline.cell_at(indices))
 
 
 def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.Dataset:
@@ -298,8 +246,8 @@ def first_cell(store: RunStore) -> str:
 
 def _recorded_failures(store: RunStore) -> Iterator[FailedCell]:
     """Yield the failed cells that the receipts of a store record."""
-    for number, receipt in receipts(store, committed(store)):
-        yield from failed_cells(store, number, receipt)
+    for _, receipt in receipts(store, committed(store)):
+        yield from receipt.failures
 
 
 @dataclass(frozen=True, slots=True)

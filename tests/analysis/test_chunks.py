@@ -4,14 +4,17 @@ import functools
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import sweep.analysis.aggregate as engine
 import sweep.analysis.statistic as blocks
 from support.small_datasets import ALL, mixed
 from sweep.analysis import (
     compare,
+    covariance_trust,
     detection_limit,
     detection_rate,
+    efficiency,
     error_models,
     error_statistics,
     failure_composition,
@@ -22,6 +25,15 @@ from sweep.analysis import (
 RESULTS = mixed(ALL, 20)
 REPLICATED = mixed({"tilt_deg": 2, "noise_grey": 2, "trial": 64, "solver": 2}, 21).assign_attrs(
     sweep={"fingerprint": {"sampling": "sobol"}})
+
+EDGES = RESULTS.assign(
+    # No bound here, one of 0 there; a pose without an error, one without depth.
+    bound_std=RESULTS["marker_area_px"].expand_dims(pose_parameter=[
+        "rotation_x", "rotation_y", "rotation_z", "translation_z"], axis=-1) * [0, 1, np.nan, 1],
+    rotation_error_rad=0 * RESULTS["rotation_error_rad"],
+    true_tvec_m=0 * RESULTS["true_tvec_m"])
+"""Where divisions, roots and logarithms have no value."""
+
 BINS = {"marker_area_px": [100.0, 400.0, 500.0, 1001.0]}
 
 
@@ -67,6 +79,13 @@ def assert_same(answer, call):
             np.testing.assert_array_equal(answer[name], array, err_msg=name)
         else:
             np.testing.assert_allclose(answer[name], array, rtol=1e-9, atol=1e-15, err_msg=name)
+
+
+@pytest.mark.parametrize("analysis", [
+    efficiency, error_statistics, covariance_trust, flip_rate, failure_composition])
+def test_a_lazy_dataset_without_values_gives_the_same_without_a_warning(analysis):
+    lazy = analysis(EDGES.chunk(trial=3), ("solver",)).compute()
+    xr.testing.assert_identical(lazy, analysis(EDGES, ("solver",)))
 
 
 @pytest.mark.parametrize("most", [1, 7, 100])

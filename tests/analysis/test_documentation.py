@@ -12,7 +12,6 @@ import xarray as xr
 
 import sweep.analysis
 from support.example_results import example_results
-from support.guide_tables import statistics_table
 
 FUNCTIONS = [getattr(sweep.analysis, name) for name in sweep.analysis.__all__]
 PUBLIC = pytest.mark.parametrize("function", FUNCTIONS, ids=sweep.analysis.__all__)
@@ -51,10 +50,6 @@ def test_examples_run(module):
 @PUBLIC
 def test_the_guide_names_a_public_function(function):
     assert f"`{function.__name__}`" in guide()
-
-
-def test_the_guide_has_the_statistics_of_the_registry():
-    assert statistics_table() in guide()
 
 
 def guide():

@@ -8,6 +8,7 @@ function runs in a fresh interpreter on the default threads, and is stopped afte
 """
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -17,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import SCHEMA
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.store.blocks import region
+from sweep.store.blocks import region, write_block
 from sweep.store.lifecycle import create_store, finish
+from sweep.store.receipt import STAGES, Receipt
 
 GRID = """
 seed = 1
@@ -81,12 +82,22 @@ def write_store(folder, poses):
     store = create_store(
         str(Path(folder) / f"{poses}.zarr"), pipeline, (*EXTENTS, min(TRIALS_A_CHUNK, trials)))
     rng = np.random.default_rng(1)
-    variables = {variable.name: variable for variable in SCHEMA}
+    flags = {"detection": len(DetectionStatus), "estimate": len(EstimateStatus)}
     for block in store.blocks:
-        for name, values in chunk(rng, pipeline, block).items():
-            variable = variables[name]
-            store.array(name)[region(variable, pipeline, block)] = values
-    # Readers see committed blocks alone, and all of a finished store.
+        values = chunk(rng, pipeline, block)
+        for variable in store.variables:
+            array = store.array(variable.name)
+            some = np.full([len(range(*cut.indices(size))) for cut, size in zip(
+                region(variable, pipeline, block), array.shape, strict=True)],
+                array.fill_value, array.dtype)
+            some[...] = values.get(variable.name, some)
+            values[variable.name] = some
+        counts = {name: np.bincount(values[name].ravel(), minlength=size).tolist()
+                  for name, size in flags.items()}
+        write_block(store, block, values, Receipt(
+            run_id=store.run_id, processors=[], scenes=math.prod(block.shape),
+            computed=dict.fromkeys(("scenes", "detections", "estimates"), 0), **counts,
+            seconds={stage: [] for stage in STAGES}, failures=[], wall_s=0.0, written=0.0))
     finish(store, {}, {"detection": [0] * len(DetectionStatus),
                        "estimate": [0] * len(EstimateStatus)})
     return store.url, trials * POSES_A_TRIAL

@@ -39,7 +39,6 @@ from numcodecs.zstd import Zstd
 
 import sweep
 from sweep.execution import on_cluster
-from sweep.execution.cluster import QUIET_DASK_CONFIG
 from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
 from sweep.execution.status import close, status
@@ -68,7 +67,10 @@ trial = {trials}
 """
 
 MONITORS = {
-    **QUIET_DASK_CONFIG,
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.cycle": "3s",
+    "distributed.scheduler.active-memory-manager.start": False,
     "distributed.admin.system-monitor.interval": "600s",
     "distributed.worker.memory.monitor-interval": "600s",
 }

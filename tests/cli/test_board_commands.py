@@ -67,7 +67,7 @@ def stores(tmp_path_factory):
 
 REFUSED = {
     "calibration": "expected at least", "compare": "expected photographs",
-    "error-model": "needs 200 or more", "export": "shows boards",
+    "error-model": "needs 200 or more",
 }
 """Command -> what stands in the line in which it refuses these stores."""
 

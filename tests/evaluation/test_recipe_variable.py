@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sweep.evaluation import block as variables
-from sweep.evaluation.block import check_complete
+from sweep.evaluation import variables
+from sweep.evaluation.variables import check_complete
 from sweep.experiment.parameters import Stage
 
 TESTS = Path(__file__).parents[1]
@@ -46,7 +46,7 @@ FUNCTION = """
 ADDITIONS = {
     # Module -> where its text is changed, and what is put there.
     "sweep.experiment.schema": (')\n"""Every variable, in the order', RECORD),
-    "sweep.evaluation.block": (
+    "sweep.evaluation.variables": (
         '}\n"""Variable of the estimation -> its values (n, ...) for', FUNCTION),
 }
 
@@ -71,7 +71,7 @@ import numpy as np
 import sweep
 from support.here import calls_here
 from sweep.cli import main
-from support.guide_tables import TABLES
+from sweep.report.reference import TABLES
 
 with calls_here():
     pipeline, new = sys.argv[1:]
@@ -88,7 +88,7 @@ with calls_here():
     np.testing.assert_allclose(error.values[solved], expected, atol=1e-6)
     assert main(["verify", new]) == 0
     assert main(["status", new]) == 0
-    assert "`range_error` | estimation" in TABLES["variables"]()
+    assert ["range_error", "estimation"] in [row[:2] for row in TABLES["variables"]().rows]
 """
 
 

@@ -91,7 +91,7 @@ def whole(url, pipeline, reference):
     assert same(url, reference)
     with xr.open_zarr(url) as opened:  # a warning where its metadata is not in one place
         assert opened.sizes
-    computed = sum(receipt.any_needed for _, receipt in told)
+    computed = sum(receipt.scenes_needed > 0 for _, receipt in told)
     with xr.open_zarr(url, group="cost") as cost:
         assert cost.sizes["block"] == computed
 
@@ -198,10 +198,11 @@ class Chaos:
         whole(self._url, self._pipeline, self._reference)
 
     def _workers(self, process):
-        """Return the worker processes below one."""
+        """Return the worker processes below one: of Dask, or children of the client itself."""
         with contextlib.suppress(psutil.NoSuchProcess):
             below = psutil.Process(process.pid).children(recursive=True)
-            return [one for one in below if "spawn_main" in " ".join(self._words(one))]
+            return [one for one in below if "spawn_main" in " ".join(self._words(one))
+                    or "child_process" in " ".join(self._words(one))]
         return []
 
     @staticmethod

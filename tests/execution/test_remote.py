@@ -22,14 +22,16 @@ import trustme
 from support.blocks import run_block
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
-from sweep.execution.cluster import external
+from sweep.execution.cluster import connected
+from sweep.execution.runner import execute
+from sweep.execution.status import drop_failed
 from sweep.experiment.grid import Block, scene_axes
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed
 from sweep.store.files import read_files, write_files
-from sweep.store.lifecycle import open_store
-from sweep.store.locations import storage_at
-from sweep.store.lock import KEY, changing
+from sweep.store.lifecycle import create_store, open_store, remove_store
+from sweep.store.locations import exists, storage_at
+from sweep.store.lock import CHANGE, changing, closing, is_written, writing
 
 TIMEOUT_S = 240.0
 
@@ -229,7 +231,7 @@ def _account():
 @pytest.mark.usefixtures("bucket")
 def test_server_lets_one_of_many_change_a_store_and_a_dead_lock_is_taken_over(monkeypatch):
     monkeypatch.setattr("sweep.store.lock.LOOK_S", 0.01)
-    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 0.5)
+    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 3.0)
     storage = storage_at("s3://bucket/lock.zarr", read_only=False)
     inside = []
 
@@ -242,11 +244,33 @@ def test_server_lets_one_of_many_change_a_store_and_a_dead_lock_is_taken_over(mo
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(change, range(4)))
-    write_files(storage, {KEY: b"of a process that died"})
+    write_files(storage, {CHANGE: b"of a process that died"})
     begun = time.monotonic()
     change(0)
-    assert time.monotonic() > begun + 0.5
-    assert read_files(storage, [KEY]) == [None]
+    assert time.monotonic() > begun + 1.0
+    assert read_files(storage, [CHANGE]) == [None]
+
+
+@pytest.mark.usefixtures("bucket")
+def test_server_refuses_changes_while_a_process_writes(monkeypatch):
+    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 3.0)
+    url = "s3://bucket/written.zarr"
+    pipeline = Pipeline.from_text("axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40")
+    store = create_store(url, pipeline, (2,))
+    with writing(url, store.storage):
+        time.sleep(3.5)  # its key is renewed
+        assert is_written(store.storage)
+        with closing(url, store.storage):
+            pass
+        for change in (
+            lambda: remove_store(url), lambda: drop_failed(store),
+            lambda: execute(pipeline, url, overwrite=True),
+        ):
+            with pytest.raises(StoreError, match="is writing it"):
+                change()
+    assert open_store(url).run_id == store.run_id
+    remove_store(url)
+    assert not exists(url)
 
 
 # --- the cluster ---
@@ -476,8 +500,8 @@ def test_server_that_never_answers_is_given_up(monkeypatch):
     monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(ArgumentError, match="no answer within"), external(
-            address, Pipeline.from_text(SMALL)
+        with pytest.raises(ArgumentError, match="no answer within"), connected(
+            Pipeline.from_text(SMALL), address, None
         ):
             pass
 
@@ -486,7 +510,7 @@ def test_server_that_never_answers_is_given_up(monkeypatch):
 def test_what_is_no_address_is_told(address):
     with pytest.raises(
         ArgumentError, match="expected an address such as tcp://host:8786"
-    ), external(address, Pipeline.from_text(SMALL)):
+    ), connected(Pipeline.from_text(SMALL), address, None):
         pass
 
 

@@ -419,7 +419,7 @@ def test_damaged_receipts_are_told(pipeline, tmp_path):
         path.write_bytes(b"garbage")
     ran = sweep_command("status", url)
     assert ran.returncode == 2
-    assert "damaged receipts among blocks 0 to 0" in ran.stderr
+    assert "the receipt of block 0 is damaged" in ran.stderr
     assert "Traceback" not in ran.stderr
 
 

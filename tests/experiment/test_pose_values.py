@@ -11,13 +11,14 @@ import sweep
 from support.here import calls_here
 from support.lengths import first_of, lengths
 from sweep.errors import PipelineError
-from sweep.evaluation.block import GEOMETRY
+from sweep.evaluation.variables import GEOMETRY
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
+from sweep.model.marker import module_count
 from sweep.model.scene import build_scenes
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -87,7 +88,8 @@ def test_places_in_metres_are_the_truth():
 
 def outline(scenes, quiet_modules, points):
     """Return points (N, M, 3) along the sides of the quiet zone, in the marker's frame."""
-    half = scenes.size_m / 2 * (1 + 2 * quiet_modules / scenes.modules)
+    modules = module_count(scenes.dictionary[0])
+    half = scenes.size_m / 2 * (1 + 2 * quiet_modules / modules)
     t = np.linspace(-1, 1, points)
     one = np.ones_like(t)
     sides = [np.stack(side, axis=1) for side in ((t, one), (t, -one), (one, t), (-one, t))]

@@ -13,12 +13,9 @@ from support.store_files import edit_receipt, edit_root
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import SweepError
-from sweep.execution.block_task import compute_block
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 title = "Small"
@@ -103,19 +100,14 @@ def test_arrays_and_groups_that_no_store_has_are_refused(copied, capsys):
     lambda attributes, _: attributes.update(pipeline=TEXT.replace("tilt_deg", "roll_deg")),
     lambda attributes, _: attributes.update(pipeline="\x00\x1b[2J"),
     lambda attributes, _: attributes.update(pipeline=None),
-    lambda _, metadata: metadata.update(block=[0, 2]),
-    lambda _, metadata: metadata.update(block=[2, 1 << 70]),
-    lambda _, metadata: metadata.update(run_id="../../outside"),
     lambda _, metadata: metadata.update(fingerprint=5),
-    lambda _, metadata: metadata.update(counts={}),
-    lambda _, metadata: metadata.pop("finished"),
 ])
 def test_root_of_something_else_is_refused(change, copied, capsys):
     edit_root(copied, change)
     see_refused(copied, capsys)
 
 
-@pytest.mark.parametrize("number", [5, 7, None])
+@pytest.mark.parametrize("number", [6, 8, None])
 def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_path, capsys):
     edit_root(copied, lambda _, metadata: metadata.update(format=number))
     see_refused(copied, capsys)
@@ -129,41 +121,14 @@ def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_
         assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("change", [
-    lambda _: "[" * 100_000, lambda _: "7",
-    lambda content: content.update(scenes="many"), lambda content: content.update(detection=[-1]),
-    lambda content: content.update(failures=[{"scene": 10**9}]),
-    lambda content: content.update(checksums={"nees": 1}),
-], ids=["deep", "number", "scenes", "counts", "failures", "checksums"])
-def test_receipts_of_something_else_are_told(change, copied, capsys):
-    edit_receipt(copied, 0, change)
-    assert {damage.block for damage in verify(str(copied), 2).damage} == {0}
-    assert main(["status", str(copied)]) == 2
-    assert "sweep verify --repair" in capsys.readouterr().err
-
-
 def test_failures_steer_no_terminal(copied, capsys):
-    failure = {"scene": 0, "kind": "failed", "stage": "detection", "setting": 0,
-               "estimator": None, "text": "Error: \x1b[2J\x1b]0;title\x07"}
+    failure = {"at": "trial=0", "kind": "failed", "stage": "detection",
+               "text": "Error: \x1b[2J\x1b]0;title\x07"}
     edit_receipt(copied, 0, lambda content: content.update(failures=[failure]))
     assert main(["status", str(copied)]) == 0
     said = capsys.readouterr()
     assert "Error" in said.out
     assert all(line.isprintable() for line in (said.out + said.err).splitlines())
-
-
-@pytest.mark.parametrize("name", ["detection", "commits", "nees/c"])
-def test_nothing_is_written_through_a_link_that_leads_out(name, tmp_path):
-    url, outside = tmp_path / "s.zarr", tmp_path / "outside"
-    store = create_store(str(url), Pipeline.from_text(TEXT, name="small"), EXTENTS)
-    compute_block(str(url), store.run_id, store.blocks[0])
-    shutil.move(url / name, outside)
-    (url / name).symlink_to(outside)
-    before = sorted(outside.rglob("*"))
-    for function in (lambda url: open_store(url, "r+"), sweep.open, repair):
-        with pytest.raises(SweepError, match="a link"):
-            function(str(url))
-    assert sorted(outside.rglob("*")) == before
 
 
 def test_store_that_is_a_link_is_a_store(copied, tmp_path):

@@ -16,6 +16,7 @@ from sweep.cli import main
 from sweep.evaluation.results import Failure
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import begin_block
 from sweep.store.lifecycle import create_store
@@ -136,10 +137,12 @@ def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback(
     text = "first" + "x" * 10 * MAX_CHARACTERS + "last"
     failures = [Failure(k, "scene", text, crashed=bool(k % 2)) for k in range(1000)]
     rows = list(range(5000, 6000))
-    kept = recorded(failures, rows, {"failed": 1000, "crashed": 7})
+    pipeline = Pipeline.from_text("[pose]\nside_px = 40\njitter_px = 1\n[axes]\ntrial = 6000")
+    block = Block((0,), (6000,))
+    kept = recorded(pipeline, block, failures, rows, {"failed": 1000, "crashed": 7})
     assert len([one for one in kept if one.kind == "crashed"]) == 7
     failed = [one for one in kept if one.kind == "failed"]
     assert 0 < len(failed) <= 100
-    assert [one.scene for one in failed] == list(range(5000, 5000 + 2 * len(failed), 2))
+    assert [one.at for one in failed] == [f"trial={5000 + 2 * k}" for k in range(len(failed))]
     assert all(one.text.endswith("last") and len(one.text) <= 4000 for one in kept)
-    assert recorded(failures, rows, {"failed": 0, "crashed": 0}) == ()
+    assert recorded(pipeline, block, failures, rows, {"failed": 0, "crashed": 0}) == ()

@@ -1,6 +1,5 @@
 """Verify and repair: every damage is named, exactly it is mended, and a sound store is sound."""
 
-import dataclasses
 import json
 import os
 import random
@@ -15,6 +14,7 @@ import pytest
 import zarr
 
 import sweep
+from support.flags_and_numbers import contradictions
 from support.lengths import lengths
 from support.poison import Poison, poisoned
 from support.store_files import edit_receipt, editable, files, see_same
@@ -24,10 +24,9 @@ from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
 from sweep.experiment.grid import scene_axes
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.recomputation import is_doubtful
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.store.blocks import begin_block, receipts
+from sweep.store.blocks import begin_block
 from sweep.store.layout import checksum_of
 from sweep.store.lifecycle import create_store, open_store
 
@@ -250,18 +249,6 @@ def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
     assert 8 <= found.sampled <= 15
 
 
-def test_scene_that_a_signal_from_outside_ended_is_tried_again(copied):
-    edit_receipt(copied, FAILED_BLOCK, lambda content: content["failures"][0].update(
-        kind="crashed", text="SIGKILL"))
-    _, receipt = next(iter(receipts(open_store(str(copied)), [FAILED_BLOCK])))
-    assert is_doubtful(receipt)
-    assert is_doubtful(dataclasses.replace(receipt, detection=[0], estimate=[0]))
-    assert not is_doubtful(
-        dataclasses.replace(receipt, detection=[0], estimate=[0], failures=[
-            dataclasses.replace(receipt.failures[0], text="SIGSEGV")])
-    )
-
-
 def test_file_is_named_when_it_alone_is_damaged(sound, copied):
     generator = random.Random(1)
     chosen = generator.sample(list(KINDS.values()), 6)  # all of them: the long test below
@@ -336,47 +323,6 @@ def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
     assert found.damage == []
     assert set(found.left_over) == set(extra)
     see_repaired(copied, sound, set(), here)
-
-
-def forged(name, where, value):
-    """Return a variable, a change of it at a place, and the block of the place."""
-    def change(values):
-        values[where] = value
-        return values
-
-    return name, change, 3 * (where[0] // 2) + where[-1 - INNER.get(name, 0)] // 2
-
-
-FORGED = {
-    "a number is gone": forged("corner_error_px", (0, 0, 0, 1, 1), np.nan),
-    "a number is infinite": forged("rotation_error_deg", (0, 0, 0, 0), np.inf),
-    "a number of nothing": forged("rotation_error_deg", (2, 0, 0, 0), 1.0),
-    "a corner of nothing": forged("corner_error_px", (2, 0, 0, 3, 0), 0.5),
-    "found, without corners": forged("detection", (2, 0, 0), 1),
-    "not found, with corners": forged("detection", (0, 0, 0), 4),
-    "a flag that is none": forged("estimate", (0, 0, 0, 0), 77),
-    "a number without a bound": forged("bound_std", (0, 0, 0), 1.0),
-    "flipped, without a pose": forged("flipped", (2, 0, 0, 0), 2),
-    "no truth": forged("true_tvec_m", (0, 2, 0), np.nan),
-    "not run": forged("estimate", (0, 0, 0, 0), 0),
-}
-
-
-OF_ONE_RULE = ("a corner of nothing", "a number without a bound", "flipped, without a pose")
-"""What the rule that finds "a number of nothing" finds, too."""
-
-
-@pytest.mark.parametrize(("name", "change", "block"), [
-    pytest.param(*case, id=name, marks=pytest.mark.long if name in OF_ONE_RULE else ())
-    for name, case in FORGED.items()
-])
-def test_flags_and_numbers_that_disagree_are_named_though_every_checksum_fits(
-    name, change, block, copied
-):
-    edit_values(copied, name, change, receipts_too=True)
-    damage = verify(str(copied), 0).damage
-    assert {one.block for one in damage} == {block}
-    assert any(word in damage[0].what for word in (name, "detection", "estimate"))
 
 
 @pytest.mark.long
@@ -520,6 +466,7 @@ def test_stores_of_all_pipelines_are_sound(path, tmp_path):
     found = verify(url, 20)
     assert (found.damage, found.left_over) == ([], [])
     assert found.files == len(files(url))
+    assert contradictions(store) == []
 
 
 @pytest.mark.long

@@ -10,11 +10,10 @@ from support.exact_image import add_clipped, values
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, bounds
 from sweep.measure.flags import BoundStatus
 from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers, with_distractors
-from sweep.model.coverage import sum_levels
 from sweep.model.effects import NEUTRAL
+from sweep.model.exposure import marker_exposure
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
-from sweep.model.scene_sheet import accumulate_solid
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 LEVELS = np.array([120.0, 40.0, 200.0])
@@ -150,20 +149,17 @@ def clipped_areas(parts, scenes):
     return areas
 
 
-def image_areas(scenes, sigma=0.0):
+def image_areas(scenes):
     """The same from exact images, which are judged by rays (tests/model/test_solid_board.py)."""
     low, high = box_of(scenes)
-    width, height = (high - low).tolist()
     rotation, position = scenes.rotation[0].copy(), scenes.translation[0].copy()
 
     def areas(step):
         scenes.rotation[0] = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
         scenes.translation[0] = position + step[3:]
         shares = []
-        for levels in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]):
-            cover, share = np.zeros((height, width + 2)), np.empty((height, width))
-            accumulate_solid(cover, scenes, 0, np.array(levels), (*low, *high), sigma)
-            sum_levels(cover, 0.0, share)
+        for levels in ([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]):
+            share = marker_exposure(scenes, 0, (*low, *high), np.array(levels))
             shares.append(share.ravel())
         scenes.rotation[0], scenes.translation[0] = rotation, position
         dark, light = shares
@@ -199,7 +195,7 @@ def test_bound_of_sheets_that_hide_others_is_that_of_differences_of_images(lens,
     Images with blur are quadratures, with errors of 1e-4 (of one marker, too).
     """
     scenes = scene(listed(FIELD), distortion=lens, blur_px=blur_px)
-    expected = deviations(image_areas(scenes, blur_px))
+    expected = deviations(image_areas(scenes))
     np.testing.assert_allclose(found_of(scenes).std[0], expected, rtol=2e-3 if blur_px else 2e-5)
 
 

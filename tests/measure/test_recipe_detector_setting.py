@@ -19,7 +19,7 @@ import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
-from support.guide_tables import TABLES
+from sweep.report.reference import TABLES
 
 TEXT = """
 [marker]
@@ -46,7 +46,7 @@ detection = [] if pipeline is None else [
 ]
 print(json.dumps({
     "message": message, "out_of_range": read([-1.0])[1], "detection": detection,
-    "table": TABLES["parameters.detector"](),
+    "table": TABLES["detector"]().rows,
 }))
 '''
 
@@ -60,7 +60,7 @@ def test_setting_is_one_field(tmp_path):
     file.write_text(file.read_text().replace(field, ""))
     before = printed_by(without, SCRIPT)
     assert f"axes.{NAME}" in before["message"]
-    assert f"`{NAME}`" not in before["table"]
+    assert NAME not in [row[0] for row in before["table"]]
 
     # Put back as a contributor would: as the last of the fields.
     last = [each.name for each in dataclasses.fields(DetectorSetting)][-1]
@@ -71,7 +71,7 @@ def test_setting_is_one_field(tmp_path):
     after = printed_by(without, SCRIPT)
     assert after["message"] == ""
     assert f"{NAME} = -1" in after["out_of_range"].replace("[", "").replace("axes.", "")
-    assert f"| `{NAME}` | 5 | grey level | a number at least 0 |" in after["table"]
+    assert [NAME, "5", "grey level", "a number at least 0"] in [row[:4] for row in after["table"]]
     # Levels 30 apart have a standard deviation of at most 15: below 40 they count as one colour.
     (strict,), (lax,) = after["detection"]
     assert strict != 1

@@ -46,7 +46,7 @@ from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.experiment.facts import parts
 from sweep.experiment.pipeline import Pipeline
-from support.guide_tables import TABLES
+from sweep.report.reference import TABLES
 
 TEXT = """
 [marker]
@@ -71,7 +71,7 @@ print(json.dumps({
     "grey": columns["reprojection_error_px"][0].tolist(),
     "message": message,
     "kept": [part.reason for part in parts(pipeline) if part.name == "pixels kept"],
-    "table": TABLES["solvers"](), "parameters": TABLES["parameters.estimator"](),
+    "table": TABLES["solvers"]().rows, "parameters": TABLES["estimator"]().markdown(),
 }))
 '''
 
@@ -93,5 +93,5 @@ def test_solver_is_one_class_and_one_record(tmp_path):
     assert all(0 < grey < 255 for grey in result["grey"])
     assert "one of frontal, ippe" in result["message"]
     assert result["kept"] == ["solver frontal needs them"]
-    assert "| `frontal` | a frontal pose | pixels | no |" in result["table"]
+    assert ["frontal", "a frontal pose", "pixels", "no"] in result["table"]
     assert "frontal: a frontal pose" in result["parameters"]

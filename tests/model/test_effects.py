@@ -31,7 +31,7 @@ from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import Effects
-from sweep.model.exposure import defocus_px, marker_exposure
+from sweep.model.exposure import defocus_px, marker_exposure, seen_sheets
 from sweep.model.extent import marker_boxes, not_modelled
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
@@ -274,7 +274,9 @@ def test_defocus_is_each_pixels_own_gaussian(count):
     worst = spread_error = 0.0
     for value in focused_poses(count, 5):
         frame, cells = frame_of(value), cells_of(value)
-        over = defocus_px(build_scenes(value, 1), 0, whole(value))
+        scenes = build_scenes(value, 1)
+        (sheet,) = seen_sheets(scenes, 0)
+        over = defocus_px(scenes, 0, sheet, whole(value))
         edges = np.argwhere(np.abs(np.gradient(frame)).max(axis=0) > 2)
         for v, u in rng.permutation(edges)[:12].tolist():
             sigma = confusion_px(value, u, v)
@@ -550,7 +552,7 @@ def test_occluded_marker_is_blurred_and_moved_with_its_sheet(count):
         image = gaussian_filter(occluded_image(fine), s, mode="nearest", truncate=6.0)
         inner = image[s * pad : -s * pad, s * pad : -s * pad]
         expected = inner.reshape(HEIGHT, s, WIDTH, s).mean(axis=(1, 3))
-        assert scenes.affected[0]
+        assert scenes.effects.active[0]
         worst = max(worst, np.abs(frame_of(value) - expected).max())
     # An edge within a finer pixel is off by up to half of it, as above.
     row("occlusion and blur", "gaussian_filter of clipped polygons, s = 8", count, worst, 0.6)

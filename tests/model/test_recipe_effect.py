@@ -39,7 +39,7 @@ from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.grid import detector_settings, scene_values
-from support.guide_tables import TABLES
+from sweep.report.reference import TABLES
 
 TEXT = """
 [camera]
@@ -91,8 +91,8 @@ print(json.dumps({
     "costs": seconds_of([without_effect(pipeline, switch)
                          for switch in ("haze", "column_noise_grey")], 8)[0],
     "broken": [broken("haze_x = 1"), broken("read_noise_e = 3")],
-    "table": TABLES["effects"](),
-    "parameters": TABLES["parameters.scene"](),
+    "table": TABLES["effects"]().rows,
+    "parameters": TABLES["scene"]().markdown(),
 }))
 '''
 
@@ -133,6 +133,7 @@ def test_all_else_follows_from_the_record(result):
     assert (noisy != quiet).any()
     assert "did you mean haze?" in result["broken"][0]
     assert "expected full_well_e beside it" in result["broken"][1]
-    assert "| haze | `haze` | 0 | light | no | no |" in result["table"]
-    assert "| column noise | `column_noise_grey` | 0 | signal | yes | no |" in result["table"]
-    assert "`column_period_px`" in result["parameters"]
+    rows = [row[:6] for row in result["table"]]
+    assert ["haze", "haze", "0", "light", "no", "no"] in rows
+    assert ["column noise", "column_noise_grey", "0", "signal", "yes", "no"] in rows
+    assert "column\\_period\\_px" in result["parameters"]

@@ -10,11 +10,10 @@ from support.exact_image import LENSES, modules_of, plane_of, values
 from support.lengths import lengths
 from sweep.model import lens
 from sweep.model.effects import NEUTRAL
-from sweep.model.exposure import marker_exposure
+from sweep.model.exposure import marker_exposure, shift_waves
 from sweep.model.extent import areas_px, hidden, marker_boxes, not_modelled
 from sweep.model.renderers import marker_levels, render
 from sweep.model.scene import build_scenes
-from sweep.model.scene_sheet import shift_waves
 
 LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
 
@@ -32,7 +31,7 @@ def exact_frame(scenes, value):
     frame = np.full((value["height_px"], value["width_px"]), value["background"])
     areas = np.array([value["background"], value["black"], value["white"], 0.0])
     if box[2] > box[0]:
-        if scenes.effects is None:
+        if not scenes.effects.active[0]:
             mean, share = marker_levels(scenes, 0, tuple(box.tolist()))
             inner = mean + (1 - share) * value["background"]
         else:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
@@ -13,6 +14,7 @@ from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.extent import marker_boxes
 from sweep.model.marker import modules
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
@@ -69,12 +71,13 @@ def turned(each):
     return (tilt * Rotation.from_euler("z", each["roll_deg"], degrees=True)).as_matrix()
 
 
-def traced(markers, camera, pose, per_side, ground=None):
+def traced(markers, camera, pose, per_side, ground=None, only=None):
     """The mean levels (height, width) of ``per_side``² rays a pixel.
 
     Each ray takes the nearest sheet. ``markers`` have quiet zones of one module; ``camera``: width,
     height, f, cx, cy; ``pose``: rotation and translation of the target. ``ground``: returns the
-    level of points (n, 2) of the target's plane, NaN where nothing is printed.
+    level of points (n, 2) of the target's plane, NaN where nothing is printed. ``only``: the number
+    of a marker (-1: the ground) beside which all is black, and rays are not averaged.
     """
     width, height, focal, cx, cy = camera
     rotation, translation = pose
@@ -83,13 +86,14 @@ def traced(markers, camera, pose, per_side, ground=None):
     x, y = np.meshgrid((u - cx) / focal, (v - cy) / focal)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     nearest, level = np.full(x.shape, np.inf), np.full(x.shape, LEVELS[0])
+    owner = np.full(x.shape, -2)
     if ground is not None:
         depth = rotation[:, 2] @ translation / (rays @ rotation[:, 2])
         points = (rays * depth[..., None] - translation) @ rotation[:, :2]
         seen = ground(points.reshape(-1, 2)).reshape(x.shape)
         hit = np.isfinite(seen) & (depth > 0)
-        nearest[hit], level[hit] = depth[hit], seen[hit]
-    for each in markers:
+        nearest[hit], level[hit], owner[hit] = depth[hit], seen[hit], -1
+    for number, each in enumerate(markers):
         centre, size = [each[f"{axis}_m"] for axis in "xyz"], each["size_m"]
         axes, middle = rotation @ turned(each), rotation @ centre + translation
         if axes[:, 2] @ middle >= 0:
@@ -107,7 +111,9 @@ def traced(markers, camera, pose, per_side, ground=None):
         index = [np.clip(along, 0, count - 1).astype(int) for along in (line, column)]
         white = ~within | bits[tuple(index)]
         nearest[hit] = depth[hit]
-        level[hit] = np.where(white, LEVELS[2], LEVELS[1])[hit]
+        level[hit], owner[hit] = np.where(white, LEVELS[2], LEVELS[1])[hit], number
+    if only is not None:
+        return np.where(owner == only, level - LEVELS[0], 0.0), x, y
     return level.reshape(height, per_side, width, per_side).mean(axis=(1, 3))
 
 
@@ -147,6 +153,109 @@ def test_an_image_is_that_of_rays(name, tilt_deg):
     assert fine < 0.8
     assert fine < 0.3 * coarse or fine == coarse == 0
     assert largest_board(chosen)[0] == (4 if ground else len(declared["markers"]))
+
+
+MOTION = {"velocity_x_m_s": 0.5, "velocity_y_m_s": -0.3, "velocity_z_m_s": 0.4,
+          "rotation_x_deg_s": 300.0, "rotation_y_deg_s": -400.0, "rotation_z_deg_s": 200.0}
+
+
+@pytest.mark.parametrize(("name", "shutter"), [
+    ("cube", {"exposure_s": 0.006, "row_time_s": 1e-4}),
+    pytest.param("field", {"exposure_s": 0.02}, marks=pytest.mark.long),
+    pytest.param("field", {"row_time_s": 3e-4}, marks=pytest.mark.long),
+    pytest.param("distractors", {"exposure_s": 0.006, "row_time_s": 1e-4}, marks=pytest.mark.long),
+])
+def test_a_moving_target_in_several_planes_is_the_mean_of_rays(name, shutter):
+    """Each row's mean over instants of its exposure, of rays to the target where it is then."""
+    declared = BOARDS[name]
+    chosen = pipeline([], 60.0, board=declared, scene=MOTION | shutter)
+    scenes = scenes_of(chosen)
+    shown = [*declared["markers"], *declared.get("distractors", [])]
+    width, height = scenes.frame[0].tolist()
+    rotation, position = scenes.rotation[0], scenes.translation[0]
+    velocity, turning = (np.array(list(MOTION.values())[part]) for part in (
+        slice(3), slice(3, 6)))
+    count = 16 if "exposure_s" in shutter else 1
+    offsets = ((np.arange(count) + 0.5) / count - 0.5) * shutter.get("exposure_s", 0.0)
+    expected = np.zeros((height, width))
+    for v in range(height):
+        for offset in offsets:
+            instant = offset + shutter.get("row_time_s", 0.0) * (v - (height - 1) / 2)
+            turned_by = Rotation.from_rotvec(np.radians(turning) * instant).as_matrix()
+            pose = turned_by @ rotation, position + velocity * instant
+            expected[v] += traced(shown, (width, 1, 150.0, 79.5, 59.5 - v), pose, 4)[0] / count
+    box = marker_boxes(scenes)[0]
+    inside = np.zeros((height, width), dtype=bool)
+    inside[box[1] : box[3], box[0] : box[2]] = True
+    assert (expected[~inside] == LEVELS[0]).all()
+    off = image_of(scenes) - expected
+    assert np.sqrt((off**2).mean()) < 0.8
+    still = image_of(scenes_of(pipeline([], 60.0, board=declared)))
+    assert np.sqrt(((still - expected) ** 2).mean()) > 10  # it does move
+
+
+def occluded_charuco(points):
+    """As :func:`charuco_level`, under a sheet that hides 0.3 of its squares from the right."""
+    level = charuco_level(points)
+    return np.where(np.isfinite(level) & (points[:, 0] > 0.045 - 0.3 * 0.09), 128.0, level)
+
+
+@pytest.mark.parametrize("name", ["cube", "charuco"])
+def test_each_sheet_is_out_of_focus_at_its_own_depth(name):
+    """What rays see of each sheet, through the Gaussian of a thin lens at each pixel."""
+    flat = name == "charuco"
+    shown = [] if flat else CUBE
+    declared = {k: v for k, v in BOARDS[name].items() if k != "distractors"}
+    chosen = pipeline([], 40.0, board=declared, marker={
+        "dictionary": "DICT_4X4_50", "size_m": 0.02 if flat else 0.04},
+        scene={"aperture_mm": 20.0, "focus_distance_m": 0.16, "occlusion": 0.3 * flat})
+    scenes = scenes_of(chosen)
+    pose = rotation, position = scenes.rotation[0], scenes.translation[0]
+    image, rng = image_of(scenes), np.random.default_rng(1)
+    pixels = rng.permutation(np.argwhere(np.abs(np.gradient(image)).max(axis=0) > 3))[:40]
+    expected = np.full(len(pixels), LEVELS[0])
+    for number in [-1] if flat else range(len(CUBE)):
+        level, x, y = traced(
+            shown, (160, 120, 150.0, 79.5, 59.5), pose, 9,
+            occluded_charuco if flat else None, only=number)
+        normal, point = rotation[:, 2], position
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (0.045 + 0.02 / 6)
+        if not flat:
+            axes = rotation @ turned(CUBE[number])
+            normal = axes[:, 2]
+            point = rotation @ [CUBE[number][f"{c}_m"] for c in "xyz"] + position
+            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.02 * 8 / 6
+            depths = (corners @ axes[:, :2].T + point)[:, 2]
+        else:
+            depths = (corners @ rotation[:, :2].T + point)[:, 2]
+        for k, (v, u) in enumerate(pixels):
+            ray = np.array([(u - 79.5) / 150, (v - 59.5) / 150, 1.0])
+            inverse = (normal @ ray) / (normal @ point)
+            inverse = np.clip(inverse, 1 / depths.max(), 1 / depths.min())
+            sigma = 150 * 0.020 * abs(1 / 0.16 - inverse) / 4
+            across, down = (  # the shares of the spread of each ray in the pixel
+                ndtr((at + 0.5) / sigma) - ndtr((at - 0.5) / sigma)
+                for at in (x[0] * 150 + 79.5 - u, y[:, 0] * 150 + 59.5 - v)
+            )
+            expected[k] += down @ level @ across / 81
+    off = np.abs(image[tuple(pixels.T)] - expected)
+    assert np.sqrt((off**2).mean()) < 1  # of the rays: a sharp edge along their rows is off by 12
+
+
+def test_a_marker_in_one_plane_of_several_is_blurred_and_moved_as_one_alone():
+    exposed = {"exposure_s": 0.01, "row_time_s": 1e-4, "velocity_x_m_s": 0.6,
+               "velocity_z_m_s": -0.5, "aperture_mm": 10.0, "focus_distance_m": 0.2,
+               "sharpening": 0.5}
+    levels = {"background": LEVELS[0], "black": LEVELS[1], "white": LEVELS[2]}
+    single = Pipeline.from_dict({
+        "camera": {"width_px": 160, "height_px": 120, "fx_px": 150, "fy_px": 150},
+        "marker": {"dictionary": "DICT_4X4_50", "marker_id": 7, "size_m": 0.04},
+        "pose": {"distance_m": 0.15, "tilt_deg": 0.0}, "scene": exposed | levels,
+    })
+    raised = pipeline([marker(7, 0, 0, 0.05)], 0.0, pose={"distance_m": 0.2}, scene=exposed)
+    np.testing.assert_allclose(
+        image_of(scenes_of(raised)), image_of(scenes_of(single)), atol=1e-3  # another quadrature
+    )
 
 
 def charuco_level(points):

@@ -115,7 +115,7 @@ def test_the_solver_finds_the_pose_of_perfect_corners():
     scenes = build_scenes(scene_values(pipeline, [np.arange(3)]), 3)
     found = build(estimators(pipeline)[0])(Detections.of_markers(
         scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
-        [scenes.markers[0]] * 3, [], np.zeros((3, 2), dtype=np.int64),
+        [scenes.target(0)] * 3, [], np.zeros((3, 2), dtype=np.int64),
     ))
     np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
     np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)

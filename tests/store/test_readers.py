@@ -125,5 +125,5 @@ def test_blocks_that_were_swapped_with_their_receipts_are_found(pipeline, tmp_pa
         swap(url, name)
     found = verify(str(url), 0)
     assert {damage.block for damage in found.damage} == {0, 1}
-    with pytest.raises(StoreError, match=r"block 0 has the receipt of block 1.*verify --repair"):
+    with pytest.raises(StoreError, match=r"receipt of block 0 is damaged.*verify --repair"):
         status(str(url))

@@ -1,0 +1,263 @@
+"""The error of one detection: covariance, bias and probability of a flip at an estimated pose."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from sweep.analysis.error_model_fit import FRONTAL_DEG, differences, focal_size_of, hat_basis
+from sweep.analysis.poses import bearing_of, sight_rotation, viewing_angle_of
+from sweep.errors import DatasetError
+from sweep.measure.flags import EstimateStatus, Flipped
+from sweep.messages import to_json
+from sweep.model.pose import rotation_of_vector, vector_of_rotation
+from sweep.store.lifecycle import open_dataset
+from sweep.typing import Floats, Masks
+
+# `sweep.analysis.error_models` is of the truth's conditions and one error at a time, without flips:
+# what a plan needs. Here conditions are those of the estimate, which is all that a user has, and
+# the six errors go together, in a frame in which they do so in one way: z along the line of sight,
+# x in the direction in which the estimated marker is tilted.
+
+KNOTS = (7, 6, 6)
+"""Knots of ln(side), of the viewing angle, and of the ambiguity's logarithm."""
+
+MIN_POSES = 2000
+"""Solved poses from which on a model is made."""
+
+MIN_AT_KNOT = 25.0
+"""Poses (sum of hat functions) at each knot that is used, below which nothing is known there."""
+
+ROUNDS = 6
+"""Rounds in which covariances at knots are fitted to what the last ones leave unexplained."""
+
+SCALE_OF_RIDGE = 1.0
+"""Penalty on differences between neighbouring knots of the flips, in poses."""
+
+
+@dataclass(frozen=True)
+class DetectionModel:
+    """Errors of one detection at its estimated pose; `error_model` makes it.
+
+    Attributes
+    ----------
+    focal_size_px_m
+        fx times the side of the square, px m.
+    side_knots, angle_knots, ambiguity_knots
+        Knots of ln(side, px), viewing angle (degrees) and ln(ambiguity).
+    bias
+        Mean errors (knots, 6): position over the range, and rotation vector (rad).
+    log_covariance
+        Matrix logarithms (knots, 6, 6) of their covariances.
+    poses
+        Solved poses at each knot (knots,).
+    flips
+        Coefficients (knots of all three,) of the logarithm of the odds of a flip.
+    max_bearing_deg
+        Largest angle to the optical axis that was seen.
+    """
+
+    focal_size_px_m: float
+    side_knots: Floats
+    angle_knots: Floats
+    ambiguity_knots: Floats
+    bias: Floats
+    log_covariance: Floats
+    poses: Floats
+    flips: Floats
+    max_bearing_deg: float
+
+    def at(
+        self, rvec: ArrayLike, tvec_m: ArrayLike, ambiguity: ArrayLike | None = None
+    ) -> xr.Dataset:
+        """Return covariance, bias and probability of a flip of estimated poses.
+
+        Parameters
+        ----------
+        rvec, tvec_m
+            Estimated rotation vectors and positions (n, 3).
+        ambiguity
+            Reprojection error of the chosen solution over that of the other one (n,), both of
+            `cv2.solvePnPGeneric`; without it the flip's probability is that of the middle one.
+
+        Returns
+        -------
+        xr.Dataset
+            ``covariance`` (pose, row, column) and ``bias`` (pose, row) in the order x, y, z (m),
+            rotation about x, y, z (rad), along and about the camera's axes: subtract the bias from
+            the position, and turn back by it, before the covariance describes what is left, if the
+            pose is not flipped. ``flip_probability``; ``known``: False, and all others NaN, where
+            the simulation has too few poses.
+        """
+        rvec, tvec = (np.atleast_2d(np.asarray(each, dtype=np.float64)) for each in (rvec, tvec_m))
+        frame, at = _conditions(rvec, tvec, self.focal_size_px_m)
+        basis = hat_basis(at, [self.side_knots, self.angle_knots])
+        knots = np.stack([(each[0], each[-1]) for each in (self.side_knots, self.angle_knots)])
+        known = ((knots[:, 0] <= at) & (at <= knots[:, 1])).all(axis=1)
+        known &= bearing_of(tvec) <= self.max_bearing_deg
+        known &= ((basis > 0) <= (self.poses >= MIN_AT_KNOT)).all(axis=1)
+        turn = np.zeros((len(tvec), 6, 6))
+        turn[:, :3, :3] = frame * np.linalg.norm(tvec, axis=1)[:, None, None]
+        turn[:, 3:, 3:] = frame
+        covariance = turn @ _of_symmetric(
+            np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
+        bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
+        middle = math.exp(float(np.median(self.ambiguity_knots)))
+        ratio = np.broadcast_to(
+            np.asarray(middle if ambiguity is None else ambiguity, dtype=np.float64), len(tvec))
+        odds = _flip_basis(at, ratio, self.flip_knots) @ self.flips
+        unknown = ~known
+        for values in (covariance, bias, odds):
+            values[unknown] = np.nan
+        return xr.Dataset({
+            "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
+            "bias": (("pose", "row"), bias, {"units": "m, radian"}),
+            "flip_probability": ("pose", 1.0 / (1.0 + np.exp(-odds)), {"units": "1"}),
+            "known": ("pose", known)})
+
+    @property
+    def flip_knots(self) -> list[Floats]:
+        """Knots of ambiguity, side and viewing angle of the flips."""
+        return [self.ambiguity_knots, self.side_knots[::3], self.angle_knots[[0, 2, 5]]]
+
+    def to_json(self) -> str:
+        """Return it as a JSON object: its attributes."""
+        return to_json(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> DetectionModel:
+        """Return the model of `to_json`."""
+        values: dict[str, Any] = {
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in json.loads(text).items()}
+        return cls(**values)
+
+
+def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
+    """Return a model of one detection's error: `sweep.error_model`."""
+    results = store if isinstance(store, xr.Dataset) else open_dataset(os.fspath(store))
+    errors, rvec, tvec, ratio, flipped = estimated(results)
+    if len(tvec) < MIN_POSES:
+        raise DatasetError(f"{len(tvec):,} solved poses; a model of one detection needs "
+                           f"{MIN_POSES:,} or more: more trials")
+    focal_size = float(focal_size_of(results).mean())
+    _, at = _conditions(rvec, tvec, focal_size)
+    side, angle = (np.quantile(at[:, k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
+    angle[0] = 0.0 if angle[0] < FRONTAL_DEG else angle[0]
+    right = ~flipped
+    basis, errors = hat_basis(at[right], [side, angle]), errors[right]
+    poses = basis.sum(axis=0)
+
+    def means(values: Floats) -> Floats:
+        """Return the means of values (n, ...) at the knots; those of few poses are held back."""
+        flat = values.reshape(len(values), -1)
+        near = (basis.T @ flat + flat.mean(axis=0)) / (poses + 1.0)[:, None]
+        return np.asarray(near.reshape(-1, *values.shape[1:]))
+
+    log_covariance = np.log(means((errors - basis @ means(errors)) ** 2))[..., None] * np.eye(6)
+    for _ in range(ROUNDS):
+        spread = np.exp(0.5 * basis @ np.diagonal(log_covariance, axis1=1, axis2=2))
+        bias = np.stack([
+            np.linalg.solve((basis.T / sd**2) @ basis + np.eye(len(poses)) * (1e-3 / sd**2).mean(),
+                            (basis.T / sd**2) @ error)
+            for error, sd in zip(errors.T, spread.T, strict=True)], axis=-1)
+        whitened = np.einsum("nij,nj->ni", _of_symmetric(
+            -0.5 * np.einsum("nk,kij->nij", basis, log_covariance), np.exp), errors - basis @ bias)
+        root = _of_symmetric(0.5 * log_covariance, np.exp)
+        log_covariance = _of_symmetric(
+            root @ means(whitened[:, :, None] * whitened[:, None, :]) @ root, np.log)
+    # Inverses of covariances of n poses are too large by n / (n - 7) on average (Anderson, "An
+    # introduction to multivariate statistical analysis", 2003, section 7.7), and the means' errors
+    # add 1 / n.
+    wider = np.log((poses + 1.0) / np.maximum(poses - 7.0, 1.0))
+    log_covariance = log_covariance + wider[:, None, None] * np.eye(6)
+    ambiguity = np.quantile(np.log(ratio[ratio > 0]), np.linspace(0.005, 0.995, KNOTS[2]))
+    model = DetectionModel(
+        focal_size, side, angle, ambiguity, bias, log_covariance, poses, np.zeros(0),
+        float(bearing_of(tvec).max()))
+    return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
+
+
+def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks]:
+    """Return errors (n, 6) in the frame of each estimate, its pose, its ambiguity, and the flips.
+
+    Errors of positions are over the range. Only solved poses.
+
+    Raises
+    ------
+    DatasetError
+        If there are several settings or solvers, or other variables are missing.
+    """
+    names = ("true_rvec", "true_tvec_m", "rotation_error_rad", "translation_error_m",
+             "reprojection_error_px", "alternative_reprojection_error_px", "flipped", "estimate")
+    if missing := [name for name in names if name not in results]:
+        raise DatasetError(f"no variable {missing[0]}: expected a run that solves poses")
+    scene = results["true_tvec_m"].dims
+    if several := [f"{name} ({results.sizes[name]})" for name in results["estimate"].dims
+                   if name not in scene and results.sizes[name] > 1]:
+        raise DatasetError(f"several settings: {', '.join(map(str, several))}: choose one with "
+                           "results.isel(...)")
+    others = [dim for dim in results["estimate"].dims if dim not in scene]
+    table = results[list(names)].isel(dict.fromkeys(others, 0), drop=True).load()
+    used = np.ravel(table["estimate"] == EstimateStatus.solved)
+    rvec, tvec, rotation, position = (
+        table[name].transpose(*(dim for dim in scene if dim != "xyz"), "xyz").values.reshape(
+            -1, 3)[used].astype(np.float64) for name in names[:4])
+    chosen, other, flipped = (table[name].transpose(
+        *(dim for dim in scene if dim != "xyz")).values.ravel()[used] for name in names[4:7])
+    estimate = tvec + position
+    turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
+    frame, _ = _conditions(turned, estimate, 1.0)
+    errors = np.concatenate([
+        np.einsum("nji,nj->ni", frame, position) / np.linalg.norm(estimate, axis=1)[:, None],
+        np.einsum("nji,nj->ni", frame, rotation)], axis=1)
+    ratio = np.where(np.isfinite(other) & (other > 0), chosen / other, 0.0)
+    return errors, turned, estimate, ratio, flipped == Flipped.flipped
+
+
+def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> tuple[Floats, Floats]:
+    """Return the frames (n, 3, 3) of estimates, and ln(side) and viewing angle (n, 2)."""
+    sight = sight_rotation(tvec)
+    normal = np.einsum("nji,nj->ni", sight, rotation_of_vector(rvec)[..., 2])
+    length = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-12)
+    cosine, sine = normal[:, 0] / length, normal[:, 1] / length
+    nothing, one = np.zeros_like(cosine), np.ones_like(cosine)
+    about = np.stack([np.stack(row, axis=-1) for row in (
+        (cosine, -sine, nothing), (sine, cosine, nothing), (nothing, nothing, one))], axis=-2)
+    return sight @ about, np.stack(
+        [np.log(focal_size / tvec[:, 2]), viewing_angle_of(rvec, tvec)], axis=-1)
+
+
+def _of_symmetric(matrices: Floats, function: Callable[[Floats], Floats]) -> Floats:
+    """Return a function of symmetric matrices (n, m, m), such as their exponentials."""
+    values, vectors = np.linalg.eigh(matrices)
+    return np.asarray((vectors * function(values)[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+def _flip_basis(at: Floats, ratio: Floats, knots: Sequence[Floats]) -> Floats:
+    """Return hat functions (n, knots) of ambiguity, side and viewing angle."""
+    with np.errstate(divide="ignore"):
+        return hat_basis(np.column_stack([np.log(ratio), at]), knots)
+
+
+def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:
+    """Return the coefficients of a logistic regression, by iterated weighted least squares."""
+    basis = _flip_basis(at, ratio, knots)
+    ridge = SCALE_OF_RIDGE * differences(knots) + 1e-3 * np.eye(basis.shape[1])
+    share = (flipped.sum() + 0.5) / (len(flipped) + 1.0)
+    found = np.full(basis.shape[1], math.log(share / (1.0 - share)))
+    for _ in range(30):
+        chance = 1.0 / (1.0 + np.exp(-(basis @ found)))
+        slope = basis.T @ (flipped - chance) - ridge @ (found - found.mean())
+        curve = (basis * (chance * (1.0 - chance))[:, None]).T @ basis + ridge
+        found = found + np.clip(np.linalg.solve(curve, slope), -2.0, 2.0)
+    return found

@@ -1,0 +1,258 @@
+"""The variables of the dataset: how each follows from the results of its stage.
+
+To add a variable, add its record to :data:`sweep.experiment.schema.SCHEMA` and its function to
+the table of its stage below; a variable with one but not the other is refused on import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.evaluation.search import SearchResult
+from sweep.experiment.parameters import Stage
+from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA, VARIABLES
+from sweep.measure.bound import Bounds
+from sweep.measure.classify import TargetScenes
+from sweep.measure.estimation import (
+    Estimates,
+    PoseError,
+    pose_error,
+    rotation_difference,
+    squared_deviations,
+)
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.model.camera import Column
+from sweep.model.extent import areas_px
+from sweep.model.polygon import signed_areas
+from sweep.model.pose import vector_of_rotation, viewing_angle
+from sweep.model.scene import Scenes
+from sweep.typing import Floats, Masks
+
+
+@dataclass(frozen=True, slots=True)
+class SceneResults:
+    """N scenes, their parameters, their targets and their accuracy bounds."""
+
+    scenes: Scenes
+    values: Mapping[str, Column]
+    targets: TargetScenes
+    bounds: Bounds
+
+
+@dataclass(frozen=True, slots=True)
+class EstimationResults:
+    """Estimates of one configuration for n scenes, those in which the target was detected.
+
+    Attributes
+    ----------
+    estimates, error
+        What the estimator returned, and its errors: n of each.
+    true_rotation, true_translation
+        (n, 3, 3) and (n, 3) in metres, target to camera.
+    """
+
+    estimates: Estimates
+    error: PoseError
+    true_rotation: Floats
+    true_translation: Floats
+
+
+def compared(
+    estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
+) -> EstimationResults:
+    """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
+    rotation, translation = scenes.rotation[rows], scenes.translation[rows]
+    error = pose_error(estimates.rotation, estimates.translation, rotation, translation)
+    return EstimationResults(estimates, error, rotation, translation)
+
+
+def target_areas_px(scenes: Scenes, targets: TargetScenes) -> Floats:
+    """Return the total area (N,) of the squares of each target that are seen, px².
+
+    Of a marker alone the area of its square, seen or not.
+    """
+    if targets.are_markers:
+        return areas_px(scenes)
+    on_board = targets.marker_id >= 0
+    unseen = ~on_board | (targets.flags == DetectionStatus.not_visible)
+    seen = np.where(unseen[..., None, None], 0.0, targets.corners_px)
+    area = np.abs(signed_areas(seen.reshape(-1, 4, 2))).reshape(unseen.shape)
+    sizes = on_board.sum(axis=1)
+    total = np.full(len(area), np.nan)
+    for size in np.unique(sizes):  # the order of a sum is that of its length: not of other boards'
+        rows = sizes == size
+        total[rows] = np.nansum(area[rows, :size], axis=1)
+    return np.where(unseen.all(axis=1), np.nan, total)
+
+
+def _centre_px(results: SceneResults) -> Floats:
+    scenes = results.scenes
+    return np.asarray(scenes.cameras.project(scenes.translation[:, None])[:, 0])
+
+
+def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
+    solved = results.estimates.status == EstimateStatus.solved
+    flipped = np.where(results.error.flipped, Flipped.flipped, Flipped.not_flipped)
+    return np.where(solved, flipped, Flipped.no_estimate).astype(np.uint8)
+
+
+def _alternative_angle_deg(results: EstimationResults) -> Floats:
+    other = rotation_difference(results.estimates.alternative_rotation, results.true_rotation)
+    return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
+
+
+def _marker_flags(results: SearchResult) -> NDArray[np.uint8]:
+    """Return the flags of the markers (N, M): the target's where it was not searched."""
+    searched = results.flags == results.found.flags
+    known = searched[:, None] | (results.targets.flags == DetectionStatus.not_on_board)
+    return np.where(known, results.found.marker_flags, results.flags[:, None])
+
+
+def _marker_errors_px(results: SearchResult) -> Floats:
+    errors = results.found.marker_corners - results.targets.corners_px
+    errors[_marker_flags(results) != DetectionStatus.detected] = np.nan
+    return errors
+
+
+def _chessboard_errors_px(results: SearchResult) -> Floats:
+    errors = results.found.chessboard_px - results.targets.chessboard_px
+    errors[results.flags != DetectionStatus.detected] = np.nan
+    return errors
+
+
+GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
+    "true_rvec": lambda scenes: vector_of_rotation(scenes.rotation),
+    "true_tvec_m": lambda scenes: scenes.translation,
+    "viewing_angle_deg": lambda scenes: np.degrees(
+        viewing_angle(scenes.rotation, scenes.translation)
+    ),
+}
+"""Variable that follows from camera and pose -> its values (N, ...)."""
+
+
+def _of_geometry(
+    function: Callable[[Scenes], NDArray[Any]]
+) -> Callable[[SceneResults], NDArray[Any]]:
+    return lambda results: function(results.scenes)
+
+
+SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
+    **{name: _of_geometry(function) for name, function in GEOMETRY.items()},
+    "marker_area_px": lambda results: target_areas_px(results.scenes, results.targets),
+    "board_marker_id": lambda results: np.where(
+        results.targets.marker_id < 0, np.nan, results.targets.marker_id
+    ),
+    "bound": lambda results: results.bounds.status,
+    "bound_std": lambda results: results.bounds.std,
+    "bound_kappa": lambda results: results.bounds.kappa,
+    "mirror_distance": lambda results: results.bounds.mirror_distance,
+    # Of photographs, whose poses are not drawn but found.
+    "side_px": lambda results: (
+        results.scenes.cameras.view[:, 0] * results.scenes.size_m / results.scenes.translation[:, 2]
+    ),
+    "distance_m": lambda results: results.scenes.translation[:, 2],
+    "tilt_deg": lambda results: results.values["resolved_tilt_deg"].values,
+    "image_x_px": lambda results: _centre_px(results)[:, 0],
+    "image_y_px": lambda results: _centre_px(results)[:, 1],
+    "truth": lambda results: results.values["truth"].values,
+    "truth_std": lambda results: results.values["truth_std"].values,
+}
+"""Variable of the scene -> its values (N, ...)."""
+
+DETECTION: dict[str, Callable[[SearchResult], NDArray[Any]]] = {
+    "detection": lambda results: results.flags,
+    "corner_error_px": lambda results: (
+        results.found.marker_corners - results.targets.corners_px
+    )[:, 0],
+    "marker_detection": _marker_flags,
+    "marker_corner_error_px": _marker_errors_px,
+    "chessboard_corner_error_px": _chessboard_errors_px,
+}
+"""Variable of the detection -> its values (N, ...)."""
+
+ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
+    "estimate": lambda results: results.estimates.status,
+    "translation_error_m": lambda results: results.error.translation_m,
+    "rotation_error_rad": lambda results: results.error.rotation_rad,
+    "rotation_error_deg": lambda results: np.degrees(results.error.rotation_angle_rad),
+    "normal_error_deg": lambda results: np.degrees(results.error.normal_angle_rad),
+    "reprojection_error_px": lambda results: results.estimates.reprojection_px,
+    "alternative_rotation_error_deg": _alternative_angle_deg,
+    "alternative_reprojection_error_px": (
+        lambda results: results.estimates.alternative_reprojection_px
+    ),
+    "predicted_std": lambda results: np.sqrt(
+        np.diagonal(results.estimates.covariance, axis1=1, axis2=2)
+    ),
+    "nees": lambda results: squared_deviations(
+        results.error.rotation_rad, results.error.translation_m, results.estimates.covariance
+    ),
+    "residual_variance_ratio": lambda results: results.estimates.residual_ratio,
+    "misfit_px": lambda results: results.estimates.misfit_px,
+    "flipped": _flipped,
+    "point_count": lambda results: results.estimates.point_count,
+}
+"""Variable of the estimation -> its values (n, ...) for the scenes with a detection."""
+
+WITHOUT_DETECTION: dict[str, int] = {
+    "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
+}
+"""Flag variable of the estimation -> its flag for scenes without a detection."""
+
+
+def check_complete(tables: Mapping[Stage, Mapping[str, Any]]) -> None:
+    """Raise TypeError unless each table has exactly the schema's variables of its stage."""
+    for stage, table in tables.items():
+        declared = {
+            variable.name for variable in (*SCHEMA, *BOARD_SCHEMA, *PHOTOGRAPH_SCHEMA)
+            if variable.stage is stage
+        }
+        for name in sorted(declared ^ table.keys()):
+            missing = "no function computes it" if name in declared else "the schema lacks it"
+            raise TypeError(f"variable {name} of stage {stage.name}: {missing}")
+
+
+check_complete({Stage.scene: SCENE, Stage.detection: DETECTION, Stage.estimation: ESTIMATION})
+
+Results = TypeVar("Results")
+
+
+def compute(
+    table: Mapping[str, Callable[[Results], NDArray[Any]]], results: Results,
+    names: Collection[str],
+) -> dict[str, NDArray[Any]]:
+    """Return every variable of a table that is among ``names``."""
+    return {name: function(results) for name, function in table.items() if name in names}
+
+
+def compute_estimation(
+    results: EstimationResults, rows: NDArray[np.intp], needed: Masks, names: Collection[str]
+) -> dict[str, NDArray[Any]]:
+    """Return the estimation variables (N, ...) over all scenes.
+
+    Parameters
+    ----------
+    results
+        Results of the n scenes with a detection.
+    rows
+        (n,) their numbers among the N scenes.
+    needed
+        (N,) scenes whose estimate was asked for; the flags of the others are ``not_run``.
+    names
+        The variables that are wanted.
+    """
+    columns = {}
+    for name, values in compute(ESTIMATION, results, names).items():
+        variable = VARIABLES[name]
+        fill = WITHOUT_DETECTION.get(name, variable.fill)
+        column = np.full((len(needed), *values.shape[1:]), fill, dtype=values.dtype)
+        column[rows] = values
+        if variable.flags is not None:
+            column[~needed] = variable.fill
+        columns[name] = column
+    return columns

@@ -1,0 +1,94 @@
+"""The covariance of one detection describes the errors of others, and knows where it ends."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep.diagnosis.detection import DetectionModel, error_model, estimated
+from sweep.errors import DatasetError
+from sweep.measure.flags import EstimateStatus, Flipped
+from sweep.model.pose import (
+    mirrored,
+    rotation_of_angles,
+    rotation_of_vector,
+    vector_of_rotation,
+)
+
+FOCAL_SIZE = 90.0
+
+
+def drawn(seed, count=6000):
+    """Return a dataset of poses whose errors are normal, grow with 1 / side, and flip when far."""
+    rng = np.random.default_rng(seed)
+    z = np.exp(rng.uniform(0, np.log(4), count))
+    tvec = z[:, None] * np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)), np.ones(count)])
+    rotation = rotation_of_angles(*np.radians([
+        rng.uniform(0, 60, count), rng.uniform(0, 360, count), rng.uniform(0, 360, count)]))
+    side = FOCAL_SIZE / z
+    sd = np.array([2e-4, 2e-4, 1e-3, 2e-3, 2e-3, 1e-3]) * (90 / side)[:, None]
+    error = rng.normal(0, 1, (count, 6)) * sd
+    error[:, 2] += 0.002
+    error[:, 0] += 2.0 * error[:, 3] / 20
+    ratio = rng.uniform(0.02, 1.0, count)
+    flipped = rng.random(count) < 0.5 * ratio**4
+    turn = rotation_of_vector(error[:, 3:])
+    other = mirrored(rotation, tvec) @ rotation.transpose(0, 2, 1)
+    turn = np.where(flipped[:, None, None], other, turn)
+    dims = ("trial", "xyz")
+    return xr.Dataset({
+        "true_rvec": (dims, vector_of_rotation(rotation)), "true_tvec_m": (dims, tvec),
+        "rotation_error_rad": (dims, vector_of_rotation(turn)),
+        "translation_error_m": (dims, error[:, :3] * np.linalg.norm(tvec, axis=1)[:, None]),
+        "reprojection_error_px": ("trial", ratio),
+        "alternative_reprojection_error_px": ("trial", np.ones(count)),
+        "flipped": ("trial", np.where(
+            flipped, Flipped.flipped, Flipped.not_flipped).astype(np.uint8)),
+        "estimate": ("trial", np.full(count, EstimateStatus.solved, np.uint8)),
+    }, {"side_px": ("trial", side)})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return error_model(drawn(1))
+
+
+def judged(model, results):
+    """Return squared distances of unflipped poses, and (chance, flipped) of all known ones."""
+    _, rvec, tvec, ratio, flipped = estimated(results)
+    found = model.at(rvec, tvec, ratio)
+    known = found["known"].values
+    error = np.concatenate([results["translation_error_m"], results["rotation_error_rad"]], axis=1)
+    left = (error - found["bias"].values)[known & ~flipped]
+    squares = np.einsum("ni,nij,nj->n", left, np.linalg.inv(
+        found["covariance"].values[known & ~flipped]), left)
+    return squares, found["flip_probability"].values[known], flipped[known]
+
+
+def test_errors_of_other_draws_are_as_large_as_the_covariance_says(model):
+    squares, chance, flipped = judged(model, drawn(2))
+    assert 5.8 < squares.mean() < 6.2
+    for bin_ in np.array_split(np.argsort(chance), 5):
+        expected, spread = chance[bin_].sum(), np.sqrt((chance * (1 - chance))[bin_].sum())
+        assert abs(flipped[bin_].sum() - expected) < 4 * spread + 3
+
+
+def test_outside_what_was_simulated_nothing_is_known(model):
+    frontal = [np.pi, 0.0, 0.0]
+    found = model.at([frontal] * 3, [[0, 0, 2.0], [0, 0, 9.0], [3.0, 0, 2.0]], 0.1)
+    assert found["known"].values.tolist() == [True, False, False]
+    assert np.isnan(found["covariance"].values[1:]).all()
+    assert np.isnan(found["flip_probability"].values[1:]).all()
+
+
+def test_model_is_the_same_from_its_json(model):
+    other = DetectionModel.from_json(model.to_json())
+    pose = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3)
+    assert model.at(*pose).equals(other.at(*pose))
+
+
+def test_few_poses_and_several_settings_are_refused():
+    with pytest.raises(DatasetError, match="more trials"):
+        error_model(drawn(1, 100))
+    two = xr.concat([drawn(1, 100)[["estimate"]]] * 2, "solver")
+    with pytest.raises(DatasetError, match="solver"):
+        error_model(drawn(1, 100).assign(estimate=two["estimate"]))

@@ -1,0 +1,125 @@
+"""What `sweep diagnose` says of rows, and of rows that cannot be."""
+
+import json
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.cli import main
+from sweep.diagnosis.inference import next_measurement, rank
+from sweep.diagnosis.observations import read_observations
+from sweep.model.calibration import Calibration
+
+CAMERA = Calibration(1280, 720, 900.0, 900.0, 639.5, 359.5, (), (), ())
+AWAY = np.array([0.5, 1.0, 2.0])
+FLAT = {"tvec_x_m": [0.0, 0.2, -0.4], "tvec_y_m": [0.0, 0.0, 0.1], "x_m": [0.0, 0.2, -0.4]}
+
+
+def first(found):
+    return found.numbers["causes"][0]["causes"]
+
+
+def test_size_is_told_from_focal_length_off_the_axis():
+    straight = np.linalg.norm([[0, 0, 0.5], [0.2, 0, 1], [-0.4, 0.1, 2]], axis=1)
+    focal = sweep.diagnose({**FLAT, "tvec_z_m": 1.3 * AWAY, "tape_m": straight},
+                           camera=CAMERA, size_m=0.1, compared="range")
+    size = sweep.diagnose(
+        {"tvec_x_m": np.multiply(1.3, FLAT["tvec_x_m"]), "x_m": FLAT["x_m"],
+         "tvec_y_m": np.multiply(1.3, FLAT["tvec_y_m"]), "tvec_z_m": 1.3 * AWAY,
+         "tape_m": straight}, camera=CAMERA, size_m=0.1, compared="range")
+    assert (first(focal), first(size)) == (["focal_length"], ["size"])
+    assert focal.status == size.status == 0
+
+
+def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
+    found = sweep.diagnose({"tvec_z_m": 1.17 * AWAY, "tape_m": AWAY}, size_m=0.1)
+    assert found.status == 3
+    assert {"size", "focal_length"} <= set(found.numbers["cannot_tell"])
+    assert found.numbers["measure_next"]["component"] == "x"
+    assert found.numbers["measure_next"]["difference"] > 2
+    assert "confounded" in found.numbers["sentence"]
+
+
+def test_rows_that_agree_are_not_explained():
+    found = sweep.diagnose({"range_m": AWAY * 1.003, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
+    assert first(found) == ["agree"]
+    assert found.status == 0
+
+
+def test_rows_that_nothing_explains_are_said_to_be():
+    found = sweep.diagnose({"range_m": [0.5, 1.9, 0.9, 3.0], "tape_m": [0.9, 0.5, 1.5, 1.0]})
+    assert "No known cause" in found.numbers["sentence"]
+
+
+def test_mirrored_yaws_are_flips():
+    found = sweep.diagnose({
+        "tvec_x_m": [0, 0.0, 0.0], "tvec_y_m": [0, 0, 0], "tvec_z_m": AWAY, "tape_m": AWAY,
+        "rvec_x": [3.02, 3.02, 3.02], "rvec_y": [0] * 3, "rvec_z": [0.8, -0.8, 0.8],
+        "yaw_deg": [28.7] * 3})
+    assert first(found) == ["flips"]
+
+
+def test_next_measurement_is_where_predictions_differ():
+    rows = read_observations({"range_m": [1.1], "tape_m": [1.0]}, camera=CAMERA, size_m=0.1)
+    found = {each.names: each for each in rank(rows).explanations}
+    scale, offset = found[frozenset({"size"})], found[frozenset({"offset"})]
+    there = next_measurement(rows, scale, offset)
+    assert there.component in {"distance", "z"}
+    assert there.distance_m > 1.5 or there.distance_m < 0.7
+    assert there.difference > 2
+
+
+@pytest.mark.parametrize(("columns", "words"), [
+    ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
+    ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
+    ({"range_m": [1.0, 2.0], "tape_m": [1.0, ""]}, "row 2: expected tape_m"),
+    ({"rang_m": [1.0], "tape_m": [1.0]}, "range_m"),
+    ({"range_m": [1.0], "tape_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m"),
+    ({"range_m": [1.0], "tape_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
+    ({}, "no rows"),
+])
+def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
+    with pytest.raises(sweep.ArgumentError) as error:
+        sweep.diagnose(columns)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_impossible_units_and_missing_uncertainty_are_noted():
+    found = sweep.diagnose({"range_m": [57.0], "tape_m": [0.57]}, camera=CAMERA, size_m=0.1)
+    assert first(found) == ["units"]
+    assert any("side of 1.6 px" in note for note in found.numbers["notes"])
+    assert any("2 mm or 0.5 %" in note for note in found.numbers["notes"])
+
+
+@pytest.mark.parametrize("rows", [[1.25], [1.25, 1.251, 1.249]])
+def test_one_row_or_one_distance_cannot_tell_a_factor_from_an_offset(rows):
+    found = sweep.diagnose({"range_m": rows, "tape_m": [1.13] * len(rows)}, camera=CAMERA,
+                           size_m=0.1, dictionary="DICT_4X4_50")
+    assert {"size", "offset"} <= set(found.numbers["cannot_tell"])
+    assert found.numbers["measure_next"] is not None
+
+
+def test_poses_are_solved_from_corners():
+    corners = {}
+    for k, (x, y) in enumerate([(-0.05, 0.05), (0.05, 0.05), (0.05, -0.05), (-0.05, -0.05)]):
+        corners[f"corner{k}_x_px"] = [639.5 + 900 * x / z for z in AWAY]
+        corners[f"corner{k}_y_px"] = [359.5 - 900 * y / z for z in AWAY]
+    rows = read_observations({**corners, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
+    assert np.allclose(rows.said[:, 2], AWAY, atol=1e-6)
+
+
+def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):
+    path = tmp_path / "rows.csv"
+    path.write_text("range_m,tape_m\n1.8,1.0\n3.6,2.0\n")
+    figure = tmp_path / "residuals.svg"
+    arguments = ["diagnose", str(path), "--set", "dictionary=tagStandard41h12", "-o", str(figure)]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "outer border taken for the detected square (9/5)" in out
+    assert out.rstrip().splitlines()[-1].startswith("It is wrong size")
+    assert figure.read_text().lstrip().startswith("<?xml")
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["causes"][0]["causes"] == ["size"]
+    assert main(["diagnose", str(path), "--set", "sise_m=1"]) == 2

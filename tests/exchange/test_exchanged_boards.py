@@ -1,0 +1,181 @@
+"""Boards exported, answered by a plain OpenCV loop over the folder, and scored as a run is."""
+
+import csv
+import re
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep.errors import PipelineError
+from sweep.evaluation.block import compute_block
+from sweep.exchange.export import export
+from sweep.exchange.score import prepare
+from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+
+TEXT = """
+title = "Exchanged"
+seed = 3
+[camera]
+width_px = 320
+height_px = 240
+fx_px = 300
+[marker]
+size_m = 0.03
+dictionary = "DICT_4X4_50"
+[scene]
+noise_grey = 3
+background = 128
+window = "full"
+[estimator]
+solver = "iterative"
+guarded = false
+[axes]
+tilt_deg = [0, 40]
+distance_m = [0.25, 0.4]
+trial = 2
+"""
+
+BOARDS = {
+    "one plane": '[board]\nkind = "grid"\nrows = 2\ncolumns = 3\ngap_m = 0.01\n',
+    "several planes": """[board]
+kind = "markers"
+[[board.markers]]
+marker_id = 3
+x_m = 0.0
+y_m = 0.0
+[[board.markers]]
+marker_id = 8
+x_m = 0.04
+y_m = 0.0
+z_m = 0.01
+tilt_deg = 20
+[[board.markers]]
+marker_id = 5
+x_m = -0.04
+y_m = 0.0
+size_m = 0.02
+z_m = -0.01
+tilt_deg = -30
+""",
+}
+
+
+def results_of(pipeline):
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    return compute_block(pipeline, Block((0,) * len(lengths), lengths))
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(row, names):
+    return [float(row[name]) for name in names]
+
+
+@pytest.fixture(scope="module", params=BOARDS)
+def exchanged(request, tmp_path_factory):
+    """A folder with images of a board, the answers of the README's script, and the run."""
+    folder = tmp_path_factory.mktemp("boards") / "export"
+    pipeline = Pipeline.from_text(TEXT + BOARDS[request.param], name="exchanged")
+    export(pipeline, folder)
+    script = re.search(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)[1]
+    subprocess.run([sys.executable, "-c", script], cwd=folder, check=True)
+    return folder, results_of(pipeline)
+
+
+def test_detections_of_a_plain_opencv_loop_are_scored_as_a_run(exchanged):
+    folder, ran = exchanged
+    scored = results_of(prepare(folder, [folder / "detections.csv"]).pipeline)
+    assert ran.keys() == scored.keys()
+    for name, values in ran.items():
+        np.testing.assert_array_equal(values, scored[name], err_msg=name)
+    assert (ran["marker_detection"] == DetectionStatus.detected).sum() > 10
+    assert (ran["estimate"] == EstimateStatus.solved).all()
+
+
+@pytest.mark.parametrize("form", ["beside the corners", "alone"])
+def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, form, tmp_path):
+    folder, ran = exchanged
+    places = {}
+    for row in rows_of(folder / "truth.csv"):
+        places[row["image"], row["id"]] = row
+    found = {}
+    for row in rows_of(folder / "detections.csv"):
+        found.setdefault(row["image"], []).append(row)
+    corner_names = [f"{axis}{k}" for k in range(4) for axis in "xy"]
+    place_names = [f"{axis}{k}_m" for k in range(4) for axis in "XYZ"]
+    camera = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
+    answers = []
+    for image, rows in found.items():
+        known = [row for row in rows if (image, row["id"]) in places]
+        objects = [numbers(places[image, row["id"]], place_names) for row in known]
+        pixels = [numbers(row, corner_names) for row in known]
+        _, rvec, tvec = cv2.solvePnP(
+            np.reshape(objects, (-1, 3)), np.reshape(pixels, (-1, 2)), camera, None,
+            flags=cv2.SOLVEPNP_ITERATIVE)
+        pose = dict(zip(("rx", "ry", "rz", "tx", "ty", "tz"),
+                        map(repr, [*rvec.ravel().tolist(), *tvec.ravel().tolist()]), strict=True))
+        answers.append({"image": image, "id": "", **dict.fromkeys(corner_names, ""), **pose})
+        if form == "beside the corners":
+            answers += [row | dict.fromkeys(pose, "") for row in rows]
+    with (tmp_path / "poses.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(answers[0]))
+        table.writeheader()
+        table.writerows(answers)
+    ready = prepare(folder, [tmp_path / "poses.csv"], names=[form.replace(" ", "-")])
+    assert ready.pipeline.fixed["solver"] == "recorded"
+    scored = results_of(ready.pipeline)
+    assert (scored["estimate"] == EstimateStatus.solved).all()
+    # The places in OpenCV's own frame, by a rotation vector: rounding, and the last step.
+    for name in ("translation_error_m", "rotation_error_rad"):
+        np.testing.assert_allclose(scored[name], ran[name], atol=2e-7, err_msg=name)
+    if form == "beside the corners":
+        np.testing.assert_array_equal(
+            scored["marker_corner_error_px"], ran["marker_corner_error_px"])
+    else:  # the corners are the image of the pose
+        assert np.nanmax(scored["reprojection_error_px"]) < 1e-9
+
+
+def test_conventions_of_answers_on_boards_are_hinted_at(exchanged, tmp_path):
+    folder, _ = exchanged
+    rows = rows_of(folder / "detections.csv")
+    for row in rows:
+        for k in range(4):
+            row[f"x{k}"], row[f"y{k}"] = float(row[f"x{k}"]) + 0.5, float(row[f"y{k}"]) + 0.5
+    with (tmp_path / "shifted.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    lines = prepare(folder, [tmp_path / "shifted.csv"]).lines
+    assert any("pass --pixel-center 0.5" in line for line in lines)
+
+
+def test_truth_of_a_charuco_has_its_chessboard(tmp_path):
+    board = ('[board]\nkind = "charuco"\nsquares_x = 4\nsquares_y = 3\n'
+             'square_m = 0.035\n')
+    settings = ['points="chessboard"', 'solver="iterative"', "size_m=0.025", "trial=1"]
+    pipeline = Pipeline.from_text(TEXT + board, settings, name="charuco")
+    export(pipeline, tmp_path / "out")
+    rows = rows_of(tmp_path / "out/truth_chessboard.csv")
+    assert len(rows) == 4 * 6
+    (truth, *_) = rows_of(tmp_path / "out/truth.csv")
+    rvec, tvec = (np.array(numbers(truth, [f"{kind}{axis}" for axis in "xyz"])) for kind in "rt")
+    camera = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
+    points = np.array([numbers(row, ("X_m", "Y_m", "Z_m")) for row in rows[:6]])
+    expected = cv2.projectPoints(points, rvec, tvec, camera, None)[0][:, 0]
+    np.testing.assert_allclose(
+        [numbers(row, ("x", "y")) for row in rows[:6]], expected, atol=1e-9)
+    with xr.open_dataset(tmp_path / "out/truth.nc", engine="scipy") as dataset:
+        assert dataset["true_corners_px"].dims[-3:] == ("marker", "corner", "xy")
+    path = tmp_path / "none.csv"
+    path.write_text("")
+    with pytest.raises(PipelineError, match=r"markers beside recorded detections"):
+        prepare(tmp_path / "out", [path])

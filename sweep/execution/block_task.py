@@ -21,7 +21,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import LOST, ReusedCells, Source, match, read_cells
-from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.plugins import lacking_plugins
@@ -103,7 +103,8 @@ def with_scenes(
     taken: Values = {}
     for variable in variables:
         names = variable.dimensions(pipeline)
-        along = dict(zip((axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
+        along = dict(zip(
+            (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
         mask = scenes.reshape([along.get(name, 1) for name in names])
         other = variable.not_needed if others is None else others[variable.name]
         taken[variable.name] = np.where(mask, other, values[variable.name]).astype(variable.dtype)

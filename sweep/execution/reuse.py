@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError
 from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, scene_axes, scene_values
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import alike
-from sweep.experiment.schema import VARIABLES, Variable, variables_of
+from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
 from sweep.store.blocks import RunStore, check_whole, receipts
@@ -220,7 +220,8 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     ]
     present = {variable.name for variable in store.variables}
     faults += [
-        f"{variable.name}: not a variable of the store" for variable in variables_of(pipeline)
+        f"{variable.name}: not a variable of the store"
+        for variable in pipeline.experiment.variables
         if variable.name not in present and not _follows(variable)
     ]
     pipeline, old = alike(pipeline, old)
@@ -303,7 +304,7 @@ class ReusedCells:
 
 def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
     """Read a block's reusable cells from old stores; of several, the first that has a cell."""
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     cuts = {
         axis.name: slice(start, stop)
         for axis, start, stop in zip(axes, block.starts, block.stops, strict=True)
@@ -319,7 +320,7 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
             [shape[n] for n in v.dimensions(pipeline) if n in shape] + list(v.inner_shape),
             v.fill, dtype=v.dtype,
         )
-        for v in variables_of(pipeline)
+        for v in pipeline.experiment.variables
     }
     available = np.zeros([shape[name] for name in order], dtype=bool)
     processors: set[str] = set()
@@ -376,7 +377,7 @@ def _read_from(
     ready, numbers = _committed_cells(source, order, positions, indices)
     if not ready.any():
         return set()
-    variables = variables_of(pipeline)
+    variables = pipeline.experiment.variables
     present = {variable.name for variable in source.store.variables}
     old = {
         v.name: _read(source, pipeline, v, indices) for v in variables if v.name in present
@@ -434,10 +435,10 @@ def _computed(
         return {}
     along = [
         cuts[axis.name].start + positions[axis.name].astype(np.intp)
-        for axis in scene_axes(pipeline)
+        for axis in pipeline.experiment.scene_axes
     ]
     indices = [grid.ravel() for grid in np.meshgrid(*along, indexing="ij")]
-    values = scene_values(pipeline, indices)
+    values = pipeline.experiment.scene_values(indices)
     scenes = build_scenes(values, computed.size)
     columns = {
         variable.name: values[variable.drawn_as].broadcast(computed.size) if variable.drawn_as
@@ -464,7 +465,7 @@ def _committed_cells(
     blocks = store.blocks
     along: list[NDArray[np.int64]] = []
     names = []
-    for axis in scene_axes(store.pipeline):
+    for axis in store.pipeline.experiment.scene_axes:
         if axis.name in source.pinned:
             names.append(PINNED)
             along.append(np.array([source.pinned[axis.name]]))

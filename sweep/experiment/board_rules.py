@@ -192,7 +192,7 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
                        "delete it")
     reading.refuse_values(
         "renderer", f"{RENDERERS}, for boards", lambda name: not is_renderer(name))
-    if any(map(is_recording, reading.values("detector"))):
+    if any(map(is_recording, reading.values_of("detector"))):
         for name, value, expected in (
             ("points", "chessboard",
              "markers beside recorded detections, which have no corners of chessboards"),

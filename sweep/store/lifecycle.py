@@ -23,7 +23,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
-from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
 from sweep.experiment.sampling import texts_in
 from sweep.experiment.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
@@ -242,7 +242,7 @@ def store_of(
             files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
         blocks = Blocks(
-            tuple(len(axis) for axis in scene_axes(pipeline)), tuple(metadata["block"]))
+            tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
         return RunStore(url, open_group(storage, mode), pipeline, metadata["run_id"], blocks)
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None

@@ -14,7 +14,6 @@ from sweep.cli import main
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 
@@ -113,8 +112,8 @@ def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
         "side_px": [20.0, 50.0],
     }
     grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
-    lengths = [len(axis) for axis in scene_axes(grid)]
-    values = scene_values(grid, [index.ravel() for index in np.indices(lengths)])
+    lengths = [len(axis) for axis in grid.experiment.scene_axes]
+    values = grid.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
     columns = [values[name].values for name in VIEW_PARAMETERS]
     fx, fy, _, _ = intrinsics(*columns)
     for k, chosen in enumerate(itertools.product(*axes.values())):
@@ -123,7 +122,7 @@ def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
         alone = Pipeline.from_dict(
             {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
         )
-        distance = scene_values(alone, [])["distance_m"].values
+        distance = alone.experiment.scene_values([])["distance_m"].values
         assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
 
 

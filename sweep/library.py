@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from sweep.execution import runner as runner
     from sweep.execution import status as status
     from sweep.experiment import cell_selection as cell_selection
-    from sweep.experiment import facts as facts
     from sweep.experiment import parameters as parameters
     from sweep.experiment import pipeline as pipeline
     from sweep.experiment import sampling as sampling
@@ -87,7 +86,6 @@ _MODULES = (
     "sweep.photographs.prepare",
     "sweep.photographs.twins",
     "sweep.experiment.cell_selection",
-    "sweep.experiment.facts",
     "sweep.experiment.parameters",
     "sweep.experiment.pipeline",
     "sweep.experiment.sampling",

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import sweep
 from sweep.analysis import flip_rate
-from sweep.report.charts import COLOURS, MATPLOTLIB_STYLE, SHAPES
+from sweep.report.figure import COLOURS, MATPLOTLIB_STYLE, SHAPES
 
 SIDE_M = 0.08
 TARGETS: dict[str, dict[str, Any]] = {

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import sweep
 from sweep.analysis import efficiency, error_statistics
-from sweep.report.charts import COLOURS, MATPLOTLIB_STYLE
+from sweep.report.figure import COLOURS, MATPLOTLIB_STYLE
 
 SIDE_M, SPAN_M, GAP_M = 0.016, 0.12, 0.0048
 SERIES: dict[str, dict[int, float]] = {

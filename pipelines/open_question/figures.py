@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from sweep.measure.detectors import DetectorSetting
 from sweep.model.marker import modules
-from sweep.report.charts import COLOURS, FAINT, INK, RULE, STRIP
+from sweep.report.figure import COLOURS, FAINT, INK, RULE, STRIP
 
 BLUE, VERMILION, GREEN, _, SKY, ORANGE, _ = COLOURS
 STYLE = {

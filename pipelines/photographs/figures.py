@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sweep.measure.flags import EstimateStatus
-from sweep.report.charts import COLOURS, FAINT, INK, MATPLOTLIB_STYLE
+from sweep.report.figure import COLOURS, FAINT, INK, MATPLOTLIB_STYLE
 
 WIDTH = 9.0
 """Inches; a point is 1.4 px where the figure is 900 px wide."""

@@ -28,7 +28,6 @@ import sweep
 from sweep.analysis import simulation_gap
 from sweep.experiment.board_rules import read_board
 from sweep.experiment.experiment import scene_plugins
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
 from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
 from sweep.model.extent import marker_boxes
@@ -79,10 +78,10 @@ def plane_images(pipeline: sweep.Pipeline) -> list[NDArray[np.float64]]:
 
     Each is (PLANE_PX, PLANE_PX), and has ``QUIET`` of the marker's side around the marker.
     """
-    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
     indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
     count = len(indices[0])
-    scenes = build_scenes(scene_values(pipeline, indices), count, scene_plugins(pipeline))
+    scenes = build_scenes(pipeline.experiment.scene_values(indices), count, scene_plugins(pipeline))
     boxes = marker_boxes(scenes)
     low = QUIET * PLANE_PX / (1 + 2 * QUIET) - 0.5
     high = PLANE_PX - 1 - low

@@ -17,8 +17,6 @@ import xarray as xr
 from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
 from sweep.analysis.intervals import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
-from sweep.experiment.experiment import shows_boards
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import cf_attributes
@@ -257,7 +255,7 @@ def _pipeline_of(results: xr.Dataset) -> Pipeline:
         raise DatasetError(
             "no pipeline in the dataset's attributes: expected results as sweep.open returns them"
         ) from None
-    if not shows_boards(pipeline):
+    if not pipeline.experiment.shows_boards:
         raise DatasetError("the scenes show no board: give kind = charuco or grid under [board]")
     return pipeline
 
@@ -277,13 +275,13 @@ def _views(
     results: xr.Dataset, pipeline: Pipeline, at: dict[str, int], name: str
 ) -> tuple[_Views, Cameras, tuple[int, int]]:
     """Return the views of a condition, its camera, and the frame's width and height."""
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     trials = np.arange(results.sizes.get(DRAWS, 1), dtype=np.intp)
     indices = [
         trials if axis.name == DRAWS else np.full(len(trials), at[axis.name], dtype=np.intp)
         for axis in axes
     ]
-    values = scene_values(pipeline, indices)
+    values = pipeline.experiment.scene_values(indices)
     cameras = build_cameras(values, len(trials))
     frame = tuple(
         int(values[key].broadcast(len(trials))[0]) for key in ("width_px", "height_px")

@@ -83,7 +83,7 @@ def run(options: argparse.Namespace, child: Child) -> int:
     pipeline = read_pipeline(options)
     announce_compilation(pipeline)
     options.stopped = "stopped before anything was computed" if options.overwrite else CONTINUES
-    camera = [] if options.json else [f"camera: {library.facts.camera_facts(pipeline).line()}"]
+    camera = [] if options.json else [f"camera: {pipeline.facts.camera.line()}"]
 
     watched = sys.stdout is not None and sys.stdout.isatty()
 
@@ -168,19 +168,19 @@ def plan(options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
 
     announce_compilation(pipeline)
-    listed = library.facts.parts(pipeline)
+    listed = pipeline.facts.parts
     switches = [part.switch for part in listed if part.switch and part.active]
     expected, costs = library.forecast.forecast(pipeline, options.workers, switches)
     bound = library.block.bound_notes(pipeline)
-    views = library.facts.pose_facts(pipeline)
+    views = pipeline.facts.poses
     if options.json:
         print_json(
             {
                 "title": pipeline.title,
-                "camera": library.facts.camera_facts(pipeline),
+                "camera": pipeline.facts.camera,
                 "notes": [
-                    *library.facts.camera_notes(pipeline),
-                    *library.facts.pose_notes(pipeline, views),
+                    *pipeline.facts.camera_notes,
+                    *pipeline.facts.pose_notes,
                     *bound,
                 ],
                 "views": views.ranges(),
@@ -198,11 +198,11 @@ def plan(options: argparse.Namespace) -> int:
         )
         return 0
     say(pipeline.heading)
-    say(f"\nCamera\n  {library.facts.camera_facts(pipeline).line()}")
-    for line in library.facts.camera_notes(pipeline):
+    say(f"\nCamera\n  {pipeline.facts.camera.line()}")
+    for line in pipeline.facts.camera_notes:
         say(f"  {line}")
     say(f"\nPoses\n  {views.line()}")
-    for line in library.facts.pose_notes(pipeline, views):
+    for line in pipeline.facts.pose_notes:
         say(f"  {line}")
     for line in bound:
         say(f"  {line}")

@@ -15,8 +15,6 @@ from sweep.evaluation.block import detections_for, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult
 from sweep.evaluation.search import search, whole_frames
-from sweep.experiment.experiment import shows_boards
-from sweep.experiment.grid import detector_settings, estimators, scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES
@@ -271,13 +269,13 @@ def trial_pipeline(
 def trial_scenes(pipeline: Pipeline) -> TrialScenes:
     """Return the scenes of :func:`trial_pipeline`, rendered as whole frames."""
     (axis,) = pipeline.axes_of(Stage.scene)
-    values = scene_values(pipeline, [np.arange(len(axis))])
+    values = pipeline.experiment.scene_values([np.arange(len(axis))])
     scenes = build_scenes(values, len(axis))
     rows = np.arange(len(scenes))
     frames = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     images = render_all(scenes, rows, marker_boxes(scenes), frames)
     return TrialScenes(
-        detector_settings(pipeline)[0], scenes.dictionary[0], np.array(scenes.marker_id),
+        pipeline.experiment.detectors[0], scenes.dictionary[0], np.array(scenes.marker_id),
         scenes.corners_px, [np.ascontiguousarray(image) for image in images],
     )
 
@@ -562,15 +560,15 @@ class SolverTrial:
 
         A run solves them one by one then, which takes long and hides it.
         """
-        if shows_boards(self.pipeline):
+        if self.pipeline.experiment.shows_boards:
             return []
-        values = scene_values(self.pipeline, [np.arange(SCENES)])
+        values = self.pipeline.experiment.scene_values([np.arange(SCENES)])
         scenes = build_scenes(values, SCENES)
         (searched,), _, _ = search(
-            scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(self.pipeline),
+            scenes, np.ones((SCENES, 1), dtype=bool), self.pipeline.experiment.detectors,
             whole_frames(values, SCENES), [], keep=True,
         )
-        (setting,) = estimators(self.pipeline)
+        (setting,) = self.pipeline.experiment.estimators
         rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
         try:
             build(setting)(detections_for(setting, values, scenes, searched, rows))

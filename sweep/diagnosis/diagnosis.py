@@ -165,7 +165,6 @@ def _sentence(rows: Observations, ranking: Ranking, measurement: Measurement | N
 
 
 def residual_figure(rows: Observations, ranking: Ranking) -> Figure:
-<<<<<<< HEAD
     """Return a figure of measured minus predicted, in standard deviations, by cause and value."""
     _, _, value = measured(rows)
     heading = Column("measured - predicted, standard deviations", "residual", level=0.0)
@@ -176,17 +175,3 @@ def residual_figure(rows: Observations, ranking: Ranking) -> Figure:
             (value - each.fitted) / np.sqrt(each.predicted.variance[each.best]))], stub=2)
     return Figure("residuals", table.caption, "", table, [heading],
                   x=table.headings[1], by="cause")
-=======
-    """Return a figure of measured minus predicted, in standard deviations, by cause and row."""
-    _, component, value = measured(rows)
-    x = "measured value: row by row, " + ", ".join(sorted({COMPONENTS[k] for k in component}))
-    residual = Column("measured - predicted, standard deviations", "residual", level=0.0)
-    cells = [
-        [name_of(each), k, Value(left)]
-        for each, _ in _shown(ranking)
-        for k, left in enumerate(((value - each.fitted) / np.sqrt(
-            each.predicted.variance[each.best])).tolist(), 1)]
-    title = "What each cause leaves unexplained"
-    return Figure("residuals", title, "", Table.of(
-        title, ["cause", x, residual.heading], cells, stub=2), [residual], x, "cause")
->>>>>>> report

@@ -44,20 +44,12 @@ from sweep.evaluation.variables import (
     compute_estimation,
 )
 from sweep.experiment.beliefs import CALIBRATED
-from sweep.experiment.experiment import largest_board, scene_plugins
 from sweep.experiment.grid import (
     Block,
     block_indices,
-    board_settings,
-    detector_settings,
-    estimators,
-    image_keys,
-    scene_axes,
-    scene_values,
 )
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import drawn_variables, variables_of
 from sweep.measure.bound import Bounds, bounds, outside_model
 from sweep.measure.classify import TargetScenes, target_scenes
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
@@ -222,12 +214,12 @@ class SceneBatch:
 def scenes_at(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> SceneBatch:
     """Return the scenes at indices (N,) along each scene axis."""
     count = len(indices[0]) if indices else 1
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count, scene_plugins(pipeline))
+    values = pipeline.experiment.scene_values(indices)
+    scenes = build_scenes(values, count, pipeline.experiment.scene_plugins)
     visibility = visibility_flags(scenes)
     boards = values["board"].listed(count) if "board" in values else None
     targets = target_scenes(
-        scenes, visibility, boards, (1, 0) if boards is None else largest_board(pipeline)
+        scenes, visibility, boards, (1, 0) if boards is None else pipeline.experiment.largest_board
     )
     return SceneBatch(values, scenes, visibility, targets)
 
@@ -244,7 +236,7 @@ def compute_block(pipeline: Pipeline, block: Block) -> dict[str, NDArray[Any]]:
     cells = run_cells(pipeline, block_indices(block))
     return {
         variable.name: to_dataset_layout(variable, pipeline, block, cells.columns[variable.name])
-        for variable in variables_of(pipeline)
+        for variable in pipeline.experiment.variables
     }
 
 
@@ -287,7 +279,7 @@ def run_cells(
     searched: Masks = np.asarray(need.any(axis=2))
     if search_too is not None:
         searched |= search_too
-    settings = estimators(pipeline)
+    settings = pipeline.experiment.estimators
     # Fewer scenes at a time if their images must be kept.
     size = sys.maxsize
     if any(build(setting).needs_images for setting in settings):
@@ -312,11 +304,11 @@ def _run_batch(
     ``searched`` (N, detector settings) are the searches that are made.
     """
     failures: list[Failure] = []
-    settings, estimating = detector_settings(pipeline), estimators(pipeline)
+    settings, estimating = pipeline.experiment.detectors, pipeline.experiment.estimators
     columns: dict[str, list[NDArray[Any]]] = {
-        variable.name: [] for variable in variables_of(pipeline)
+        variable.name: [] for variable in pipeline.experiment.variables
     }
-    drawn = {variable.name: variable.drawn_as for variable in drawn_variables(pipeline)}
+    drawn = {variable.name: variable.drawn_as for variable in pipeline.experiment.drawn}
 
     def add(computed: Mapping[str, NDArray[Any]]) -> None:
         for name, column in computed.items():
@@ -332,8 +324,8 @@ def _run_batch(
         batch.scenes, searched & visible[:, None], settings,
         whole_frames(batch.values, len(need)), failures,
         keep=any(each.needs_images for each in builds), targets=batch.targets,
-        keys=image_keys(pipeline, indices) if any(map(is_recorded, settings)) else None,
-        board_settings=board_settings(pipeline),
+        keys=pipeline.experiment.image_keys(indices) if any(map(is_recorded, settings)) else None,
+        board_settings=pipeline.experiment.board_settings,
     )
 
     start = time.perf_counter()
@@ -403,7 +395,7 @@ def bound_notes(pipeline: Pipeline) -> list[str]:
     """Return a line if a pipeline asks for the accuracy bound and no scene can have one."""
     if set(pipeline.values_of("bound")) <= {"none"}:
         return []
-    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
     total = math.prod(lengths)
     numbers = np.unique(np.linspace(0, total - 1, min(total, NOTED_SCENES)).astype(np.int64))
     indices = [np.asarray(index, dtype=np.intp) for index in np.unravel_index(numbers, lengths)] \
@@ -457,7 +449,7 @@ def warm_up(pipeline: Pipeline) -> None:
             "solver": solvers or [SOLVERS[0]],
         },
     })
-    lengths = [len(axis) for axis in scene_axes(standard)]
+    lengths = [len(axis) for axis in standard.experiment.scene_axes]
     indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
     try:
         cells = run_cells(standard, indices)

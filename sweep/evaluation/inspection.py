@@ -18,15 +18,8 @@ from sweep.evaluation.search import (
     search_windows,
     whole_frames,
 )
-from sweep.experiment.grid import (
-    board_settings,
-    detector_settings,
-    estimators,
-    image_keys,
-)
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.extent import marker_boxes
@@ -81,7 +74,7 @@ class SceneInspection:
 def _searched_window(pipeline: Pipeline, batch: SceneBatch) -> list[int]:
     """Return the window that is searched in a run; the whole frame if the target is not seen."""
     full = whole_frames(batch.values, 1) | (batch.visibility != DetectionStatus.not_run)
-    boxes, setting = marker_boxes(batch.scenes), detector_settings(pipeline)[0]
+    boxes, setting = marker_boxes(batch.scenes), pipeline.experiment.detectors[0]
     window: list[int] = search_windows(batch.scenes, boxes, setting, full)[0].tolist()
     return window
 
@@ -136,9 +129,9 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     image, window = _drawn(pipeline, batch, whole_frame=whole_frame)
     # Searched in its own window, as in a run, even if the whole frame is shown.
     (left, top), (x0, y0, x1, y1) = window[:2], _searched_window(pipeline, batch)
-    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
-    keys = image_keys(pipeline, indices) if is_recorded(setting) else None
-    source = detection_source(setting, scenes, targets, keys, board_settings(pipeline)[0])
+    setting, estimator = pipeline.experiment.detectors[0], pipeline.experiment.estimators[0]
+    keys = pipeline.experiment.image_keys(indices) if is_recorded(setting) else None
+    source = detection_source(setting, scenes, targets, keys, pipeline.experiment.board_settings[0])
     output = SearchOutput([], None, [])
     origin = np.array([x0, y0] if source.needs_images else [0, 0], dtype=np.float64)
     with suppress(PluginError):  # flagged "failed" by the run
@@ -181,10 +174,11 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px=axes_px,
         errors={
             v.name: float(np.linalg.norm(columns[v.name]))
-            for v in variables_of(pipeline)
+            for v in pipeline.experiment.variables
             if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
         },
         values={
-            v.name: np.asarray(columns[v.name], dtype=v.dtype) for v in variables_of(pipeline)
+            v.name: np.asarray(columns[v.name], dtype=v.dtype)
+            for v in pipeline.experiment.variables
         },
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import Variable, variables_of
+from sweep.experiment.schema import Variable
 from sweep.typing import Floats
 
 
@@ -85,7 +85,7 @@ class CellsResult:
                     np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
                     for _ in range(variable.configurations(pipeline))
                 ]
-                for variable in variables_of(pipeline)
+                for variable in pipeline.experiment.variables
             },
             {
                 "scene": [0.0],

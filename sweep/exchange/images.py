@@ -20,9 +20,8 @@ from sweep.errors import StoreError
 from sweep.evaluation.block import scenes_at
 from sweep.evaluation.search import common_windows, search_windows, whole_frames
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
-from sweep.experiment.grid import detector_settings, image_keys, scene_axes
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LABELS, VARIABLES, Variable, drawn_variables
+from sweep.experiment.schema import LABELS, VARIABLES, Variable
 from sweep.measure.classify import TargetScenes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
@@ -83,12 +82,12 @@ class ImageBatch:
 
 def scene_count(pipeline: Pipeline) -> int:
     """Return the number of scenes of an experiment."""
-    return math.prod(len(axis) for axis in scene_axes(pipeline))
+    return math.prod(len(axis) for axis in pipeline.experiment.scene_axes)
 
 
 def scene_indices(pipeline: Pipeline, numbers: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Return the indices (N,) along each scene axis of scenes by their numbers (N,)."""
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return [np.asarray(index) for index in np.unravel_index(numbers, lengths)] if lengths else []
 
 
@@ -106,10 +105,12 @@ def image_batch(
     if windowed:
         full = whole_frames(batch.values, len(numbers))
         windows = common_windows([
-            search_windows(scenes, boxes, setting, full) for setting in detector_settings(pipeline)
+            search_windows(scenes, boxes, setting, full)
+            for setting in pipeline.experiment.detectors
         ])
     return ImageBatch(
-        np.asarray(numbers), image_keys(pipeline, indices), scenes, batch.targets, batch.values,
+        np.asarray(numbers), pipeline.experiment.image_keys(indices), scenes, batch.targets,
+        batch.values,
         batch.visibility == DetectionStatus.not_run, boxes, windows,
     )
 
@@ -229,7 +230,7 @@ class TruthTables:
 
         Of targets with a chessboard ``truth_chessboard.csv``, too.
         """
-        drawn = drawn_variables(self.pipeline)
+        drawn = self.pipeline.experiment.drawn
         columns: dict[str, list[Any]] = {}
         tables: list[pd.DataFrame] = []
         chessboards: list[pd.DataFrame] = []
@@ -265,7 +266,7 @@ class TruthTables:
 
     def _of_images(self, batch: ImageBatch, variables: dict[str, Any]) -> pd.DataFrame:
         """Return a row an image of a batch with these variables, and note its cameras."""
-        scenes, axes = batch.scenes, scene_axes(self.pipeline)
+        scenes, axes = batch.scenes, self.pipeline.experiment.scene_axes
         first, last = batch.windows[:, :2], batch.windows[:, 2:]
         view = scenes.cameras.view
         cameras = [
@@ -288,7 +289,7 @@ class TruthTables:
                 if name not in (*table, "marker_id", "dictionary"):
                     labels = [label(v) if isinstance(v, tuple) else v for v in values]
                     table[name] = [labels[k] for k in along.tolist()]
-        for each in drawn_variables(self.pipeline):
+        for each in self.pipeline.experiment.drawn:
             if each.name not in table:
                 table[each.name] = variables[each.name]
         return table
@@ -297,7 +298,7 @@ class TruthTables:
         self, columns: dict[str, NDArray[Any]], drawn: Sequence[Variable]
     ) -> xr.Dataset:
         """Return the truth over the experiment's scene axes."""
-        axes = scene_axes(self.pipeline)
+        axes = self.pipeline.experiment.scene_axes
         dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
         corner_dims = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
         inner = {name: VARIABLES[name].inner for name in (*GEOMETRY, "marker_area_px")}

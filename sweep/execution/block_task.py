@@ -20,7 +20,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
-from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.plugins import lacking_plugins
@@ -240,7 +240,7 @@ def _compute_begun(
     if not needed.all():
         for v in store.variables:
             lengths = dict(zip(
-                (axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
+                (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
             mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
             values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
     seconds = _NO_SECONDS if cells is None else cells.seconds

@@ -40,12 +40,11 @@ from sweep.execution.limits import (
     WAVE_BLOCK_S,
 )
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.experiment import effects_of
-from sweep.experiment.grid import Block, Blocks, block_indices, scene_axes
+from sweep.experiment.grid import Block, Blocks, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs, shows_photographs
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import bytes_per_block, variables_of
+from sweep.experiment.schema import bytes_per_block
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.machine import default_workers
 from sweep.isolation.watchdog import compilation_s
@@ -133,7 +132,7 @@ def seconds_of(
 
 def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
     """Return the indices of a random sample of scenes: of photographs all markers of one."""
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     generator = np.random.Generator(np.random.PCG64(count))
     if not shows_photographs(pipeline):
         return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
@@ -240,7 +239,7 @@ def blocks_of(
     time_limit_s
         Block timeout in seconds, if the user gave one.
     """
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     lengths = tuple(len(axis) for axis in axes)
     if shows_photographs(pipeline):  # each is searched once, for all its markers
         along = along_photographs(axes)
@@ -408,14 +407,14 @@ def _some(axis: Axis, count: int) -> Axis:
 
 def _first_wave(pipeline: Pipeline, rule: Stopping) -> dict[str, NDArray[Any]]:
     """Return the results of the first wave of all conditions."""
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     block = Block((0,) * len(axes), tuple(
         rule.ends[0] if axis.name == TRIAL else len(axis) for axis in axes))
     cells = run_cells(pipeline, block_indices(block))
     return {
         variable.name: in_order_of_results(pipeline, variable, to_dataset_layout(
             variable, pipeline, block, cells.columns[variable.name]))
-        for variable in variables_of(pipeline)
+        for variable in pipeline.experiment.variables
         if variable.name in {"detection", *rule.variables}
     }
 
@@ -429,7 +428,7 @@ def _simulated(
     generator = np.random.Generator(np.random.PCG64(0))
     drawn = generator.integers(0, rule.ends[0], rule.ends[-1])
     drawn[: rule.ends[0]] = np.arange(rule.ends[0])
-    variables = {variable.name: variable for variable in variables_of(pipeline)}
+    variables = {variable.name: variable for variable in pipeline.experiment.variables}
     values = {name: np.take(array, drawn, axis=along) for name, array in first.items()}
     trials = np.full(shape, float(rule.ends[0]))
     mask = np.ones(shape, dtype=bool)
@@ -508,7 +507,7 @@ def demand_of(
     A block has a file for each variable, and its receipt.
     """
     poses = math.ceil(share * pipeline.size(Stage.scene) * left / max(blocks, 1))
-    files = left * (len(variables_of(pipeline)) + 1)
+    files = left * (len(pipeline.experiment.variables) + 1)
     return Demand(poses * scene_s / workers, workers, bytes_per_block(pipeline, poses), files)
 
 
@@ -718,7 +717,7 @@ def _effect_costs(
 
 def without_effect(pipeline: Pipeline, switch: str) -> Pipeline:
     """Return the pipeline with an effect switched off everywhere, on the same grid."""
-    off = next(each.off for each in effects_of(pipeline.plugins) if each.switch == switch)
+    off = next(each.off for each in pipeline.experiment.effects if each.switch == switch)
     return dataclasses.replace(
         pipeline,
         fixed={**pipeline.fixed, switch: off},

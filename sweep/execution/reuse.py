@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError
 from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import alike
-from sweep.experiment.schema import Variable, variables_of
+from sweep.experiment.schema import Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
 from sweep.store.blocks import RunStore, check_whole, receipts, region
@@ -216,7 +216,8 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     ]
     present = {variable.name for variable in store.variables}
     faults += [
-        f"{variable.name}: not a variable of the store" for variable in variables_of(pipeline)
+        f"{variable.name}: not a variable of the store"
+        for variable in pipeline.experiment.variables
         if variable.name not in present and not _follows(variable)
     ]
     pipeline, old = alike(pipeline, old)
@@ -294,11 +295,11 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
     """Read a block's reusable cells from old stores; of several, the first that has a cell."""
     settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     # The last axis is that of a grid without any.
-    order = [*(axis.name for axis in (*scene_axes(pipeline), *settings)), ""]
+    order = [*(axis.name for axis in (*pipeline.experiment.scene_axes, *settings)), ""]
     parts = [range(*cut) for cut in zip(block.starts, block.stops, strict=True)]
     parts += [*(range(len(axis)) for axis in settings), range(1)]
     cuts = dict(zip(order, parts, strict=True))
-    variables = variables_of(pipeline)
+    variables = pipeline.experiment.variables
     values = {
         v.name: np.full(
             [len(cuts[n]) for n in v.dimensions(pipeline) if n in cuts] + list(v.inner_shape),
@@ -317,7 +318,7 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
             cells = np.nonzero(wanted & (numbers == number))
             taken[_copied(source, number, variables, order, cells, at, values)] = True
         present = {variable.name for variable in source.store.variables}
-        scenes = taken.reshape(len(block), -1).any(axis=1)
+        scenes = np.asarray(taken.reshape(len(block), -1).any(axis=1))
         _compute(pipeline, block, [v for v in variables if v.name not in present], scenes, values)
         used = np.unique(numbers[taken]).tolist()
         for _, receipt in receipts(source.store, used):
@@ -334,7 +335,7 @@ def _block_numbers(
     blocks = source.store.blocks
     numbers = np.zeros(shape, dtype=np.intp)
     for axis, extent, count in zip(
-        scene_axes(source.old), blocks.extents, blocks.counts, strict=True
+        source.old.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
     ):
         numbers = numbers * count + at[axis.name] // extent
     return numbers
@@ -352,7 +353,8 @@ def _copied(
     """
     store, pipeline = source.store, source.store.pipeline
     block = store.blocks[number]
-    first = dict(zip((axis.name for axis in scene_axes(pipeline)), block.starts, strict=True))
+    axes = pipeline.experiment.scene_axes
+    first = dict(zip((axis.name for axis in axes), block.starts, strict=True))
     inside = {name: index[cells] - first.get(name, 0) for name, index in at.items()}
     present = {variable.name: variable for variable in store.variables}
 
@@ -391,7 +393,7 @@ def _compute(
     rows = np.flatnonzero(scenes & np.isfinite(values["true_tvec_m"]).all(axis=-1))
     if not (variables and len(rows)):
         return
-    drawn = scene_values(pipeline, [index[rows] for index in block_indices(block)])
+    drawn = pipeline.experiment.scene_values([index[rows] for index in block_indices(block)])
     built = build_scenes(drawn, len(rows))
     for variable in variables:
         values[variable.name].reshape(-1)[rows] = (

@@ -45,7 +45,6 @@ from sweep.execution.status import (
     summary_of,
     summary_of_complete,
 )
-from sweep.experiment.facts import notes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import MAX_TRIALS
@@ -202,7 +201,7 @@ def execute(
     stricter = unfinished is not None and unfinished.pipeline.stopping != pipeline.stopping
     if unfinished is not None and unfinished.finished and not (again or stricter):
         return summary_of_complete(unfinished, started)
-    for line in notes(pipeline):
+    for line in pipeline.facts.notes:
         notice(line)
     if unfinished is not None and is_written(unfinished.storage):
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")

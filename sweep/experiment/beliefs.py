@@ -137,7 +137,7 @@ def _with_least_focal_length(parameter: str, values: Sequence[Any]) -> Any:
 
 
 def belief_notes(
-    given: frozenset[str], fixed: Mapping[str, Any], believed: Sequence[Any]
+    given: frozenset[str] | set[str], fixed: Mapping[str, Any], believed: Sequence[Any]
 ) -> list[str]:
     """Return a line for each belief that may surprise (arguments as a pipeline has them)."""
     lines = [

@@ -45,7 +45,7 @@ class Grid:
     __slots__ = ()
 
     fixed: Mapping[str, Any]
-    given: Collection[str]
+    given: frozenset[str] | set[str]
     distributions: Mapping[str, Distribution]
     axes: Any
     plugins: tuple[DeclaredPlugin, ...]

@@ -6,15 +6,15 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sweep.experiment.beliefs import belief_notes
-from sweep.experiment.experiment import effects_of, relative_sizes, shows_boards, target_word
-from sweep.experiment.grid import detector_settings, scene_axes, scene_values
+from sweep.experiment.experiment import relative_sizes, target_word
+from sweep.experiment.grid import Experiment
 from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, WORLD
-from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,
     full_frame_reason,
@@ -133,64 +133,6 @@ MAX_CORNERS = 200
 """The most corners of a grid that are looked at."""
 
 
-def sampled_scenes(pipeline: Pipeline) -> tuple[int, dict[str, Column]]:
-    """Return the number of the scenes that are looked at, and the values of their parameters.
-
-    Every quantity of a camera is monotonic in each of its parameters, so that the corners of the
-    grid have its ends; axes of the camera, the size and the distance are varied first.
-    """
-    axes = scene_axes(pipeline)
-    lengths = [len(axis) for axis in axes]
-    cells = math.prod(lengths)
-    if cells <= MAX_SAMPLE:
-        indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-        return max(cells, 1), scene_values(pipeline, indices)
-    first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
-    # The last axis of a product varies fastest.
-    order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
-    ends = itertools.product(*((0, lengths[k] - 1) if lengths[k] > 1 else (0,) for k in order))
-    corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
-    chosen = np.random.default_rng(0)
-    anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
-    return MAX_SAMPLE, scene_values(pipeline, [
-        np.concatenate([corners[:, order.index(k)], other]).astype(np.intp)
-        for k, other in enumerate(anywhere)
-    ])
-
-
-def camera_facts(pipeline: Pipeline) -> CameraFacts:
-    """Return what a pipeline's camera is, by the scenes that are looked at."""
-    count, values = sampled_scenes(pipeline)
-    fx, fy, cx, cy = build_cameras(values, count).view.T
-    width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
-
-    def ends(numbers: Floats) -> Range:
-        return float(np.min(numbers)), float(np.max(numbers))
-
-    given = values["side_px"]
-    with np.errstate(divide="ignore"):
-        sides = given.broadcast(count) if not given.missing else (
-            fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
-    sides = sides[sides > 0]  # before the camera
-    least, largest = relative_sizes(pipeline)
-    return CameraFacts(
-        width_px=ends(width), height_px=ends(height), fx_px=ends(fx), fy_px=ends(fy),
-        cx_px=ends(cx), cy_px=ends(cy), hfov_deg=ends(field_of_view_deg(width, fx)),
-        vfov_deg=ends(field_of_view_deg(height, fy)), aspect=ends(fy / fx),
-        off_centre_x=ends((cx - (width - 1) / 2) / width),
-        off_centre_y=ends((cy - (height - 1) / 2) / height),
-        square=bool(np.all(are_square(fx, fy))), boards=shows_boards(pipeline),
-        side_px=(float(sides.min()) * least, float(sides.max()) * largest) if len(sides) else None,
-    )
-
-
-def _numbers(pipeline: Pipeline, name: str) -> list[float]:
-    """Return the numbers that the document has for a parameter: the ends or the mean of draws."""
-    if (drawn := pipeline.distributions.get(name)) is not None:
-        return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
-    return [float(value) for value in pipeline.values_of(name) if value is not None]
-
-
 def _in_degrees(name: str, numbers: Sequence[float]) -> str:
     largest = max(numbers, key=abs)
     return (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
@@ -213,51 +155,6 @@ NOT_SQUARE = 0.01
 """Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
 
 
-def camera_notes(pipeline: Pipeline) -> list[str]:
-    """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
-    facts = camera_facts(pipeline)
-    hfov, lines = _text(facts.hfov_deg, 4), []
-    if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
-        lines.append(
-            f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
-            "sensor, or fx_px alone, makes them square")
-    if facts.hfov_deg[1] > WIDE_DEG:
-        lines.append(f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in "
-                     "another unit?")
-    if len(pipeline.values_of("width_px")) > 1 and pipeline.fixed.get("fx_px") is not None:
-        lines.append(f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
-                     "place of fx_px keeps it")
-    lines += [
-        _in_degrees(name, numbers) for name in FIELDS_OF_VIEW
-        if (numbers := _numbers(pipeline, name))
-        and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]
-    ]
-    return [
-        *lines, *_centre_notes(facts), *_fold_notes(pipeline, facts), *_side_notes(pipeline, facts),
-        *belief_notes(pipeline.given, pipeline.fixed, pipeline.values_of("believed")),
-    ]
-
-
-def _side_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
-    """Return a line if no marker of the grid is of a size that can be detected."""
-    if facts.side_px is None:
-        return []
-    far, near = facts.side_px
-    if near < min(map(module_count, pipeline.values_of("dictionary"))):
-        problem = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
-    elif far > max(facts.width_px[1], facts.height_px[1]):
-        problem = f"at least {far:.4g} px, more than the frame's"
-    else:
-        return []
-    units = (
-        "" if "side_px" in pipeline.given
-        else "; are size_m and the distances in metres?" if "size_m" in pipeline.given
-        else f"; size_m is not given: {pipeline.fixed['size_m']:g} m"
-    )
-    whose = "the markers' sides are" if facts.boards else "the marker's side is"
-    return [f"{whose} {problem}{units}"]
-
-
 def _centre_notes(facts: CameraFacts) -> list[str]:
     lines = []
     frame = f"{_text(facts.width_px)} x {_text(facts.height_px)} px"
@@ -273,31 +170,6 @@ def _centre_notes(facts: CameraFacts) -> list[str]:
                 "of another frame size?"
             )
     return lines
-
-
-def _fold_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
-    """Return a line if the radial distortion of the only lens stops growing within the frame."""
-    lens = canonical_distortion(pipeline.fixed.get("distortion", ()))
-    ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
-    if not lens or any(low != high for low, high in ends) or not math.isfinite(fold_radius(lens)):
-        return []
-    width, height, fx, fy, cx, cy = (low for low, _ in ends)
-    radius = fold_radius(lens)
-    k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
-    s = radius**2
-    denominator = 1 + s * (k4 + s * (k5 + s * k6))
-    if denominator <= POLE:
-        return []
-    fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
-    corner = math.hypot(
-        max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
-    )
-    if fold >= corner:
-        return []
-    where = f"{fold * fx:.0f} px from the principal point, within the frame"
-    return [
-        f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
-    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -363,133 +235,8 @@ class PoseFacts:
         return f"{roughly}{100 * chosen.mean():.2g} % of the poses"
 
 
-def pose_facts(pipeline: Pipeline) -> PoseFacts:
-    """Return what a pipeline's poses are."""
-    count, values = sampled_scenes(pipeline)
-    scenes = build_scenes(values, count)
-    normal, depth = scenes.rotation[:, 2, 2], scenes.translation[:, 2]
-    behind = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
-    averted = hidden(scenes) & ~behind
-    outside = np.zeros(count, dtype=bool)
-    seen = np.flatnonzero(~behind & ~averted)
-    outside[seen] = outside_frame(scenes, seen)
-    corners = scenes.corners_px
-    beyond = (corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)
-    return PoseFacts(
-        poses=math.prod(len(axis) for axis in scene_axes(pipeline)),
-        sampled=count,
-        tilt_deg=np.degrees(np.arctan2(np.hypot(*scenes.rotation[:, :2, 2].T), -normal)),
-        viewing_angle_deg=np.degrees(viewing_angle(scenes.rotation, scenes.translation)),
-        range_m=np.linalg.norm(scenes.translation, axis=1),
-        depth_m=depth,
-        behind=behind, averted=averted, outside=outside,
-        cut=np.asarray(beyond.any(axis=(1, 2)) & ~behind & ~averted & ~outside),
-    )
-
-
-def pose_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
-    """Return a line for each property of a pipeline's poses that may surprise."""
-    return [*_visibility_notes(pipeline, facts), *_axis_notes(pipeline, facts),
-            *_unit_notes(pipeline)]
-
-
-def _visibility_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
-    lines = []
-    world = any(name in pipeline.given for name in WORLD)
-    framed = {"frame_x", "frame_y"} & pipeline.given
-    target = target_word(pipeline)
-    where = "outside the frame of the camera" if world else "outside the frame"
-    for chosen, what in (
-        (facts.behind, "have a corner behind the camera: not_visible"),
-        (facts.averted,
-         f"show the {target}'s back or its edge (a viewing angle of 90° or more): not_visible"),
-        (facts.outside, f"are {where}: not_visible"
-         + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
-        (facts.cut, "are cut off by the frame's edge"
-         + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in the "
-            "middle" if framed else "")),
-    ):
-        if chosen.mean() > MIN_SHARE:
-            lines.append(f"{facts.share(chosen)} {what}")
-    unseen = facts.behind | facts.averted | facts.outside
-    if unseen.all() and len(lines) > 1:
-        lines.insert(0, f"{facts.share(unseen)} are not_visible:")
-    return lines
-
-
-def _axis_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
-    """Return a line for angles and distances that differ off the optical axis, or do nothing."""
-    given, shown = pipeline.given, ~facts.behind
-    in_camera = not given.intersection(WORLD)
-    tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
-    apart = np.abs(view - tilt).max(initial=0)
-    farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
-    angles = "yaw_deg and pitch_deg are" if {"yaw_deg", "pitch_deg"} & given else "tilt_deg is"
-    distance = "side_px" if "side_px" in given else "distance_m"
-    turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
-    azimuths = "azimuth_deg" in pipeline.distributions or len(pipeline.values_of("azimuth_deg")) > 1
-    tilted = turned in pipeline.distributions or pipeline.any_value(turned, bool)
-    lines = []
-    if in_camera and "view_angle_deg" not in given and apart > APART_DEG:
-        lines.append(
-            f"off the optical axis the viewing angle differs from the tilt by up to {apart:.3g}° "
-            f"(tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): {angles} to "
-            "the image plane, view_angle_deg is to the line of sight")
-    if in_camera and farther > FARTHER:
-        lines.append(
-            f"{distance} counts along the optical axis: off it, the {target_word(pipeline)}'s "
-            f"centre is up to {farther:.3g} times as far away")
-    if azimuths and not tilted:
-        lines.append(
-            f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0")
-    return lines
-
-
 ROUNDED_RAD = 4e-3
 """How far an angle in radians that someone rounded may be from a multiple of 15°."""
-
-
-def _unit_notes(pipeline: Pipeline) -> list[str]:
-    """Return a line for each angle whose values look like radians."""
-    lines = []
-    for parameter in PARAMETERS.values():
-        if parameter.section != "pose" or parameter.unit != "degree":
-            continue
-        values = _numbers(pipeline, parameter.name)
-        steps = np.array([value for value in values if value]) / (math.pi / 12)
-        close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
-        if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
-            lines.append(_in_degrees(parameter.name, values))
-    return lines
-
-
-# --------------------------------------------------------------------------------------------------
-# What may surprise of a pipeline, in a line each: of its camera, and of its poses.
-
-def notes(pipeline: Pipeline) -> list[str]:
-    """Return the lines that `sweep plan` and the start of a run print."""
-    if PHOTOGRAPHS in pipeline.given:
-        return []
-    return [
-        *camera_notes(pipeline), *pose_notes(pipeline, pose_facts(pipeline)),
-        *_corner_square_notes(pipeline),
-    ]
-
-
-def _corner_square_notes(pipeline: Pipeline) -> list[str]:
-    """Return what to set where OpenCV's default threshold loses markers beside squares."""
-    squares = (
-        pipeline.any_value("kind", lambda kind: kind == "aprilgrid")
-        or pipeline.any_value("corner_squares", bool)
-    )
-    by_default = not any(name in pipeline.given for name in ("adaptiveThreshConstant", "detector"))
-    if not (squares and by_default):
-        return []
-    return [(
-        "board: squares touch its markers' corners, and OpenCV's default threshold joins both: it "
-        "finds a third of sharp markers; adaptiveThreshConstant = 60, adaptiveThreshWinSizeMax = "
-        "33 and adaptiveThreshWinSizeStep = 4 find four in five (pipelines/boards/README.md)"
-    )]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -515,22 +262,6 @@ class Part:
     switch: str = ""
 
 
-def _effect(pipeline: Pipeline, effect: Effect) -> Part:
-    name, switch = effect.label, effect.switch
-    if switch in pipeline.distributions:
-        return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
-    values = [value for value in pipeline.values_of(switch) if effect.is_on(value)]
-    if not values:
-        return Part(name, False, f"{switch} is {effect.off_text}", switch)
-    extent = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) else _text(values)
-    return Part(name, True, f"{switch} is {extent}", switch)
-
-
-def _needs_images(pipeline: Pipeline, solver: str) -> bool:
-    plugin = pipeline.plugin("estimator", solver)
-    return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
-
-
 def _described(plugin: DeclaredPlugin) -> str:
     """Return a plug-in in words: kind, name, versions."""
     versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
@@ -544,60 +275,338 @@ def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") 
     return Part(name, bool(text), form.format(text) if text else otherwise)
 
 
-def parts(pipeline: Pipeline) -> list[Part]:
-    """Return every optional part, active or not."""
-    effects, target = effects_of(pipeline.plugins), target_word(pipeline)
-    drawn = pipeline.distributions
-    on = [effect for effect in effects
-          if effect.switch in drawn or pipeline.any_value(effect.switch, effect.is_on)]
-    calibrated = "calibration" in pipeline.values_of("believed")
-    draws = list(dict.fromkeys([
-        *drawn, *(["jitter_px"] if pipeline.any_value("jitter_px", bool) else []),
-        *(each.switch for each in on if each.random),
-        *(["the believed calibration"] if calibrated else []),
-    ]))
-    lens = any(map(canonical_distortion, pipeline.values_of("distortion")))
-    image = pipeline.any_value("background", lambda value: isinstance(value, str))
-    asked = "full" in pipeline.values_of("window")
-    guarded = pipeline.any_value("guarded", bool)
-    settings = detector_settings(pipeline)
-    whole = sorted({reason for each in settings if (reason := full_frame_reason(each)) is not None})
-    gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
-        [1.0, *pipeline.values_of("gain")])
-    if any(effect.widens == "uneven light" for effect in on) and any(
-            uneven_light_needs_frame(setting, gain) for setting in settings):
-        whole.append("adaptiveThreshConstant is low for uneven light")
-    if image:
-        whole.append(
-            f"the background is an image: clutter near the {target} may change the detection")
-    if asked:
-        whole.append('window = "full"')
-    coarse = any("noise" in effect.worsens for effect in on)
-    noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
-    noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
-    margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
-    assumptions = [
-        name for name in PARAMETERS
-        if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
-    ] + (["believed: calibration"] if calibrated else [])
-    return [
-        Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
-        _listed("random draws", draws, "nothing is random",
-                "{}, Sobol' points" if pipeline.sampling == "sobol" else "{}"),
-        Part("background image", image, "background names a file" if image else "a level"),
-        _listed("window", [] if asked or image else map(str, margins), "the full frame",
-                f"{{}} px around the {target}'s pixels{noise}"),
-        _listed("plug-ins", map(_described, pipeline.plugins), "none is named"),
-        Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
-        Part("renderer", True, ", ".join(sorted(set(pipeline.values_of("renderer"))))),
-        *(_effect(pipeline, effect) for effect in effects),
-        Part("solver guard", guarded,
-             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP"),
-        _listed("accuracy bound", sorted(set(pipeline.values_of("bound")) - {"none"}),
-                "bound is none", "bound is {}"),
-        _listed("pixels kept",
-                (name for name in pipeline.values_of("solver") if _needs_images(pipeline, name)),
-                "no solver needs them", "solver {} needs them"),
-        _listed("wrong assumptions", assumptions,
-                "the estimator knows the true camera and size"),
-    ]
+# --------------------------------------------------------------------------------------------------
+# The facts of an experiment, and what may surprise: a line each. They are gathered once.
+
+class Facts:
+    """What an experiment's camera and poses are, which parts are active, and what may surprise.
+
+    `sweep plan` prints all of it; the start of a run prints the notes.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment, self.grid = experiment, experiment.grid
+
+    @cached_property
+    def _sample(self) -> tuple[int, dict[str, Column]]:
+        """The number of the scenes that are looked at, and the values of their parameters.
+
+        Every quantity of a camera is monotonic in each of its parameters, so that the corners of
+        the grid have its ends; axes of the camera, the size and the distance are varied first.
+        """
+        axes = self.experiment.scene_axes
+        lengths = [len(axis) for axis in axes]
+        cells = math.prod(lengths)
+        if cells <= MAX_SAMPLE:
+            indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+            return max(cells, 1), self.experiment.scene_values(indices)
+        first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
+        # The last axis of a product varies fastest.
+        order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
+        ends = itertools.product(*((0, lengths[k] - 1) if lengths[k] > 1 else (0,) for k in order))
+        corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
+        chosen = np.random.default_rng(0)
+        anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
+        return MAX_SAMPLE, self.experiment.scene_values([
+            np.concatenate([corners[:, order.index(k)], other]).astype(np.intp)
+            for k, other in enumerate(anywhere)
+        ])
+
+    @cached_property
+    def camera(self) -> CameraFacts:
+        """What a pipeline's camera is, by the scenes that are looked at."""
+        count, values = self._sample
+        fx, fy, cx, cy = build_cameras(values, count).view.T
+        width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
+
+        def ends(numbers: Floats) -> Range:
+            return float(np.min(numbers)), float(np.max(numbers))
+
+        given = values["side_px"]
+        with np.errstate(divide="ignore"):
+            sides = given.broadcast(count) if not given.missing else (
+                fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
+        sides = sides[sides > 0]  # before the camera
+        least, largest = relative_sizes(self.grid)
+        return CameraFacts(
+            width_px=ends(width), height_px=ends(height), fx_px=ends(fx), fy_px=ends(fy),
+            cx_px=ends(cx), cy_px=ends(cy), hfov_deg=ends(field_of_view_deg(width, fx)),
+            vfov_deg=ends(field_of_view_deg(height, fy)), aspect=ends(fy / fx),
+            off_centre_x=ends((cx - (width - 1) / 2) / width),
+            off_centre_y=ends((cy - (height - 1) / 2) / height),
+            square=bool(np.all(are_square(fx, fy))), boards=self.experiment.shows_boards,
+            side_px=None if not len(sides) else (
+                float(sides.min()) * least, float(sides.max()) * largest),
+        )
+
+    def _numbers(self, name: str) -> list[float]:
+        """Return the numbers of the document for a parameter: the ends or the mean of draws."""
+        if (drawn := self.grid.distributions.get(name)) is not None:
+            return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
+        return [float(value) for value in self.grid.values_of(name) if value is not None]
+
+    @cached_property
+    def camera_notes(self) -> list[str]:
+        """A line for each property of the camera, or of beliefs about it, that may surprise."""
+        facts = self.camera
+        hfov, lines = _text(facts.hfov_deg, 4), []
+        if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
+            lines.append(
+                f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
+                "sensor, or fx_px alone, makes them square")
+        if facts.hfov_deg[1] > WIDE_DEG:
+            lines.append(f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length "
+                         "in another unit?")
+        if len(self.grid.values_of("width_px")) > 1 and self.grid.fixed.get("fx_px") is not None:
+            lines.append(f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg "
+                         "in place of fx_px keeps it")
+        lines += [
+            _in_degrees(name, numbers) for name in FIELDS_OF_VIEW
+            if (numbers := self._numbers(name))
+            and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]
+        ]
+        return [
+            *lines, *_centre_notes(facts), *self._fold_notes(), *self._side_notes(),
+            *belief_notes(self.grid.given, self.grid.fixed, self.grid.values_of("believed")),
+        ]
+
+    def _side_notes(self) -> list[str]:
+        """Return a line if no marker of the grid is of a size that can be detected."""
+        facts = self.camera
+        if facts.side_px is None:
+            return []
+        far, near = facts.side_px
+        if near < min(map(module_count, self.grid.values_of("dictionary"))):
+            problem = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
+        elif far > max(facts.width_px[1], facts.height_px[1]):
+            problem = f"at least {far:.4g} px, more than the frame's"
+        else:
+            return []
+        units = (
+            "" if "side_px" in self.grid.given
+            else "; are size_m and the distances in metres?" if "size_m" in self.grid.given
+            else f"; size_m is not given: {self.grid.fixed['size_m']:g} m"
+        )
+        whose = "the markers' sides are" if facts.boards else "the marker's side is"
+        return [f"{whose} {problem}{units}"]
+
+    def _fold_notes(self) -> list[str]:
+        """Return a line if the only lens' radial distortion stops growing within the frame."""
+        facts = self.camera
+        lens = canonical_distortion(self.grid.fixed.get("distortion", ()))
+        ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
+        varies = any(low != high for low, high in ends)
+        if not lens or varies or not math.isfinite(fold_radius(lens)):
+            return []
+        width, height, fx, fy, cx, cy = (low for low, _ in ends)
+        radius = fold_radius(lens)
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
+        s = radius**2
+        denominator = 1 + s * (k4 + s * (k5 + s * k6))
+        if denominator <= POLE:
+            return []
+        fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+        corner = math.hypot(
+            max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+        )
+        if fold >= corner:
+            return []
+        where = f"{fold * fx:.0f} px from the principal point, within the frame"
+        return [
+            f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
+        ]
+
+    @cached_property
+    def poses(self) -> PoseFacts:
+        """What a pipeline's poses are."""
+        count, values = self._sample
+        scenes = build_scenes(values, count)
+        normal, depth = scenes.rotation[:, 2, 2], scenes.translation[:, 2]
+        behind = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+        averted = hidden(scenes) & ~behind
+        outside = np.zeros(count, dtype=bool)
+        seen = np.flatnonzero(~behind & ~averted)
+        outside[seen] = outside_frame(scenes, seen)
+        corners = scenes.corners_px
+        beyond = (corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)
+        return PoseFacts(
+            poses=math.prod(len(axis) for axis in self.experiment.scene_axes),
+            sampled=count,
+            tilt_deg=np.degrees(np.arctan2(np.hypot(*scenes.rotation[:, :2, 2].T), -normal)),
+            viewing_angle_deg=np.degrees(viewing_angle(scenes.rotation, scenes.translation)),
+            range_m=np.linalg.norm(scenes.translation, axis=1),
+            depth_m=depth,
+            behind=behind, averted=averted, outside=outside,
+            cut=np.asarray(beyond.any(axis=(1, 2)) & ~behind & ~averted & ~outside),
+        )
+
+    @cached_property
+    def pose_notes(self) -> list[str]:
+        """A line for each property of a pipeline's poses that may surprise."""
+        return [*self._visibility_notes(), *self._axis_notes(),
+                *self._unit_notes()]
+
+    def _visibility_notes(self) -> list[str]:
+        lines, facts = [], self.poses
+        world = any(name in self.grid.given for name in WORLD)
+        framed = {"frame_x", "frame_y"} & self.grid.given
+        target = target_word(self.grid)
+        where = "outside the frame of the camera" if world else "outside the frame"
+        for chosen, what in (
+            (facts.behind, "have a corner behind the camera: not_visible"),
+            (facts.averted,
+             f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
+            (facts.outside, f"are {where}: not_visible"
+             + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
+            (facts.cut, "are cut off by the frame's edge"
+             + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
+                "the middle" if framed else "")),
+        ):
+            if chosen.mean() > MIN_SHARE:
+                lines.append(f"{facts.share(chosen)} {what}")
+        unseen = facts.behind | facts.averted | facts.outside
+        if unseen.all() and len(lines) > 1:
+            lines.insert(0, f"{facts.share(unseen)} are not_visible:")
+        return lines
+
+    def _axis_notes(self) -> list[str]:
+        """Return lines for angles and distances that differ off the axis, or do nothing."""
+        facts = self.poses
+        given, shown = self.grid.given, ~facts.behind
+        in_camera = not given.intersection(WORLD)
+        tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
+        apart = np.abs(view - tilt).max(initial=0)
+        farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
+        angles = "yaw_deg and pitch_deg are" if {"yaw_deg", "pitch_deg"} & given else "tilt_deg is"
+        distance = "side_px" if "side_px" in given else "distance_m"
+        turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
+        drawn = self.grid.distributions
+        azimuths = "azimuth_deg" in drawn or len(self.grid.values_of("azimuth_deg")) > 1
+        tilted = turned in drawn or self.grid.any_value(turned, bool)
+        lines = []
+        if in_camera and "view_angle_deg" not in given and apart > APART_DEG:
+            lines.append(
+                "off the optical axis the viewing angle differs from the tilt by up to "
+                f"{apart:.3g}° (tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): "
+                f"{angles} to the image plane, view_angle_deg is to the line of sight")
+        if in_camera and farther > FARTHER:
+            lines.append(
+                f"{distance} counts along the optical axis: off it, the {target_word(self.grid)}'s "
+                f"centre is up to {farther:.3g} times as far away")
+        if azimuths and not tilted:
+            lines.append(
+                f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0")
+        return lines
+
+    def _unit_notes(self) -> list[str]:
+        """Return a line for each angle whose values look like radians."""
+        lines = []
+        for parameter in PARAMETERS.values():
+            if parameter.section != "pose" or parameter.unit != "degree":
+                continue
+            values = self._numbers(parameter.name)
+            steps = np.array([value for value in values if value]) / (math.pi / 12)
+            close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
+            if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
+                lines.append(_in_degrees(parameter.name, values))
+        return lines
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """The lines that `sweep plan` and the start of a run print."""
+        if PHOTOGRAPHS in self.grid.given:
+            return []
+        return [
+            *self.camera_notes, *self.pose_notes,
+            *self._corner_square_notes(),
+        ]
+
+    def _corner_square_notes(self) -> list[str]:
+        """Return what to set where OpenCV's default threshold loses markers beside squares."""
+        squares = (
+            self.grid.any_value("kind", lambda kind: kind == "aprilgrid")
+            or self.grid.any_value("corner_squares", bool)
+        )
+        by_default = self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector"))
+        if not (squares and by_default):
+            return []
+        return [(
+            "board: squares touch its markers' corners, and OpenCV's default threshold joins both: "
+            "it finds a third of sharp markers; adaptiveThreshConstant = 60, "
+            "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in five "
+            "(pipelines/boards/README.md)"
+        )]
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """Every optional part, active or not."""
+        effects, target = self.experiment.effects, target_word(self.grid)
+        drawn = self.grid.distributions
+        on = [effect for effect in effects
+              if effect.switch in drawn or self.grid.any_value(effect.switch, effect.is_on)]
+        calibrated = "calibration" in self.grid.values_of("believed")
+        draws = list(dict.fromkeys([
+            *drawn, *(["jitter_px"] if self.grid.any_value("jitter_px", bool) else []),
+            *(each.switch for each in on if each.random),
+            *(["the believed calibration"] if calibrated else []),
+        ]))
+        lens = any(map(canonical_distortion, self.grid.values_of("distortion")))
+        image = self.grid.any_value("background", lambda value: isinstance(value, str))
+        asked = "full" in self.grid.values_of("window")
+        guarded = self.grid.any_value("guarded", bool)
+        settings = self.experiment.detectors
+        whole = sorted({reason for reason in map(full_frame_reason, settings) if reason})
+        gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
+            [1.0, *self.grid.values_of("gain")])
+        if any(effect.widens == "uneven light" for effect in on) and any(
+                uneven_light_needs_frame(setting, gain) for setting in settings):
+            whole.append("adaptiveThreshConstant is low for uneven light")
+        if image:
+            whole.append(
+                f"the background is an image: clutter near the {target} may change the detection")
+        if asked:
+            whole.append('window = "full"')
+        coarse = any("noise" in effect.worsens for effect in on)
+        noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
+        noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
+        margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
+        assumptions = [
+            name for name in PARAMETERS
+            if name.startswith("believed_") and self.grid.fixed.get(name, "varies") is not None
+        ] + (["believed: calibration"] if calibrated else [])
+        return [
+            Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
+            _listed("random draws", draws, "nothing is random",
+                    "{}, Sobol' points" if self.grid.sampling == "sobol" else "{}"),
+            Part("background image", image, "background names a file" if image else "a level"),
+            _listed("window", [] if asked or image else map(str, margins), "the full frame",
+                    f"{{}} px around the {target}'s pixels{noise}"),
+            _listed("plug-ins", map(_described, self.grid.plugins), "none is named"),
+            Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
+            Part("renderer", True, ", ".join(sorted(set(self.grid.values_of("renderer"))))),
+            *(self._effect(effect) for effect in effects),
+            Part("solver guard", guarded,
+                 "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP"),
+            _listed("accuracy bound", sorted(set(self.grid.values_of("bound")) - {"none"}),
+                    "bound is none", "bound is {}"),
+            _listed("pixels kept",
+                    (name for name in self.grid.values_of("solver") if self._needs_images(name)),
+                    "no solver needs them", "solver {} needs them"),
+            _listed("wrong assumptions", assumptions,
+                    "the estimator knows the true camera and size"),
+        ]
+
+    def _effect(self, effect: Effect) -> Part:
+        name, switch = effect.label, effect.switch
+        if switch in self.grid.distributions:
+            return Part(name, True, f"{switch} is drawn: {self.grid.distributions[switch]}", switch)
+        values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
+        if not values:
+            return Part(name, False, f"{switch} is {effect.off_text}", switch)
+        coded = is_coded(effect.off)
+        extent = ", ".join(dict.fromkeys(map(label, values))) if coded else _text(values)
+        return Part(name, True, f"{switch} is {extent}", switch)
+
+    def _needs_images(self, solver: str) -> bool:
+        plugin = self.grid.plugin("estimator", solver)
+        return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -383,41 +383,3 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return ",".join("" if item is None else _text(item) for item in value)
     return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
-
-
-class Compiled(Protocol):
-    """A pipeline, whose experiment is resolved when it is asked for."""
-
-    @property
-    def experiment(self) -> Experiment:
-        """The experiment that it describes."""
-
-
-def scene_axes(pipeline: Compiled) -> tuple[Axis, ...]:
-    """Return the axes that blocks are cut along."""
-    return pipeline.experiment.scene_axes
-
-
-def scene_values(pipeline: Compiled, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
-    """Return :meth:`Experiment.scene_values` of a pipeline."""
-    return pipeline.experiment.scene_values(indices)
-
-
-def image_keys(pipeline: Compiled, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
-    """Return :meth:`Experiment.image_keys` of a pipeline."""
-    return pipeline.experiment.image_keys(indices)
-
-
-def detector_settings(pipeline: Compiled) -> list[AnyDetectorSetting]:
-    """Return the detector settings of a pipeline."""
-    return pipeline.experiment.detectors
-
-
-def board_settings(pipeline: Compiled) -> list[BoardDetectorSetting]:
-    """Return what the detector settings of a pipeline do with boards."""
-    return pipeline.experiment.board_settings
-
-
-def estimators(pipeline: Compiled) -> list[EstimatorSetting]:
-    """Return the estimators of a pipeline."""
-    return pipeline.experiment.estimators

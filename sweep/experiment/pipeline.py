@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from sweep.experiment.cameras import (
     resolve_sensor,
 )
 from sweep.experiment.experiment import Grid
+from sweep.experiment.facts import Facts
 from sweep.experiment.grid import Experiment
 from sweep.experiment.parameters import PARAMETERS, RIVALS, Parameter, is_zip
 from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
@@ -258,9 +259,14 @@ class Pipeline(Grid):
         """The experiment that it describes, resolved once in each process."""
         return Experiment(self)
 
+    @cached_property
+    def facts(self) -> Facts:
+        """What its camera and poses are, and what may surprise of them."""
+        return Facts(self.experiment)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process gets; it resolves the experiment itself."""
-        return {name: value for name, value in vars(self).items() if name != "experiment"}
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def heading(self) -> str:

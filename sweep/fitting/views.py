@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
@@ -71,7 +70,7 @@ def photograph_scenes(pipeline: Pipeline, board: Board | None) -> PhotographScen
     A board that is in them says better where its markers are than the other camera, whose poses
     have the error of a single marker.
     """
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     lengths = [1 if axis.name == "stereo_camera" else len(axis) for axis in axes]
     indices = [each.ravel() for each in np.indices(lengths)]
     count = len(indices[0])
@@ -79,7 +78,7 @@ def photograph_scenes(pipeline: Pipeline, board: Board | None) -> PhotographScen
         (index for axis, index in zip(axes, indices, strict=True) if axis.name == "trial"),
         np.zeros(count, dtype=np.int64),
     )
-    values = scene_values(pipeline, indices)
+    values = pipeline.experiment.scene_values(indices)
     taken = PhotographScenes(
         build_scenes(values, count), trial, values["truth"].broadcast(count, np.uint8)
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
 from sweep.model.pose import rotation_of_vector
@@ -48,7 +48,7 @@ def stored_cell(store: RunStore, index: Mapping[str, int]) -> StoredCell | None:
     StoreError
         If its receipt is damaged, or a chunk of it is missing.
     """
-    corner = tuple(index[axis.name] for axis in scene_axes(store.pipeline))
+    corner = tuple(index[axis.name] for axis in store.pipeline.experiment.scene_axes)
     number = store.blocks.number(Block(corner, corner))
     if number not in committed(store):
         return None

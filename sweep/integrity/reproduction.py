@@ -13,7 +13,6 @@ from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
 from sweep.experiment.cell_selection import cell, parse_selection, selection_text
-from sweep.experiment.grid import scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import Variable
@@ -105,7 +104,7 @@ def reproduce(
     setting, estimator = (
         _number(pipeline, stage, index) for stage in (Stage.detection, Stage.estimation)
     )
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     need = np.zeros(
         (1, pipeline.size(Stage.detection), pipeline.size(Stage.estimation)), dtype=bool
     )

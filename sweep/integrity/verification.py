@@ -19,7 +19,7 @@ from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.progress import InWaves
 from sweep.experiment.cell_selection import selection_text
-from sweep.experiment.grid import Block, detector_settings, estimators, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.recomputation import (
@@ -354,7 +354,7 @@ def _compared(
     damage: list[Damage] = []
     elsewhere: list[Damage] = []
     other_processor = 0
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     one = Block((0,) * len(axes), (1,) * len(axes))
     for row, (scene, stored) in enumerate(scenes.items()):
         values = {
@@ -405,10 +405,10 @@ def _differing(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.bool_]:
 def _part(pipeline: Pipeline, stage: Stage, configuration: int) -> str:
     """Return the name of what computes a configuration of a stage, as far as can be told."""
     if stage is Stage.estimation:
-        settings = estimators(pipeline)
+        settings = pipeline.experiment.estimators
         return settings[configuration % len(settings)].solver
     if stage is Stage.detection:
-        setting = detector_settings(pipeline)[configuration]
+        setting = pipeline.experiment.detectors[configuration]
         if isinstance(setting, PluginSetting):
             return setting.plugin.name
     drawing = [each.name for each in pipeline.plugins if each.kind in {"effect", "renderer"}]
@@ -420,7 +420,7 @@ def _at(store: RunStore, scene: Scene) -> str:
     block, number = scene
     return "--at " + selection_text({
         axis.name: axis.values[index] for axis, index in zip(
-            scene_axes(store.pipeline), store.blocks[block].cell(number), strict=True)
+            store.pipeline.experiment.scene_axes, store.blocks[block].cell(number), strict=True)
     })
 
 

@@ -16,10 +16,8 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.experiment import scene_plugins
-from sweep.experiment.grid import detector_settings, estimators, scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.machine import explained
 from sweep.measure.detectors import make_detector
@@ -131,9 +129,10 @@ class _IsolatedCells:
         pipeline = self._pipeline
         values = [
             axis.values[int(index[0])]
-            for axis, index in zip(scene_axes(pipeline), indices, strict=True)
+            for axis, index in zip(pipeline.experiment.scene_axes, indices, strict=True)
         ]
-        named = dict(zip((axis.name for axis in scene_axes(pipeline)), values, strict=True))
+        names = (axis.name for axis in pipeline.experiment.scene_axes)
+        named = dict(zip(names, values, strict=True))
         for stage, number in ((Stage.detection, setting), (Stage.estimation, estimator)):
             axes = pipeline.axes_of(stage)
             if number is not None and axes:
@@ -314,7 +313,7 @@ class _Scene:
         else:
             number = (setting or 0) * (1 if estimator is None else self._need.shape[2])
             number += estimator or 0
-            for variable in variables_of(self._pipeline):
+            for variable in self._pipeline.experiment.variables:
                 if variable.stage is stage:
                     column = part.columns[variable.name][number]
                     self._result.columns[variable.name][number] = column
@@ -436,7 +435,7 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
         width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
         blank = np.full((height, width), 128, dtype=np.uint8)
         settings = [
-            setting for setting in detector_settings(pipeline)
+            setting for setting in pipeline.experiment.detectors
             if isinstance(setting, PluginSetting) and setting.plugin.name == name
         ]
         for setting in _first(settings):
@@ -445,7 +444,7 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
                 search(blank, dictionary, max(width, height))
     elif kind == "estimator":
         for estimator in _first(
-            each for each in estimators(pipeline)
+            each for each in pipeline.experiment.estimators
             if isinstance(each, PluggedEstimatorSetting) and each.solver == name
         ):
             build(estimator)

@@ -20,7 +20,7 @@ from sweep.analysis.requirements import (
     verdicts,
 )
 from sweep.errors import DatasetError, StoreError
-from sweep.experiment.experiment import shows_boards, target_word
+from sweep.experiment.experiment import target_word
 from sweep.report.comparison import CARDS, COUNTED, Comparison, comparison
 from sweep.report.decisions import WORDS, condition_table, decision_table, valued
 from sweep.report.error_model_file import error_model_tables
@@ -274,7 +274,7 @@ def _notes(data: ReportData, known: Configurations) -> str:
     warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
     return warnings + sentences(
         "A board counts as detected if at least one of its markers is."
-        if shows_boards(data.pipeline) else "",
+        if data.pipeline.experiment.shows_boards else "",
         *known.settings.grouping.notes, data.pooled(*known.settings.axes))
 
 

@@ -14,7 +14,6 @@ import xarray as xr
 from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, QUANTITIES, VARIES
 from sweep.analysis.error_models import UNITS, WORDS, Use, cell_edges, error_models, model_errors
 from sweep.errors import ArgumentError
-from sweep.experiment.facts import camera_facts
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
@@ -264,7 +263,7 @@ def facts_of(data: ReportData) -> dict[str, Any]:
     """Return what the models are of."""
     return {
         "store": data.store, "title": data.pipeline.heading,
-        "camera": camera_facts(data.pipeline).line(),
+        "camera": data.pipeline.facts.camera.line(),
         "fingerprint": dict(data.run_metadata.get("fingerprint", {})),
         "pipeline": data.pipeline.text,
     }

@@ -20,7 +20,7 @@ from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.experiment.cell_selection import cell, coordinates_text, selection_text
 from sweep.experiment.experiment import target_word
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import VARIABLES, Variable, variables_of
+from sweep.experiment.schema import VARIABLES, Variable
 from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.report.report_data import AREA, ReportData, store_errors
@@ -377,7 +377,7 @@ def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
     StoreError
         If the store cannot be read.
     """
-    variables = variables_of(data.pipeline)
+    variables = data.pipeline.experiment.variables
     names = [variable.name for variable in variables if variable.name in data.results.variables]
     with store_errors(data.store):
         cell = data.results[names].isel(index).load()
@@ -524,7 +524,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
         picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
         # The store may be another machine's: as `sweep verify`, within the tolerances for those.
-        difference = compare(inspected.values, stored, variables_of(data.pipeline),
+        difference = compare(inspected.values, stored, data.pipeline.experiment.variables,
                              same_processor=False)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__

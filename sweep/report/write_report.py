@@ -20,7 +20,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.axes import Axis
-from sweep.experiment.facts import camera_facts, camera_notes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label
 from sweep.report.answer import Answer, answer
@@ -88,7 +87,7 @@ def provenance(data: ReportData, output: str) -> Provenance:
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
         "Store": data.store,
-        "Camera": "; ".join([camera_facts(data.pipeline).line(), *camera_notes(data.pipeline)]),
+        "Camera": "; ".join([data.pipeline.facts.camera.line(), *data.pipeline.facts.camera_notes]),
         "Run": _dates(data.run_metadata),
         **({"Sampling": sampling} if (sampling := sampling_text(data.results)) else {}),
         "Versions": versions,

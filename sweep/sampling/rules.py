@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import StoreError
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES, Variable
@@ -48,7 +48,7 @@ def block_unit(ends: Sequence[int]) -> int:
 
 def condition_axes(pipeline: Pipeline) -> tuple[Axis, ...]:
     """Return the axes of the scene except ``trial``, in the pipeline's order."""
-    return tuple(axis for axis in scene_axes(pipeline) if axis.name != TRIAL)
+    return tuple(axis for axis in pipeline.experiment.scene_axes if axis.name != TRIAL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Waves:
     @staticmethod
     def of(pipeline: Pipeline, rule: Stopping, blocks: Blocks) -> Waves:
         """Return the groups and waves of a pipeline's blocks; ValueError if they do not fit."""
-        names = [axis.name for axis in scene_axes(pipeline)]
+        names = [axis.name for axis in pipeline.experiment.scene_axes]
         trial = names.index(TRIAL)
         if any(end % blocks.extents[trial] for end in rule.ends[:-1]):
             raise ValueError(f"blocks of {blocks.extents[trial]} trials, waves at {rule.ends}")
@@ -407,7 +407,7 @@ def in_order_of_results(
 ) -> NDArray[Any]:
     """Return values in the dataset's dimensions in those of `GroupResults`."""
     names = variable.dimensions(pipeline)
-    scene = [axis.name for axis in scene_axes(pipeline) if axis.name != TRIAL]
+    scene = [axis.name for axis in pipeline.experiment.scene_axes if axis.name != TRIAL]
     order = [
         *scene, TRIAL,
         *(axis.name for axis in pipeline.axes_of(Stage.detection)),
@@ -421,7 +421,7 @@ def by_scene(
 ) -> NDArray[Any]:
     """Return a block's values of a variable in the dimensions (N, configurations)."""
     names = variable.dimensions(pipeline)
-    scene = [axis.name for axis in scene_axes(pipeline)]
+    scene = [axis.name for axis in pipeline.experiment.scene_axes]
     order = [*(names.index(name) for name in scene),
              *(k for k, name in enumerate(names) if name not in scene)]
     return values.transpose(order).reshape(len(block), -1)

@@ -19,9 +19,9 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
-from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import VARIABLES, Variable, variables_of
+from sweep.experiment.schema import VARIABLES, Variable
 from sweep.store.chunks import Chunks, receipt_key
 from sweep.store.files import (
     absent_files,
@@ -72,7 +72,7 @@ class RunStore:
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """The variables of the pipeline."""
-        return variables_of(self.pipeline)
+        return self.pipeline.experiment.variables
 
     @cached_property
     def chunks(self) -> Chunks:
@@ -146,7 +146,7 @@ def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice,
     slices = {
         axis.name: slice(start, stop)
         for axis, start, stop in zip(
-            scene_axes(pipeline), block.starts, block.stops, strict=True
+            pipeline.experiment.scene_axes, block.starts, block.stops, strict=True
         )
     }
     return tuple(slices.get(name, slice(None)) for name in variable.dimensions(pipeline))

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.store.layout import RECEIPTS, packed
 
 
@@ -34,7 +33,7 @@ class Chunks:
 
     def __init__(self, pipeline: Pipeline, blocks: Blocks) -> None:
         self._blocks = blocks
-        axes = [axis.name for axis in scene_axes(pipeline)]
+        axes = [axis.name for axis in pipeline.experiment.scene_axes]
         extents = dict(zip(axes, blocks.extents, strict=True))
         # For each scene axis, its position among a variable's dimensions.
         self._positions: dict[str, tuple[int, ...]] = {}
@@ -42,7 +41,7 @@ class Chunks:
         self._templates: dict[str, str] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._types: dict[str, tuple[str, float | int]] = {}
-        for variable in variables_of(pipeline):
+        for variable in pipeline.experiment.variables:
             names = variable.dimensions(pipeline)
             positions = tuple(names.index(name) for name in axes)
             parts = ["0"] * len(names)

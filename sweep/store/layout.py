@@ -21,7 +21,7 @@ from zarr.storage import MemoryStore
 
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
-from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.photographs import is_simulated
 from sweep.experiment.pipeline import Pipeline
@@ -31,7 +31,6 @@ from sweep.experiment.schema import (
     FixedValue,
     Variable,
     fixed_values,
-    variables_of,
     with_description,
 )
 from sweep.model.image_file import IMAGE_SUFFIXES
@@ -152,8 +151,9 @@ def unpacked(content: bytes) -> bytes:
 
 def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
-    variables = variables_of(pipeline)
-    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
+    variables = pipeline.experiment.variables
+    names = (axis.name for axis in pipeline.experiment.scene_axes)
+    scene_extent = dict(zip(names, extents, strict=True))
     planned = [each for axis in pipeline.axes for each in _axis(axis)]
     used = {
         name: length for variable in variables
@@ -169,7 +169,7 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
                for each in planned]
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     planned.append(
         PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
     )
@@ -241,7 +241,8 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
     if not sides or sides[0] is None:
         return []
     axes = [
-        axis for axis in scene_axes(pipeline) if axis.columns.keys() & set(DISTANCE_PARAMETERS)
+        axis for axis in pipeline.experiment.scene_axes
+        if axis.columns.keys() & set(DISTANCE_PARAMETERS)
     ]
     values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
     for k, axis in enumerate(axes):

@@ -23,8 +23,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
-from sweep.experiment.facts import camera_facts, camera_notes
-from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
 from sweep.experiment.sampling import texts_in
 from sweep.experiment.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
@@ -243,7 +242,7 @@ def store_of(
             files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
         blocks = Blocks(
-            tuple(len(axis) for axis in scene_axes(pipeline)), tuple(metadata["block"]))
+            tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
         return RunStore(url, open_group(storage, mode), pipeline, metadata["run_id"], blocks)
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None
@@ -339,11 +338,11 @@ def root_attributes(
 ) -> dict[str, Any]:
     """Return the attributes of a store's root: texts and numbers, which netCDF can hold."""
     coordinates = [array.path for array in planned if array.coordinate]
-    surprising = camera_notes(pipeline)
+    surprising = pipeline.facts.camera_notes
     attributes = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
-        **camera_facts(pipeline).attributes(),
+        **pipeline.facts.camera.attributes(),
         **({"camera_notes": "; ".join(surprising)} if surprising else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": json.dumps(metadata),

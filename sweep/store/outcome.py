@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.experiment.cell_selection import selection_text
-from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
@@ -60,7 +60,7 @@ def recorded(
 
 def _at(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
     """Return the coordinates of a failure's cell, as ``sweep repro --at`` takes them."""
-    indices = {axis.name: k for axis, k in zip(scene_axes(pipeline), cell, strict=True)}
+    indices = {axis.name: k for axis, k in zip(pipeline.experiment.scene_axes, cell, strict=True)}
     for number, stage in (
         (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
     ):

@@ -18,8 +18,6 @@ from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.experiment.axes import TRIAL
-from sweep.experiment.experiment import scene_plugins
-from sweep.experiment.grid import detector_settings, estimators, scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.detectors import (
@@ -151,7 +149,7 @@ def whole_frames_of(pipeline: Pipeline) -> list[bool]:
     whole = pipeline.any_value("window", lambda value: value == "full")
     whole |= pipeline.any_value("background", lambda value: isinstance(value, str))
     return [
-        whole or full_frame_reason(setting) is not None for setting in detector_settings(pipeline)
+        whole or full_frame_reason(setting) is not None for setting in pipeline.experiment.detectors
     ]
 
 
@@ -177,7 +175,7 @@ def sample_scenes(
     frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
     count = MIN_SCENES if any(whole_frames_of(pipeline)) else MAX_SCENES
     count = int(min(max(MAX_PX // (frame * conditions), 1), count))
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     lengths = [
         1 if axis.name in fixed or axis.name == TRIAL else len(axis) for axis in axes
     ]
@@ -275,7 +273,7 @@ def measure(
         Called after each round with the share of the time limit that is used.
     """
     started = time.perf_counter()
-    settings, estimating = detector_settings(pipeline), estimators(pipeline)
+    settings, estimating = pipeline.experiment.detectors, pipeline.experiment.estimators
     configurations = _Configurations(
         [make_detector(setting) for setting in settings], estimating,
         [build(estimator) for estimator in estimating],
@@ -398,15 +396,15 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
     count = len(indices[0]) if indices else 1
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count, scene_plugins(pipeline))
+    values = pipeline.experiment.scene_values(indices)
+    scenes = build_scenes(values, count, pipeline.experiment.scene_plugins)
     rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
     if 0 < len(rows) < count:
         return _prepare(pipeline, [index[rows] for index in indices], most)
     if count > most:
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
         return _prepare(pipeline, [index[chosen] for index in indices], most)
-    settings = detector_settings(pipeline)
+    settings = pipeline.experiment.detectors
     wanted = np.full((count, len(settings)), len(rows) > 0)
     full = whole_frames(values, count)
     searches, _, _ = search(scenes, wanted, settings, full, [], keep=True)
@@ -455,9 +453,10 @@ def measure_renderers(
         Checked between two measurements.
     """
     count = len(samples[0][0])
-    plugins = scene_plugins(pipeline)
+    plugins = pipeline.experiment.scene_plugins
     scenes = [
-        build_scenes(scene_values(pipeline, indices), count, plugins) for indices in samples
+        build_scenes(pipeline.experiment.scene_values(indices), count, plugins)
+        for indices in samples
     ]
     rows = np.flatnonzero(visibility_flags(scenes[reference]) == DetectionStatus.not_run)
     boxes = [marker_boxes(each)[rows] for each in scenes]

@@ -21,7 +21,6 @@ from sweep.analysis.summaries import guarded_error_statistics
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import estimators
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
@@ -339,10 +338,11 @@ def _corner_noise_scale(
     assumed = np.array(
         [
             np.nan if setting.corner_noise_px is None else setting.corner_noise_px
-            for setting in estimators(pipeline)
+            for setting in pipeline.experiment.estimators
         ]
     )
-    from_images = np.array([build(setting).needs_images for setting in estimators(pipeline)])
+    estimators = pipeline.experiment.estimators
+    from_images = np.array([build(setting).needs_images for setting in estimators])
     shape = [len(axis) for axis in axes]
     names = [axis.name for axis in axes]
 
@@ -351,7 +351,7 @@ def _corner_noise_scale(
                             coords={name: results[name] for name in names})
 
     noise = measured(corners_of(results))
-    chessboard = np.array([setting.points == "chessboard" for setting in estimators(pipeline)])
+    chessboard = np.array([setting.points == "chessboard" for setting in estimators])
     if chessboard.any():
         noise = noise.where(
             ~over_estimators(chessboard), measured("chessboard_corner_error_px"))

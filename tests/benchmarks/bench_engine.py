@@ -26,7 +26,7 @@ from tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.execution.forecast import forecast, seconds_of
 from sweep.execution.runner import execute
-from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.machine import default_workers
 
@@ -76,7 +76,7 @@ def grid_for(seconds, workers):
 def bare(text, start, stop, seconds, at):
     """Run the kernel alone on a part of the trials; report scenes and time."""
     pipeline = Pipeline.from_text(text)
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     run_cells(pipeline, [np.zeros(1, dtype=np.intp) for _ in axes])
     while time.time() < at:
         time.sleep(0.001)
@@ -144,7 +144,7 @@ def shared_work():
     """Compare 4 refinements x 5 solvers in one sweep with 20 separate sweeps."""
     text = grid(1)[0] + SETTINGS
     together = Pipeline.from_text(text)
-    axes = scene_axes(together)
+    axes = together.experiment.scene_axes
     indices = [g.ravel() for g in np.indices([len(axis) for axis in axes])]
     ratios = []
     for _ in range(REPEATS):

@@ -18,7 +18,6 @@ from tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
-from sweep.experiment.grid import detector_settings, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import Detector, charuco_board
 from sweep.measure.flags import DetectionStatus
@@ -99,11 +98,11 @@ class Block:
         self.pipeline = Pipeline.from_text(text.format(
             width=width, height=height, focal=4 / 4.8 * width, poses=poses, **given))
         self.poses, self.indices = poses, [np.arange(poses)]
-        self.values = scene_values(self.pipeline, self.indices)
+        self.values = self.pipeline.experiment.scene_values(self.indices)
         self.scenes = build_scenes(self.values, poses)
         self.boxes = marker_boxes(self.scenes)
         self.rows = np.flatnonzero(visibility_flags(self.scenes) == DetectionStatus.not_run)
-        self.setting = detector_settings(self.pipeline)[0]
+        self.setting = self.pipeline.experiment.detectors[0]
         self.cut = search_windows(
             self.scenes, self.boxes, self.setting, whole_frames(self.values, poses))
         self.camera = self.scenes.cameras.matrix(0)

@@ -23,7 +23,6 @@ from support.photographs import drawn_pose, photograph
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, whole_frames
-from sweep.experiment.grid import detector_settings, estimators, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bound_of_scene
 from sweep.measure.estimation import Detections
@@ -75,7 +74,7 @@ def measured(side, tilt):
     """Return ms of the bound, of two starts and of four, a scene."""
     pipeline = Pipeline.from_text(
         TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)).replace("SCENES", str(SCENES)))
-    values = scene_values(pipeline, [np.arange(SCENES)])
+    values = pipeline.experiment.scene_values([np.arange(SCENES)])
     scenes = build_scenes(values, SCENES)
     box = marker_boxes(scenes)[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
     view = marker_view(
@@ -85,11 +84,11 @@ def measured(side, tilt):
     width, height = (box[2:] - box[:2]).tolist()
     image = np.zeros((height, width))
     found, _, _ = search(
-        scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(pipeline),
+        scenes, np.ones((SCENES, 1), dtype=bool), pipeline.experiment.detectors,
         whole_frames(values, SCENES), [], keep=True,
     )
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
-    seen = detections_for(estimators(pipeline)[0], values, scenes, found[0], rows)
+    seen = detections_for(pipeline.experiment.estimators[0], values, scenes, found[0], rows)
     return (
         best_ms(lambda: bound_of_scene(state, view, image, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))

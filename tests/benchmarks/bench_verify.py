@@ -19,7 +19,6 @@ from sweep.execution import block_task as task
 from sweep.execution.status import close
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.lifecycle import create_store
@@ -49,7 +48,7 @@ def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
     }
     absent = ("bound_", "mirror", "predicted", "nees", "residual")
     columns = {}
-    for variable in variables_of(pipeline):
+    for variable in pipeline.experiment.variables:
         if variable.flags is not None:
             values = flags[variable.name]
         else:

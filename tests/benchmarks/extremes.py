@@ -22,7 +22,7 @@ import numpy as np
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure
-from sweep.experiment.grid import Block, block_indices, detector_settings, estimators, scene_axes
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -65,10 +65,10 @@ class Measured:
             return groups.items()
 
         for searched, by_refinement in grouped(
-            Stage.detection, "cornerRefinementMethod", detector_settings(self.pipeline)
+            Stage.detection, "cornerRefinementMethod", self.pipeline.experiment.detectors
         ):
             for solved, by_solver in grouped(
-                Stage.estimation, "solver", estimators(self.pipeline)
+                Stage.estimation, "solver", self.pipeline.experiment.estimators
             ):
                 yield searched, solved, by_refinement, by_solver
 
@@ -79,7 +79,7 @@ def _shown(value):
 
 def measured(pipeline, count=None):
     """Run a pipeline's scenes: all, or ``count`` of them, drawn by its seed."""
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     indices = block_indices(Block((0,) * len(shape), shape))
     if count is not None and count < len(indices[0]):
         chosen = np.random.default_rng(pipeline.seed).permutation(len(indices[0]))[:count]

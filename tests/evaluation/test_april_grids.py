@@ -5,7 +5,6 @@ import pytest
 
 from support.blocks import run_block
 from sweep.errors import PipelineError
-from sweep.experiment.facts import notes
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -58,10 +57,10 @@ def test_the_named_setting_finds_what_the_default_loses():
 
 
 def test_plan_names_the_setting_where_the_default_loses_markers():
-    (line,) = [each for each in notes(Pipeline.from_text(TEXT)) if "squares" in each]
+    (line,) = [each for each in Pipeline.from_text(TEXT).facts.notes if "squares" in each]
     for setting in FOUND:
         assert setting.replace("=", " = ") in line
-    assert not [each for each in notes(Pipeline.from_text(TEXT, FOUND)) if "squares" in each]
+    assert not [each for each in Pipeline.from_text(TEXT, FOUND).facts.notes if "squares" in each]
 
 
 @pytest.mark.parametrize("kind", ["aprilgrid", "grid"])

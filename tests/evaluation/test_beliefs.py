@@ -32,7 +32,7 @@ from support.blocks import run_block
 from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
-from sweep.experiment.grid import Block, block_indices, estimators, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -53,7 +53,7 @@ below are effects of 1e-2 and more."""
 
 
 def whole(pipeline):
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return Block((0,) * len(shape), shape)
 
 
@@ -74,9 +74,9 @@ class Estimated:
     def __init__(self, text, settings=(), noise=0.0):
         pipeline = Pipeline.from_text(text, settings)
         block = whole(pipeline)
-        self.values = scene_values(pipeline, block_indices(block))
+        self.values = pipeline.experiment.scene_values(block_indices(block))
         self.scenes = build_scenes(self.values, len(block))
-        self.estimators = estimators(pipeline)
+        self.estimators = pipeline.experiment.estimators
         shifts = np.random.default_rng(6).normal(size=self.scenes.corners_px.shape)
         corners = self.scenes.corners_px + noise * shifts
         self.estimates, self.errors = [], []

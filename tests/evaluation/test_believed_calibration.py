@@ -8,8 +8,6 @@ from sweep.errors import PipelineError, StoreError
 from sweep.evaluation.block import run_cells
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
-from sweep.experiment.facts import camera_notes
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import EstimateStatus
@@ -45,8 +43,8 @@ def pipeline(camera, estimator=None, trials=DRAWS, settings=(), **sections):
 
 def drawn(chosen, names=NAMES):
     count = chosen.size(Stage.scene)
-    lengths = [len(axis) for axis in scene_axes(chosen)]
-    values = scene_values(chosen, [index.ravel() for index in np.indices(lengths)])
+    lengths = [len(axis) for axis in chosen.experiment.scene_axes]
+    values = chosen.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
     return np.stack([values[f"calibrated_{name}"].broadcast(count) for name in names])
 
 
@@ -76,7 +74,7 @@ def test_draws_of_a_calibration_change_no_other_draw_and_follow_the_cell():
         "estimator": {"believed": "calibration"},
     })
     index = [np.arange(50)]
-    ours, theirs = scene_values(believing, index), scene_values(plain, index)
+    ours, theirs = believing.experiment.scene_values(index), plain.experiment.scene_values(index)
     np.testing.assert_array_equal(ours["shift_u_px"].values, theirs["shift_u_px"].values)
     # The same trial of a calibration twice as uncertain is twice as far off.
     wider = pipeline({"calibration_sd": [2 * d for d in SD]}, trials=50)
@@ -101,7 +99,7 @@ def test_a_believed_calibration_is_what_each_trial_s_numbers_give_on_their_own(t
     results = sweep.open(tmp_path / "s.zarr").load()
     assert (results["estimate"] == EstimateStatus.solved).all()
     assert set(results["believed_fx_px"].dims) == {"trial"}
-    values = scene_values(chosen, [np.arange(4)])
+    values = chosen.experiment.scene_values([np.arange(4)])
     for name in NAMES:
         np.testing.assert_array_equal(
             results[f"believed_{name}"], values[f"calibrated_{name}"].values
@@ -176,8 +174,8 @@ def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line)
      "the calibration's numbers are drawn independently of each other"),
 ])
 def test_beliefs_that_may_surprise_are_told(camera, estimator, line):
-    assert [each for each in camera_notes(pipeline(camera, estimator, 1)) if line in each]
-    assert not camera_notes(pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1))
+    assert [each for each in pipeline(camera, estimator, 1).facts.camera_notes if line in each]
+    assert not pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1).facts.camera_notes
 
 
 # Reuse.

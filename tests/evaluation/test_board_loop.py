@@ -9,7 +9,7 @@ from support.blocks import run_block
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
 from sweep.evaluation.block import run_cells
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
@@ -113,7 +113,7 @@ def plain_pose(objects, pixels, lens, method, limit_px):
 def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, request):
     trials = 15 if request.node.get_closest_marker("long") else 1
     pipeline = Pipeline.from_text(text(name, trials, window), [])
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     block = Block((0,) * len(shape), shape)
     result = run_block(pipeline, block)
     assert not result.failures
@@ -121,7 +121,7 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, reques
         key: column.reshape(len(block), *column.shape[len(shape) :])
         for key, column in result.values.items()
     }
-    values = scene_values(pipeline, block_indices(block))
+    values = pipeline.experiment.scene_values(block_indices(block))
     scenes = build_scenes(values, len(block))
     (printed,) = set(values["board"].listed(len(block)))
     boxes = marker_boxes(scenes)

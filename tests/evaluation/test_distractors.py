@@ -7,8 +7,7 @@ import pytest
 from support.lengths import lengths
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.experiment.experiment import largest_board
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import BoardDetectorSetting, DetectorSetting
@@ -40,7 +39,7 @@ def pipeline(board, *settings, **sections):
 
 
 def shown(chosen):
-    values = scene_values(chosen, [])
+    values = chosen.experiment.scene_values([])
     return build_scenes(values, 1), values
 
 
@@ -50,11 +49,12 @@ def one(chosen, name):
 
 def searched(chosen, count, window):
     """Scenes, their boards, and what is found in windows or whole frames."""
-    shape = tuple(len(axis) for axis in scene_axes(chosen))
-    values = scene_values(chosen, block_indices(Block((0,) * len(shape), shape)))
+    shape = tuple(len(axis) for axis in chosen.experiment.scene_axes)
+    values = chosen.experiment.scene_values(block_indices(Block((0,) * len(shape), shape)))
     scenes = build_scenes(values, count)
     flags = visibility_flags(scenes)
-    boards = target_scenes(scenes, flags, values["board"].listed(count), largest_board(chosen))
+    boards = target_scenes(
+        scenes, flags, values["board"].listed(count), chosen.experiment.largest_board)
     results, _, _ = search(
         scenes, (flags == DetectionStatus.not_run)[:, None], [DetectorSetting()],
         np.full(count, window == "full"), [], targets=boards,
@@ -114,7 +114,7 @@ def test_a_target_is_visible_and_as_large_as_without_distractors(board):
             for more in (({} if board is GRID else {"distractors": [SQUARE]}),
                          {"distractors": BESIDE})
         )
-        assert largest_board(beside) == largest_board(plain)
+        assert beside.experiment.largest_board == plain.experiment.largest_board
         for name in ("marker_area_px", "detection", "marker_detection", "board_marker_id"):
             np.testing.assert_array_equal(one(beside, name), one(plain, name))
     # At the last pose the frame shows the distractor with the board's ID alone.
@@ -146,5 +146,6 @@ def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(besid
     scenes, values = shown(chosen)
     flags = visibility_flags(scenes)
     assert flags[0] == expected
-    boards = target_scenes(scenes, flags, values["board"].listed(1), largest_board(chosen))
+    boards = target_scenes(
+        scenes, flags, values["board"].listed(1), chosen.experiment.largest_board)
     assert (boards.flags == expected).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.blocks import run_block
-from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
 from sweep.measure.classify import TargetScenes, classify
@@ -26,7 +26,7 @@ background = 128
 
 
 def run(pipeline):
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     result = run_block(pipeline, Block((0,) * len(shape), shape))
     assert not result.failures
     return result.values

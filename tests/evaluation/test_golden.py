@@ -5,7 +5,6 @@ import hashlib
 import numpy as np
 
 from support.solving import estimate
-from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
@@ -87,7 +86,7 @@ def drawn(text):
     pipeline = Pipeline.from_text(text)
     shape = [len(axis) for axis in pipeline.axes]
     indices = [grid.ravel() for grid in np.indices(shape)]
-    scenes = build_scenes(scene_values(pipeline, indices), len(indices[0]))
+    scenes = build_scenes(pipeline.experiment.scene_values(indices), len(indices[0]))
     boxes = marker_boxes(scenes)
     images = hashlib.sha256()
     for row in range(len(scenes)):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
@@ -133,7 +133,7 @@ def plain_loop(trials):
     """
     pipeline = Pipeline.from_text(GRID, [f"trial={trials}", "window=full"])
     block = whole(pipeline)
-    scenes = build_scenes(scene_values(pipeline, block_indices(block)), len(block))
+    scenes = build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
     boxes = marker_boxes(scenes)
     detectors = {}
     for name, number in DICTIONARIES.items():
@@ -170,7 +170,7 @@ def plain_loop(trials):
 
 
 def whole(pipeline):
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return Block((0,) * len(shape), shape)
 
 

@@ -13,9 +13,6 @@ from sweep.evaluation.search import search, search_windows, visibility_flags
 from sweep.experiment.grid import (
     Block,
     block_indices,
-    detector_settings,
-    scene_axes,
-    scene_values,
 )
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
@@ -49,12 +46,12 @@ trial = 20
 def visible_scenes(count, width=640, height=480, settings=()):
     """Return ``count`` scenes of the grid, each visible at least in part."""
     pipeline = Pipeline.from_text(SCENES.format(width=width, height=height), settings)
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     order = np.random.default_rng(5).permutation(int(np.prod(shape)))
 
     def built(cells):
         indices = list(np.unravel_index(cells, shape))
-        return build_scenes(scene_values(pipeline, indices), len(cells))
+        return build_scenes(pipeline.experiment.scene_values(indices), len(cells))
 
     candidates = order[: count * 5 // 4 + 20]
     seen = np.flatnonzero(visibility_flags(built(candidates)) == DetectionStatus.not_run)
@@ -130,7 +127,7 @@ background = 255
 
 def test_pose_that_a_margin_of_16_px_lost_to_the_apriltag_search_is_found_as_in_the_frame():
     """Rejected in the frame and no candidate in a window with 16 px around it."""
-    scenes = build_scenes(scene_values(Pipeline.from_text(PINNED), []), 1)
+    scenes = build_scenes(Pipeline.from_text(PINNED).experiment.scene_values([]), 1)
     windowed, framed = both_searches(scenes, DetectorSetting(cornerRefinementMethod="apriltag"))
     assert windowed.flags == framed.flags
 
@@ -252,7 +249,7 @@ def test_deglitching_is_refused_or_does_not_depend_on_the_order_of_scenes(count)
 
 def test_settings_of_the_grid_are_told_apart_by_their_margins():
     pipeline = Pipeline.from_text(PAIRED, ["adaptiveThreshWinSizeMax=[23, 61]"])
-    small, large = detector_settings(pipeline)[:2]
+    small, large = pipeline.experiment.detectors[:2]
     assert (small.adaptiveThreshWinSizeMax, large.adaptiveThreshWinSizeMax) == (23, 61)
     scenes = visible_scenes(20)
     inner, outer = (
@@ -339,8 +336,9 @@ def test_window_finds_of_a_board_what_the_frame_holds_but_for_stated_exceptions(
 def test_opencv_refines_the_same_pixels_elsewhere_in_the_frame_otherwise(name, count):
     text = BOARD.format(board=BOARDS[name], noise=0, window="full", trials=count)
     pipeline = Pipeline.from_text(text)
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
-    scenes = build_scenes(scene_values(pipeline, block_indices(Block((0, 0), shape))), 3 * count)
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
+    values = pipeline.experiment.scene_values(block_indices(Block((0, 0), shape)))
+    scenes = build_scenes(values, 3 * count)
     boxes = marker_boxes(scenes)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

@@ -14,7 +14,7 @@ from sweep.errors import PipelineError
 from sweep.evaluation.block import compute_block
 from sweep.exchange.export import export
 from sweep.exchange.score import prepare
-from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 
@@ -67,7 +67,7 @@ tilt_deg = -30
 
 
 def results_of(pipeline):
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return compute_block(pipeline, Block((0,) * len(lengths), lengths))
 
 

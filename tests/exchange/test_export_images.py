@@ -17,7 +17,6 @@ from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.exchange.images import scene_indices
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.grid import image_keys
 from sweep.experiment.pipeline import Pipeline
 
 TEXT = """
@@ -248,16 +247,16 @@ def test_what_is_large_has_to_be_confirmed(pipeline, tmp_path, monkeypatch):
 
 
 def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
-    keys = image_keys(pipeline, scene_indices(pipeline, np.arange(18)))
+    keys = pipeline.experiment.image_keys(scene_indices(pipeline, np.arange(18)))
     assert len(set(keys.tolist())) == 18
     single = cell(pipeline, "tilt_deg=50,distance_m=0.2,trial=2")
-    assert image_keys(single, [np.zeros(1, dtype=np.intp)]) == keys[14]
+    assert single.experiment.image_keys([np.zeros(1, dtype=np.intp)]) == keys[14]
     larger = Pipeline.from_text(
         pipeline.text, ["distance_m=[0.05, 0.2]", "trial=9", 'window="full"', "solver=ippe",
                         "cornerRefinementMethod=none"])
-    among = image_keys(larger, scene_indices(larger, np.arange(36)))
+    among = larger.experiment.image_keys(scene_indices(larger, np.arange(36)))
     assert set(among.tolist()) & set(keys.tolist()) == set(keys[[3, 4, 5, 12, 13, 14]].tolist())
     for other in ("seed=6", "noise_grey=3", "size_m=0.06", "background=100", "fx_px=151"):
         changed = Pipeline.from_text(pipeline.text, [other])
-        among = image_keys(changed, scene_indices(changed, np.arange(18)))
+        among = changed.experiment.image_keys(scene_indices(changed, np.arange(18)))
         assert not set(among.tolist()) & set(keys.tolist()), other

@@ -25,7 +25,7 @@ from sweep.errors import ArgumentError, StoreError
 from sweep.execution.cluster import connected
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
-from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed
 from sweep.store.files import read_files, write_files
@@ -102,7 +102,7 @@ def sweep_command(*arguments, **options):
 def expected(text):
     """What a store must hold, computed here as one block, without a store."""
     pipeline = Pipeline.from_text(text)
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     values = run_block(pipeline, Block((0,) * len(lengths), lengths)).values
     return {name: hashlib.sha256(v.tobytes()).hexdigest() for name, v in values.items()}
 

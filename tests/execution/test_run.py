@@ -22,9 +22,8 @@ from sweep.cli import main
 from sweep.errors import ArgumentError, MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
-from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
 
@@ -193,7 +192,7 @@ GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 
 def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
     grown = Pipeline.from_text(TEXT, settings, name="grown")
     fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
-    extents = tuple(GROWN_EXTENTS[axis.name] for axis in scene_axes(grown))
+    extents = tuple(GROWN_EXTENTS[axis.name] for axis in grown.experiment.scene_axes)
     by_hand(fresh, grown, extents)
     store = create_store(reusing, grown, extents)
     computed = [
@@ -355,9 +354,9 @@ def test_running_scheduler_with_two_workers_gives_the_same(
 
 
 def test_template_says_what_the_kernel_makes(pipeline):
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     result = run_block(pipeline, Block((0,) * len(lengths), lengths))
-    variables = variables_of(pipeline)
+    variables = pipeline.experiment.variables
     assert list(result.values) == [variable.name for variable in variables]
     for variable in variables:
         values = result.values[variable.name]

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from zarr.storage import LocalStore, WrapperStore
 
-from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 
@@ -123,7 +123,7 @@ def test_memory_of_client_and_scheduler_does_not_grow_with_the_grid(tmp_path):
 def test_a_billion_poses_are_planned_lazily():
     pipeline = Pipeline.from_text(GRID % 100_000)
     assert pipeline.size(Stage.scene) == 10**9
-    blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), (1, 200, 20))
+    blocks = Blocks(tuple(len(axis) for axis in pipeline.experiment.scene_axes), (1, 200, 20))
     assert len(blocks) == 250_000
     assert blocks.number(blocks[249_999]) == 249_999
     assert str(blocks[249_999]) == "49-50,0-200,99980-100000"

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.measure.flags import DetectionStatus
 
 TEXT = """
@@ -177,7 +175,7 @@ OF_BOARDS = TEXT.replace("size_m = 0.05\n", "") + OF_KINDS
 
 def test_each_of_several_kinds_uses_its_own_keys():
     pipeline = Pipeline.from_text(OF_BOARDS + AXIS, [])
-    boards = scene_values(pipeline, [np.arange(3)])["board"].listed(3)
+    boards = pipeline.experiment.scene_values([np.arange(3)])["board"].listed(3)
     assert [len(board) for board in boards] == [1, 4, 4]
 
 
@@ -202,14 +200,14 @@ def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind, kept):
 
 def test_rows_of_a_grid_can_be_an_axis():
     pipeline = Pipeline.from_text(TEXT + GRID, ["rows=[1,2,5]"])
-    boards = scene_values(pipeline, [np.arange(3)])["board"].listed(3)
+    boards = pipeline.experiment.scene_values([np.arange(3)])["board"].listed(3)
     assert [len(board) for board in boards] == [7, 14, 35]
 
 
 def test_cells_of_smaller_boards_fit_the_largest_of_another_grid():
     flags, errors = (
-        next(variable for variable in variables_of(Pipeline.from_text(TEXT + GRID, ["rows=[1,2]"]))
-             if variable.name == name)
+        next(each for each in Pipeline.from_text(TEXT + GRID, ["rows=[1,2]"]).experiment.variables
+             if each.name == name)
         for name in ("marker_detection", "marker_corner_error_px")
     )
     some = np.arange(1, 15, dtype=np.uint8).reshape(2, 7)

@@ -14,8 +14,6 @@ from sweep.cli import main
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.facts import camera_facts, camera_notes
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 
@@ -77,8 +75,8 @@ def test_a_pixel_size_gives_the_focal_length_in_pixels():
 def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
     fx, fy, _, _ = view(camera)
     assert [fx, fy] == pytest.approx([focal] * 2, rel=1e-15)
-    assert camera_facts(pipeline(camera)).square
-    assert not any("square" in line for line in camera_notes(pipeline(camera)))
+    assert pipeline(camera).facts.camera.square
+    assert not any("square" in line for line in pipeline(camera).facts.camera_notes)
 
 
 @pytest.mark.parametrize("camera", [
@@ -87,10 +85,10 @@ def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
 ])
 def test_pixels_that_are_not_square_are_said_to_be(camera):
     fx, fy, _, _ = view(camera)
-    facts = camera_facts(pipeline(camera))
+    facts = pipeline(camera).facts.camera
     assert not facts.square
     assert f"pixels are not square: fy/fx = {fy / fx:.4g}" in facts.line()
-    assert camera_notes(pipeline(camera))[0].startswith(
+    assert pipeline(camera).facts.camera_notes[0].startswith(
         f"pixels are not square: fy/fx = {fy / fx:.4g};"
     )
 
@@ -114,8 +112,8 @@ def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
         "side_px": [20.0, 50.0],
     }
     grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
-    lengths = [len(axis) for axis in scene_axes(grid)]
-    values = scene_values(grid, [index.ravel() for index in np.indices(lengths)])
+    lengths = [len(axis) for axis in grid.experiment.scene_axes]
+    values = grid.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
     columns = [values[name].values for name in VIEW_PARAMETERS]
     fx, fy, _, _ = intrinsics(*columns)
     for k, chosen in enumerate(itertools.product(*axes.values())):
@@ -124,7 +122,7 @@ def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
         alone = Pipeline.from_dict(
             {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
         )
-        distance = scene_values(alone, [])["distance_m"].values
+        distance = alone.experiment.scene_values([])["distance_m"].values
         assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
 
 
@@ -132,7 +130,7 @@ def test_a_frame_size_on_an_axis_keeps_pixels_square():
     grid = Pipeline.from_dict({
         "pose": {"distance_m": 1}, "axes": {"width_px": [640, 1280], "height_px": [480, 720]},
     })
-    facts = camera_facts(grid)
+    facts = grid.facts.camera
     assert facts.square
     assert facts.fx_px == facts.fy_px == (4 / 4.8 * 640, 4 / 4.8 * 1280)
 
@@ -205,7 +203,7 @@ def test_sides_of_a_board_s_markers_are_their_own():
             {"marker_id": 1, "x_m": 0.1, "y_m": 0, "size_m": 0.01},
         ]}, "axes": {"distance_m": [1, 2]},
     })
-    facts = camera_facts(board)
+    facts = board.facts.camera
     assert facts.side_px == pytest.approx((3, 24))
     assert "the markers have sides of 3 to 24 px" in facts.line()
 
@@ -216,7 +214,7 @@ def test_sides_of_poses_in_the_world_are_named():
         "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"camera_x_m": 1.0},
         "axes": {"marker_x_m": [3.0, 2.0, 0.0]},
     })
-    assert camera_facts(world).side_px == pytest.approx((600 * 0.1 / 2, 600 * 0.1 / 1))
+    assert world.facts.camera.side_px == pytest.approx((600 * 0.1 / 2, 600 * 0.1 / 1))
 
 
 def test_facts_of_parameters_that_go_together_are_those_of_each_row():
@@ -224,7 +222,7 @@ def test_facts_of_parameters_that_go_together_are_those_of_each_row():
         "width_px": [640, 1280], "height_px": [480, 720], "fx_px": [500.0, 1000.0],
         "cx_px": [319.5, 639.5], "cy_px": [239.5, 359.5],
     }}}})
-    facts = camera_facts(together)
+    facts = together.facts.camera
     assert (facts.aspect, facts.off_centre_x, facts.off_centre_y) == ((1, 1), (0, 0), (0, 0))
     assert facts.hfov_deg == pytest.approx((2 * math.degrees(math.atan(0.64)),) * 2)
 
@@ -274,7 +272,7 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
 ])
 def test_what_may_surprise_of_a_camera_is_told(sections, line):
     camera = sections.pop("camera")
-    told = camera_notes(pipeline(camera, **sections))
+    told = pipeline(camera, **sections).facts.camera_notes
     assert [each for each in told if line in each], told
 
 

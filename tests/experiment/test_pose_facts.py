@@ -3,12 +3,12 @@
 
 import pytest
 
-from sweep.experiment.facts import MAX_SAMPLE, notes, pose_facts
+from sweep.experiment.facts import MAX_SAMPLE
 from sweep.experiment.pipeline import Pipeline
 
 
 def told(pose, axes=None, **sections):
-    return notes(Pipeline.from_dict({"pose": pose, "axes": axes or {}, **sections}))
+    return Pipeline.from_dict({"pose": pose, "axes": axes or {}, **sections}).facts.notes
 
 
 @pytest.mark.parametrize(("pose", "axes", "named"), [
@@ -52,7 +52,7 @@ def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
         "axes": {"tilt_deg": {"linspace": [0, 60, 61]}, "distance_m": {"geom": [0.1, 10, 1000]},
                  "trial": 1000},
     })
-    facts = pose_facts(pipeline)
+    facts = pipeline.facts.poses
     assert facts.poses == 61 * 1000 * 1000
     assert facts.sampled == MAX_SAMPLE
     assert facts.tilt_deg.min() == 0

@@ -14,7 +14,6 @@ from sweep.errors import PipelineError
 from sweep.evaluation.search import visibility_flags
 from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
@@ -31,9 +30,9 @@ LENS = [-0.3, 0.1, 0.001, -0.002]
 def made(pose, axes=None, seed=1, **sections):
     """Return the values and scenes of a pipeline's whole grid."""
     pipeline = Pipeline.from_dict({"seed": seed, "pose": pose, "axes": axes or {}, **sections})
-    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
     indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-    values = scene_values(pipeline, indices)
+    values = pipeline.experiment.scene_values(indices)
     return values, build_scenes(values, int(np.prod(lengths)))
 
 
@@ -246,9 +245,9 @@ def test_any_pose_has_a_truth_and_is_the_same_alone(count):
         document = any_document(rng)
         pipeline = Pipeline.from_dict(document)
         indices = [index.ravel() for index in np.indices(
-            [len(axis) for axis in scene_axes(pipeline)], dtype=np.intp)]
+            [len(axis) for axis in pipeline.experiment.scene_axes], dtype=np.intp)]
         scene_count = len(indices[0]) if indices else 1
-        values = scene_values(pipeline, indices)
+        values = pipeline.experiment.scene_values(indices)
         scenes = build_scenes(values, scene_count)
         unseen = visibility_flags(scenes) == DetectionStatus.not_visible
         for name, function in GEOMETRY.items():
@@ -261,7 +260,8 @@ def test_any_pose_has_a_truth_and_is_the_same_alone(count):
             found = GEOMETRY["viewing_angle_deg"](scenes)
             np.testing.assert_allclose(found, given, atol=1e-10, err_msg=str(document))
         one = int(rng.integers(scene_count))
-        alone = build_scenes(scene_values(pipeline, [each[one : one + 1] for each in indices]), 1)
+        alone = build_scenes(
+            pipeline.experiment.scene_values([each[one : one + 1] for each in indices]), 1)
         np.testing.assert_array_equal(alone.translation[0], scenes.translation[one])
         np.testing.assert_array_equal(alone.rotation[0], scenes.rotation[one])
 

@@ -17,7 +17,6 @@ from sweep.experiment.draws import (
     scrambled,
     sobol_uniform,
 )
-from sweep.experiment.grid import scene_values
 from sweep.experiment.parameters import PARAMETERS
 from sweep.model.calibration import CalibrationError
 from sweep.store.provenance import fingerprint
@@ -34,7 +33,7 @@ def pipeline(*settings, trials=64, **sections):
 
 
 def drawn(grid, *indices):
-    values = scene_values(grid, [np.asarray(index) for index in indices])
+    values = grid.experiment.scene_values([np.asarray(index) for index in indices])
     return {name: values[name].values for name in
             ("tilt_deg", "roll_deg", "shift_u_px", "shift_v_px")}
 
@@ -109,7 +108,7 @@ def test_what_a_calibration_gives_is_drawn_evenly_with_all_else():
     grid = pipeline(camera={"fx_px": 600, "calibration_sd": [5, 5, 2, 2]},
                     estimator={"believed": "calibration"})
     index = np.zeros(64, dtype=int), np.arange(64)
-    values = scene_values(grid, index)
+    values = grid.experiment.scene_values(index)
     for replicate in range(REPLICATES):
         for name, (mean, sd) in {"calibrated_fx_px": (600, 5), "tilt_deg": (None, None)}.items():
             numbers = values[name].values[replicate::REPLICATES]

@@ -7,7 +7,6 @@ import sweep
 from sweep.errors import PipelineError
 from sweep.experiment.axes import combinations
 from sweep.experiment.cell_selection import cell, parse_selection, selection_text
-from sweep.experiment.grid import scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import parse_settings
 
@@ -55,8 +54,8 @@ def test_draws_are_those_of_the_same_values_on_axes_of_their_own():
     one = pipeline({"lens": {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}}, "trial": 9},
                    **drawn)
     two = pipeline({"fx_px": [600, 800], "fy_px": [600, 805], "trial": 9}, **drawn)
-    zipped = scene_values(one, [np.array([0, 1, 1]), np.array([3, 4, 8])])
-    apart = scene_values(two, [np.array(k) for k in ([0, 1, 1], [0, 1, 1], [3, 4, 8])])
+    zipped = one.experiment.scene_values([np.array([0, 1, 1]), np.array([3, 4, 8])])
+    apart = two.experiment.scene_values([np.array(k) for k in ([0, 1, 1], [0, 1, 1], [3, 4, 8])])
     for name in ("fx_px", "fy_px", "tilt_deg", "shift_u_px", "shift_v_px"):
         assert zipped[name].values.tolist() == apart[name].values.tolist()
     assert len(set(zipped["tilt_deg"].values.tolist())) == 3

@@ -22,7 +22,6 @@ from support.stores import by_hand
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.experiment.grid import scene_axes
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
@@ -457,7 +456,7 @@ def test_stores_of_all_pipelines_are_sound(path, tmp_path):
             chosen = [axis.values[k] for k in np.linspace(0, len(axis) - 1, 4).astype(int)]
             settings.append(f"{axis.name}={chosen}".replace("True", "true"))
     pipeline = Pipeline.from_text(text, settings, name=path.stem, folder=path.parent)
-    lengths_ = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths_ = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     if np.prod(lengths_, dtype=np.int64) > 3000:
         pytest.skip("many poses")
     url = str(tmp_path / "store.zarr")

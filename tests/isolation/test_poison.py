@@ -12,7 +12,6 @@ from support.commands import command
 from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
 from sweep.experiment.cell_selection import cell as cell_at
-from sweep.experiment.grid import scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -60,7 +59,7 @@ def notes(log):
 
 def scene_index(pipeline, cell):
     """Return a scene's index along each scene axis."""
-    axes = scene_axes(pipeline)
+    axes = pipeline.experiment.scene_axes
     index = np.unravel_index(cell, [len(axis) for axis in axes])
     return {axis.name: int(i) for axis, i in zip(axes, index, strict=True)}
 
@@ -176,14 +175,14 @@ def see_status(url, pipeline, poisons):
         one = cell_at(pipeline, at)  # it can be handed to the other commands as it is
         key = tuple(
             one.axes[0].values[0] if axis.name == "trial" else one.fixed[axis.name]
-            for axis in scene_axes(pipeline)
+            for axis in pipeline.experiment.scene_axes
         )
         told.setdefault(key, []).append(line)
     wanted = {}
     for poison in poisons:
         if poison.deadly:
             index = scene_index(pipeline, poison.cell)
-            key = tuple(axis.values[index[axis.name]] for axis in scene_axes(pipeline))
+            key = tuple(axis.values[index[axis.name]] for axis in pipeline.experiment.scene_axes)
             wanted.setdefault(key, []).append(poison)
     assert told.keys() == wanted.keys(), plain.stdout
     for key, those in wanted.items():

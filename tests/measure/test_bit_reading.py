@@ -16,7 +16,7 @@ import pytest
 
 import sweep
 from sweep.evaluation.block import run_cells
-from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.grid import Block, block_indices
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import modules
@@ -55,7 +55,7 @@ def warped(bits, corners, size=64, background=255):
 
 def flags_of(pipeline):
     """Return the detection flags of a pipeline over its scene axes, computed here."""
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     cells = run_cells(pipeline, block_indices(Block((0,) * len(shape), shape)))
     return cells.columns["detection"][0].reshape(shape)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import (
     ALIGNMENT_PX,
@@ -155,14 +155,14 @@ def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(diction
         f'dictionary = ["{dictionary}"]\nmarker_id = {ids_of(dictionary)}\n'
         "roll_deg = [0, 90, 180, 270]"
     )
-    block = Block((0,) * 3, tuple(len(axis) for axis in scene_axes(pipeline)))
+    block = Block((0,) * 3, tuple(len(axis) for axis in pipeline.experiment.scene_axes))
     values = run_block(pipeline, block).values
     assert (values["detection"] == DetectionStatus.detected).all()
     # Unrefined corners are whole pixels just within the true ones: half a pixel, plus one for
     # an edge that rounding of the roll's sine moves across a pixel's centre.
     assert np.abs(values["corner_error_px"]).max() <= 1.5
 
-    scenes = build_scenes(scene_values(pipeline, block_indices(block)), len(block))
+    scenes = build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     left, top = 320 - side // 2, 240 - side // 2
     for row, marker_id in enumerate(scenes.marker_id):

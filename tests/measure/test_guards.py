@@ -24,7 +24,7 @@ from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation import search as search_module
 from sweep.evaluation.search import search, visibility_flags
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
@@ -41,13 +41,13 @@ RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 
 
 def whole(pipeline):
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return Block((0,) * len(shape), shape)
 
 
 def scenes_of(pipeline):
     block = whole(pipeline)
-    return build_scenes(scene_values(pipeline, block_indices(block)), len(block))
+    return build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
 
 
 def cameras(count, lens=()):

@@ -12,7 +12,6 @@ from support.lengths import lengths
 from support.small_scenes import SMALL, image_of, scenes_of
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search_windows
-from sweep.experiment.facts import parts
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import BoundStatus
@@ -194,7 +193,7 @@ trial = 2
     cells = run_cells(pipeline, indices)
     status = np.asarray(cells.columns["bound"][0])
     assert (status == BoundStatus.not_in_model).all()
-    reasons = {part.name: part.reason for part in parts(pipeline) if part.active}
+    reasons = {part.name: part.reason for part in pipeline.facts.parts if part.active}
     assert reasons["JPEG"] == "jpeg_quality is 40"
     assert reasons["demosaicing"] == "bayer is RGGB"
     assert reasons["noise by level"] == "noise_table is [0.0, 2.0, 255.0, 1.0]"
@@ -226,5 +225,5 @@ def test_coarse_noise_is_searched_in_wider_windows_and_steep_light_on_whole_fram
     assert left_of("vignetting=4", "bloom=0.5") == plain
     assert left_of("tone_gamma=0.5") == plain
     text = SMALL + "noise_grey = 3\nnoise_correlation = 0.5\n"
-    reasons = {part.name: part.reason for part in parts(Pipeline.from_text(text))}
+    reasons = {part.name: part.reason for part in Pipeline.from_text(text).facts.parts}
     assert reasons["window"].endswith("and 64 more for noise")

@@ -27,7 +27,6 @@ from support.exact_image import (
 from support.lengths import first_of, lengths
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
-from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import Effects
@@ -619,7 +618,7 @@ def images(text, settings=()):
     shape = tuple(len(axis) for axis in axes)
     indices = [grid.ravel() for grid in np.indices(shape)]
     count = int(np.prod(shape))
-    scenes = build_scenes(scene_values(pipeline, indices), count)
+    scenes = build_scenes(pipeline.experiment.scene_values(indices), count)
     windows = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     frames = np.stack(render_all(scenes, np.arange(count), marker_boxes(scenes), windows))
     return frames.reshape(*shape, *frames.shape[1:]), [axis.name for axis in axes], scenes

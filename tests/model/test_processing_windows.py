@@ -6,7 +6,6 @@ import pytest
 from support.windows import corners_of, outcomes_elsewhere
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, visibility_flags
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
@@ -50,12 +49,12 @@ PROCESSING = {
 @pytest.mark.parametrize("name", PROCESSING)
 def test_window_finds_what_the_frame_holds(name, refinement):
     pipeline = Pipeline.from_text(DRAWN.replace("SETTINGS", PROCESSING[name]))
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     order = np.random.default_rng(6).permutation(int(np.prod(shape)))[:270]
 
     def built(cells):
         indices = list(np.unravel_index(cells, shape))
-        return build_scenes(scene_values(pipeline, indices), len(cells))
+        return build_scenes(pipeline.experiment.scene_values(indices), len(cells))
 
     count = 200
     seen = np.flatnonzero(visibility_flags(built(order)) == DetectionStatus.not_run)[:count]

@@ -37,7 +37,6 @@ from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
-from sweep.experiment.facts import parts
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.grid import detector_settings, scene_values
 from sweep.report.reference import TABLES
@@ -86,8 +85,8 @@ print(json.dumps({
     "box": box, "levels": (mean + (1 - share) * 90).tolist(),
     "images": [result.images[row].tolist() for row in range(8)],
     "origins": result.origins.tolist(), "windows": margins.tolist(),
-    "parts": {part.name: [part.active, part.switch] for part in parts(pipeline)},
-    "draws": next(part.reason for part in parts(pipeline) if part.name == "random draws"),
+    "parts": {part.name: [part.active, part.switch] for part in pipeline.facts.parts},
+    "draws": next(part.reason for part in pipeline.facts.parts if part.name == "random draws"),
     "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
     "costs": seconds_of([without_effect(pipeline, switch)
                          for switch in ("haze", "column_noise_grey")], 8)[0],

@@ -10,7 +10,6 @@ import pytest
 from scipy import stats
 
 from support.lengths import lengths
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.model import sensor
 from sweep.model.extent import marker_boxes
@@ -43,8 +42,8 @@ background = {level}
 
 
 def scenes_of(pipeline, trial=0):
-    axes = scene_axes(pipeline)
-    return build_scenes(scene_values(pipeline, [np.array([trial])] * len(axes)), 1)
+    axes = pipeline.experiment.scene_axes
+    return build_scenes(pipeline.experiment.scene_values([np.array([trial])] * len(axes)), 1)
 
 
 def image_of(pipeline, trial=0, window=None):

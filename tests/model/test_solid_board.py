@@ -9,8 +9,6 @@ from scipy.special import ndtr
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
-from sweep.experiment.experiment import largest_board
-from sweep.experiment.grid import scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -54,7 +52,7 @@ def pipeline(markers, tilt_deg=30.0, **sections):
 
 
 def scenes_of(chosen):
-    return build_scenes(scene_values(chosen, []), 1)
+    return build_scenes(chosen.experiment.scene_values([]), 1)
 
 
 def image_of(scenes):
@@ -152,7 +150,7 @@ def test_an_image_is_that_of_rays(name, tilt_deg):
     )
     assert fine < 0.8
     assert fine < 0.3 * coarse or fine == coarse == 0
-    assert largest_board(chosen)[0] == (4 if ground else len(declared["markers"]))
+    assert chosen.experiment.largest_board[0] == (4 if ground else len(declared["markers"]))
 
 
 MOTION = {"velocity_x_m_s": 0.5, "velocity_y_m_s": -0.3, "velocity_z_m_s": 0.4,
@@ -277,7 +275,7 @@ def test_sheets_behind_others_and_backs_are_not_visible():
     hidden = [marker(0, 0, 0, 0, size=0.01), marker(1, 0, 0, 0.05), marker(2, 0.05, 0, 0),
               marker(3, -0.05, 0, 0, tilt=180)]
     chosen = pipeline(hidden, tilt_deg=0.0)
-    scenes, values = scenes_of(chosen), scene_values(chosen, [])
+    scenes, values = scenes_of(chosen), chosen.experiment.scene_values([])
     boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (4, 0))
     not_visible = DetectionStatus.not_visible
     assert boards.flags[0].tolist() == [
@@ -288,7 +286,7 @@ def test_sheets_behind_others_and_backs_are_not_visible():
 def test_a_marker_of_a_sheet_that_a_distractor_hides_is_not_visible():
     boards = {"kind": "grid", "rows": 1, "columns": 2, "gap_m": 0.02}
     chosen = pipeline([], 0.0, board={**boards, "distractors": [marker(9, 0.03, 0.0, 0.05)]})
-    scenes, values = scenes_of(chosen), scene_values(chosen, [])
+    scenes, values = scenes_of(chosen), chosen.experiment.scene_values([])
     boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (2, 0))
     assert boards.flags[0].tolist() == [DetectionStatus.not_run, DetectionStatus.not_visible]
 

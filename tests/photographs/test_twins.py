@@ -10,7 +10,7 @@ from support.here import calls_here
 from sweep.errors import SweepError
 from sweep.evaluation.block import run_cells
 from sweep.execution.runner import execute
-from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.photographs import read_record
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
@@ -36,7 +36,7 @@ def prepared(tmp_path_factory):
 
 
 def all_indices(pipeline):
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     return block_indices(Block((0,) * len(lengths), lengths))
 
 
@@ -65,13 +65,13 @@ def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
 def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared):
     twins = twin_pipeline(prepared, SCENE, repeats=2)
     indices = all_indices(twins)
-    values = scene_values(twins, indices)
+    values = twins.experiment.scene_values(indices)
     blur = values["blur_px"].values.reshape(6, -1)
     assert (blur == blur[:, :1]).all()
     assert len(set(blur[:, 0].tolist())) == 6  # other repeats, other draws
     assert len(set(values["noise_key"].values.tolist())) == len(indices[0])
     some = [index[3:9] for index in indices]
-    assert np.array_equal(scene_values(twins, some)["blur_px"].values, blur.ravel()[3:9])
+    assert np.array_equal(twins.experiment.scene_values(some)["blur_px"].values, blur.ravel()[3:9])
 
 
 def test_the_quiet_zone_is_as_wide_as_the_board_leaves_clear(prepared):

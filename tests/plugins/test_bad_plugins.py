@@ -13,7 +13,6 @@ from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
 from sweep.execution.cluster import _worker_identity
 from sweep.execution.runner import execute
-from sweep.experiment.grid import detector_settings
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child
 from sweep.isolation.crash_isolation import check_plugins, use
@@ -312,7 +311,7 @@ def test_what_compiled_code_prints_on_import_goes_to_the_standard_error(tmp_path
 def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
     (tmp_path / "mine.py").write_text("def D(settings, family): return lambda image: ([], [])\n")
     text = '[pose]\nside_px = 24\n[axes]\ndetector = ["opencv", "mine:D"]\n'
-    settings = detector_settings(Pipeline.from_text(text, folder=tmp_path))
+    settings = Pipeline.from_text(text, folder=tmp_path).experiment.detectors
     assert clock_of(settings[:1]) is time.thread_time
     assert clock_of(settings) is time.process_time
 

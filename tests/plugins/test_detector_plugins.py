@@ -8,7 +8,6 @@ import pytest
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.grid import detector_settings
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import use
 from sweep.measure.flags import DetectionStatus
@@ -105,7 +104,7 @@ by = { zip = { detector = ["opencv", "mine:TURNED"], shift_px = [0, 0.5] } }""")
 def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):
     (folder / "other.py").write_text(MINE)
     both = GRID.replace('"mine:TURNED"]', '"mine:TURNED", "other:TURNED"]\nshift_px = [0, 1]')
-    settings = detector_settings(Pipeline.from_text(both, folder=folder))
+    settings = Pipeline.from_text(both, folder=folder).experiment.detectors
     assert len(settings) == 6
     (folder / "other.py").write_text(MINE.replace("high=9", "high=8"))
     with pytest.raises(PipelineError) as refused:

@@ -10,7 +10,6 @@ import pytest
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.grid import estimators, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections
 from sweep.measure.estimators import build
@@ -112,8 +111,8 @@ def test_the_effect_is_that_of_plain_numpy():
 def test_the_solver_finds_the_pose_of_perfect_corners():
     text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
     pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
-    scenes = build_scenes(scene_values(pipeline, [np.arange(3)]), 3)
-    found = build(estimators(pipeline)[0])(Detections.of_markers(
+    scenes = build_scenes(pipeline.experiment.scene_values([np.arange(3)]), 3)
+    found = build(pipeline.experiment.estimators[0])(Detections.of_markers(
         scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
         [scenes.target(0)] * 3, [], np.zeros((3, 2), dtype=np.int64),
     ))

@@ -6,7 +6,6 @@ from typing import Any
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure, to_dataset_layout
 from sweep.experiment.grid import block_indices
-from sweep.experiment.schema import variables_of
 
 
 @dataclass
@@ -24,7 +23,7 @@ def run_block(pipeline, block):
     return BlockResult(
         {
             v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
-            for v in variables_of(pipeline)
+            for v in pipeline.experiment.variables
         },
         cells.seconds,
         cells.failures,

@@ -6,7 +6,6 @@ import io
 from sweep import cli
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.experiment.grid import scene_axes
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store
 
@@ -46,7 +45,7 @@ def made(folder, text, name, *, finished=True, settings=()):
     """Compute a store in this process, without a cluster; return its place."""
     url = str(folder / f"{name}.zarr")
     pipeline = Pipeline.from_text(text, settings, name=name)
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     store = create_store(url, pipeline, tuple(-(-length // 2) for length in lengths))
     for block in list(store.blocks)[: None if finished else 1]:
         compute_block(url, store.run_id, block)

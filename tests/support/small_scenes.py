@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from sweep.experiment.grid import scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
@@ -32,8 +31,8 @@ background = 90.4
 
 def scenes_of(settings=(), text=SMALL):
     pipeline = Pipeline.from_text(text, list(settings))
-    first = [np.array([0])] * len(scene_axes(pipeline))
-    return build_scenes(scene_values(pipeline, first), 1)
+    first = [np.array([0])] * len(pipeline.experiment.scene_axes)
+    return build_scenes(pipeline.experiment.scene_values(first), 1)
 
 
 def image_of(settings=(), window=None, text=SMALL):

@@ -5,7 +5,6 @@ import xarray as xr
 from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.progress import InWaves
 from sweep.experiment.axes import TRIAL
-from sweep.experiment.grid import scene_axes
 from sweep.sampling.rules import block_unit, make_rule
 from sweep.store.lifecycle import create_store
 
@@ -18,7 +17,7 @@ def by_hand(url, pipeline, extents=None):
     rule = make_rule(pipeline)
     lengths = tuple(
         block_unit(rule.ends) if rule and axis.name == TRIAL else len(axis)
-        for axis in scene_axes(pipeline)
+        for axis in pipeline.experiment.scene_axes
     )
     store = create_store(url, pipeline, extents or lengths)
     if rule is None:

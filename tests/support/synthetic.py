@@ -6,7 +6,6 @@ As a preload of Dask workers (``dask_setup``), and in the client by :func:`insta
 import numpy as np
 
 from sweep.evaluation.results import CellsResult
-from sweep.experiment.schema import variables_of
 
 
 def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
@@ -16,7 +15,7 @@ def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
     for axis, index in zip(pipeline.axes, indices, strict=True):
         ramp = ramp * len(axis) + index
     columns = {}
-    for variable in variables_of(pipeline):
+    for variable in pipeline.experiment.variables:
         values = np.ones((count, *variable.inner_shape), dtype=variable.dtype)
         if variable.flags is None:
             values *= (ramp % 1000).reshape(-1, *[1] * len(variable.inner_shape))

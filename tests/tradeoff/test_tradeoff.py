@@ -18,7 +18,6 @@ from sweep import cli
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
-from sweep.experiment.grid import scene_axes
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.messages import to_json
@@ -89,7 +88,7 @@ def _few_scenes():
 def made(folder, text, name, *, finished=True):
     """Compute a store in this process, without a cluster; return its place."""
     url, pipeline = str(folder / f"{name}.zarr"), Pipeline.from_text(text, name=name)
-    store = create_store(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    store = create_store(url, pipeline, tuple(len(axis) for axis in pipeline.experiment.scene_axes))
     if finished:
         for block in store.blocks:
             compute_block(url, store.run_id, block)

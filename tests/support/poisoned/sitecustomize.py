@@ -86,12 +86,20 @@ class _Poison:
         self._made = collections.deque(maxlen=4)
         self._images = {}
         homes = {
-            "scene_values": cells, "build_scenes": cells, "detections_for": cells, "build": cells,
+            "build_scenes": cells, "detections_for": cells, "build": cells,
             "render_all": search,
         }
         self._real = {name: getattr(home, name) for name, home in homes.items()}
         for name, home in homes.items():
             setattr(home, name, getattr(self, name))
+        from sweep.experiment.grid import Experiment  # noqa: PLC0415
+
+        self._real["scene_values"] = Experiment.scene_values
+
+        def values(experiment, indices):
+            return self.scene_values(experiment, indices)
+
+        Experiment.scene_values = values
         from sweep.measure import detectors  # noqa: PLC0415
 
         detectors.Detector = self._detector(detectors.Detector)
@@ -121,15 +129,15 @@ class _Poison:
     def _cells(self, scenes):
         return next((cells for made, cells in self._made if made is scenes), None)
 
-    def scene_values(self, pipeline, indices):
+    def scene_values(self, experiment, indices):
         import numpy as np  # noqa: PLC0415  (this module is imported by every process)
 
-        lengths = [len(axis) for axis in pipeline.axes if axis.stage.name == "scene"]
+        lengths = [len(axis) for axis in experiment.scene_axes]
         cells = np.ravel_multi_index(list(indices), lengths).tolist() if lengths else [0]
-        if pipeline.title == "A standard scene":  # is computed before any block, and not poisoned
+        if experiment.grid.title == "A standard scene":  # computed before any block, not poisoned
             cells = [-1] * len(cells)
         self._here.cells = cells
-        return self._real["scene_values"](pipeline, indices)
+        return self._real["scene_values"](experiment, indices)
 
     def build_scenes(self, *arguments):
         scenes = self._real["build_scenes"](*arguments)

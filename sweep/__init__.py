@@ -99,7 +99,7 @@ def run(
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
     workers
-        Processes that are started on this machine (default: the available processors).
+        Processes of the cluster that is started for the run (default: the available processors).
     client
         A ``distributed.Client``, or a cluster object such as ``LocalCluster`` or ``SLURMCluster``,
         to run on instead. It stays open. Its workers must be processes that have the same versions

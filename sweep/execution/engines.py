@@ -1,21 +1,20 @@
-"""Where blocks are computed: one loop over what is out, and children of this process."""
+"""Where blocks are computed: one loop over what is out, and one child process as an engine."""
 
 from __future__ import annotations
 
-import threading
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from sweep.errors import MachineFaultError, RunError, StoreReplacedError
-from sweep.evaluation.machine_faults import exception_line, local_fault, machine_faults_raised
-from sweep.execution import BLOCK_TASK
+from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.execution.block_task import compute_blocks
-from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_S, TIME_LIMIT_S
+from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
 from sweep.execution.progress import AnyOrder, Tally, Waiting, Work
 from sweep.isolation.child_process import (
     POLL_S,
@@ -38,6 +37,14 @@ from sweep.store.receipt import Receipt
 
 Pending = TypeVar("Pending")
 """What an engine returns for work that it has taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """Why work failed: by a machine's fault, or because it raises."""
+
+    reason: str
+    machine_fault: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,25 +98,25 @@ class Engine(ABC, Generic[Pending]):
         """
         ready = AnyOrder(waiting) if isinstance(waiting, Iterable) else waiting
         try:
-            while self._fill(ready, tally):
+            self._fill(ready, tally)
+            while self.out:
                 interrupts.check()
                 try:
                     done = self.finished.get(timeout=POLL_S)
                 except Empty:
                     self.check()
-                else:
-                    self._note(done, ready, tally)
+                    continue
+                self._note(done, ready, tally)
+                self._fill(ready, tally)
         finally:
             self.end()
         tally.check()
 
-    def _fill(self, waiting: Waiting, tally: Tally) -> bool:
-        """Begin what there is room for; return whether anything is out."""
+    def _fill(self, waiting: Waiting, tally: Tally) -> None:
         while len(self.out) < self.room() and not tally.hopeless:
             if (work := waiting.next()) is None:
-                break
+                return
             self._begin(work, tally)
-        return bool(self.out)
 
     def _begin(self, work: Work, tally: Tally, others: Sequence[str] = ()) -> None:
         blocks = [self.store.blocks[number] for number in work.numbers]
@@ -121,21 +128,13 @@ class Engine(ABC, Generic[Pending]):
     def _note(self, done: Pending, waiting: Waiting, tally: Tally) -> None:
         """Count what was computed; begin again what may still be computed."""
         work = self.out.pop(done)
-        block = self.store.blocks[work.numbers[0]]
-        try:
-            result = self.result(done, work)
-        except MachineFaultError as fault:
-            tally.add_failed(f"block {block}: {fault}", machine_fault=True)
-        except (StoreReplacedError, RunError):
-            raise
-        except ChildRaisedError as error:
-            tally.add_failed(f"block {block}: {last_line(error)}")
-        except Exception as error:
-            tally.add_failed(f"block {block}: {exception_line(error)}")
+        result = self.result(done, work)
+        if isinstance(result, Failed):
+            block = self.store.blocks[work.numbers[0]]
+            tally.add_failed(f"block {block}: {result.reason}", machine_fault=result.machine_fault)
+        elif isinstance(result, Again):
+            self._begin(work, tally, result.workers)
         else:
-            if isinstance(result, Again):
-                self._begin(work, tally, result.workers)
-                return
             for number, receipt in zip(work.numbers, result, strict=True):
                 waiting.committed(number, receipt)
                 tally.add(receipt)
@@ -152,8 +151,8 @@ class Engine(ABC, Generic[Pending]):
         """
 
     @abstractmethod
-    def result(self, done: Pending, work: Work) -> list[Receipt] | Again:
-        """Return receipts, or that the work is begun again; raise why it failed."""
+    def result(self, done: Pending, work: Work) -> list[Receipt] | Failed | Again:
+        """Return receipts, or why there are none, or that the work is begun again."""
 
     def check(self) -> None:
         """Look after work while nothing is finished; RunError if nothing will be."""
@@ -164,92 +163,79 @@ class Engine(ABC, Generic[Pending]):
 
 
 # --------------------------------------------------------------------------------------------------
-# This machine, without a cluster: the guarantees are those of one. A block that ends its process
-# is computed in isolation when it is begun again, and a block is committed by its receipt.
+# Small runs: blocks are computed one after another in the child process that measured scenes.
+#
+# A cluster takes seconds to start and to end, and as many processors as it has workers to import
+# the packages. The guarantees are those of a cluster: a block that ends its process is computed
+# in isolation when it is begun again, and a block is committed by its receipt.
 
-class OnThisMachine(Engine[Future[Any]]):
-    """Computes blocks in child processes of this one, beside each a thread of this process.
+class InChild(Engine[Future[Any]]):
+    """Computes blocks in a child process, for at most :data:`SMALL_RUN_LIMIT_S` seconds.
 
     Parameters
     ----------
     child
-        A child process that was started before. It is ended with the others.
-    workers
-        How many children there are at most; each is started when it is needed.
-    small
-        Whether the run is so small that one child is to compute it alone, for at most
-        :data:`~sweep.execution.limits.SMALL_RUN_S` seconds.
+        The child process; another is started in its place if it ends.
     """
 
     def __init__(
-        self, store: RunStore, child: Child, workers: int = 1, sources: Sequence[str] = (),
-        time_limit_s: float = TIME_LIMIT_S, *, small: bool = False,
+        self, store: RunStore, child: Child, sources: Sequence[str] = (),
+        time_limit_s: float = TIME_LIMIT_S,
     ) -> None:
         super().__init__(store, sources, time_limit_s)
-        self._workers, self._threads = workers, ThreadPoolExecutor(workers, "sweep")
-        self._children, self._idle = [child], [child]
-        self._small_until = time.monotonic() + SMALL_RUN_S if small else 0.0
-        self._lock, self._ended = threading.Lock(), False
+        self._child, self._thread = child, ThreadPoolExecutor(1)
+        self._deaths: Counter[int] = Counter()
+        self._faults: Counter[int] = Counter()
+        self._deadline: float | None = None
 
     def room(self) -> int:
-        """Return how many blocks may be out: one waits for each child that computes."""
-        return 1 if time.monotonic() < self._small_until else 2 * self._workers
+        """Return 1 until time is up; the first block is begun in any case."""
+        if self._deadline is None:
+            self._deadline = time.monotonic() + SMALL_RUN_LIMIT_S
+            return 1
+        return int(time.monotonic() <= self._deadline)
 
     def submit(self, arguments: tuple[Any, ...], others: Sequence[str]) -> Future[Any]:
-        """Have a thread call a child."""
+        """Call the child in a thread."""
         del others
-        done = self._threads.submit(self._compute, arguments)
+        done = self._thread.submit(
+            self._child.call, compute_blocks, *arguments,
+            # The block keeps its own time limit; this one is for what surrounds it.
+            limit_s=2 * self.time_limit_s,
+        )
         done.add_done_callback(self.finished.put)
         return done
 
-    def _compute(self, arguments: tuple[Any, ...]) -> list[Receipt]:
-        """Call a child; after a death, or a first fault of the machine, start another one."""
-        deaths = faults = 0
-        with machine_faults_raised():
-            child = self._started(self._idle.pop() if self._idle else None)
-            try:
-                while True:
-                    try:
-                        # The block keeps its own time limit; this one is for what surrounds it.
-                        receipts: list[Receipt] = child.call(
-                            compute_blocks, *arguments, limit_s=2 * self.time_limit_s)
-                    except ChildDiedError as death:
-                        deaths += 1
-                        if deaths > MAX_DEATHS:
-                            raise local_fault(f"its process ended: {explained(death)}") from None
-                    except MachineFaultError:
-                        faults += 1
-                        if faults > 1:
-                            raise
-                    else:
-                        return receipts
-                    self._started(child, again=True)
-            finally:
-                self._idle.append(child)
-
-    def _started(self, child: Child | None, *, again: bool = False) -> Child:
-        """Return a child that runs: a new one, or one that is started again."""
-        with self._lock:
-            if self._ended:
-                raise RunError("the run was stopped")
-            if child is None:
-                child = Child(BLOCK_TASK)
-                self._children.append(child)
-            elif again:
-                child.restart()
-            return child
-
-    def result(self, done: Future[Any], work: Work) -> list[Receipt]:
-        """Return the receipts."""
-        del work
-        receipts: list[Receipt] = done.result()
+    def result(self, done: Future[Any], work: Work) -> list[Receipt] | Failed | Again:
+        """Return the receipts; after a death, or a first fault, the block is begun again."""
+        number = work.numbers[0]
+        try:
+            receipts: list[Receipt] = done.result()
+        except StoreReplacedError:
+            raise
+        except ChildDiedError as error:
+            self._deaths[number] += 1
+            with machine_faults_raised():
+                self._child.restart()
+            if self._deaths[number] <= MAX_DEATHS:
+                return Again()
+            reason = f"its process ended: {explained(error)}"
+            return Failed(reason, machine_fault=error.from_outside)
+        except MachineFaultError as error:
+            self._faults[number] += 1
+            if self._faults[number] > 1:
+                return Failed(str(error), machine_fault=True)
+            with machine_faults_raised():
+                self._child.restart()
+            return Again()
+        except ChildRaisedError as error:
+            return Failed(last_line(error))
+        except SweepError as error:
+            return Failed(f"{type(error).__name__}: {error}")
         return receipts
 
     def end(self) -> None:
-        """End the children, and the threads that wait for their answers."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        with self._lock:
-            self._ended = True
-            for child in self._children:
-                child.close()
-        self._threads.shutdown()
+        """End the child if it still computes: the thread waits for its answer."""
+        if self.out:
+            self._child.close()
+        self._thread.shutdown()

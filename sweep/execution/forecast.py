@@ -575,8 +575,11 @@ EFFECT_SCENES = 24
 PILOT_SHARE = 0.6
 """Share of the time for effects in which a pilot computes poses."""
 
-START_S = 1.5
+START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
+
+SMALL_START_S = 1.2
+"""The same of a small run, which is computed in one child process without a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -599,7 +602,7 @@ class Forecast:
     workers, seconds
         Number of workers, and how long they would take.
     small
-        Whether the run is so small that one process computes it.
+        Whether the run is so small that one process computes it, without a cluster.
     pilot
         Of a run to a precision, what it is expected to need of the poses, after which ``seconds``
         are estimated; None of a run of fixed trials, or if poses take too long for a pilot.
@@ -684,7 +687,7 @@ def forecast(
         sampled=timing.sampled,
         over=timing.over,
         workers=count,
-        seconds=START_S + demand.seconds,
+        seconds=(SMALL_START_S if small else START_S) + demand.seconds,
         small=small,
         pilot=expected,
     ), costs

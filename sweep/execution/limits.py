@@ -27,11 +27,13 @@ FAULT_WINDOW = 10
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 
-# This machine (`sweep.execution.engines`)
+# Small runs (`sweep.execution.engines`)
 
 SMALL_RUN_S = 3.0
-"""Work up to which one child is enough: each imports packages for a second of a processor. What
-takes longer than was measured is divided among several."""
+"""Work up to which a run needs no cluster, which takes about as long to start and to end."""
+
+SMALL_RUN_LIMIT_S = 10.0
+"""Seconds after which the rest of a run that was taken for a small one goes to a cluster."""
 
 # Time limits
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import sys
@@ -281,6 +282,9 @@ class Waiting(Protocol):
     def next(self) -> Work | None:
         """Return what can be computed now; None if nothing can, before more is committed."""
 
+    def put_back(self, work: Work) -> None:
+        """Take back what `next` returned and nobody began."""
+
     def committed(self, number: int, receipt: Receipt) -> None:
         """Note that a block is committed."""
 
@@ -294,6 +298,10 @@ class AnyOrder:
     def next(self) -> Work | None:
         """Return the next block."""
         return next(self._works, None)
+
+    def put_back(self, work: Work) -> None:
+        """Return it next."""
+        self._works = itertools.chain([work], self._works)
 
     def committed(self, number: int, receipt: Receipt) -> None:
         """Nothing follows from it."""
@@ -391,6 +399,10 @@ class InWaves:
             self._groups[group] = _Group()
             self._advance(group)
         return self._ready.popleft()
+
+    def put_back(self, work: Work) -> None:
+        """Return it next."""
+        self._ready.appendleft(work)
 
     def committed(self, number: int, receipt: Receipt) -> None:
         """Note a committed block; the last one of a wave makes the next wave ready."""

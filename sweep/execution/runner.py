@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tomlkit
 
@@ -24,7 +24,7 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK
-from sweep.execution.engines import Engine, OnThisMachine
+from sweep.execution.engines import InChild
 from sweep.execution.forecast import (
     Timing,
     block_time_limit_s,
@@ -51,7 +51,6 @@ from sweep.experiment.sampling import MAX_TRIALS
 from sweep.experiment.stopping import SEARCH
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
-from sweep.isolation.machine import default_workers
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
@@ -126,7 +125,7 @@ def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
 # A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
 
 # `sweep.execution.cluster` and `on_cluster` are imported where they are used: Dask is slow to
-# import, and runs on this machine need none of it.
+# import, and finished stores and small runs need none of it.
 
 
 def execute(
@@ -154,13 +153,14 @@ def execute(
     store
         Path or URL of the store (default: ``runs/NAME.zarr``).
     workers
-        Processes on this machine (default: the available processors, or a single one where
-        :data:`SMALL_RUN_S` seconds of work are left).
+        Processes of the embedded cluster (default: the available processors, or a single child
+        process and no cluster where :data:`SMALL_RUN_S` seconds of work are left).
     scheduler
-        Address of a running Dask scheduler to use instead. Its workers must reach the store under
-        the same path.
+        Address of a running Dask scheduler, in place of the embedded cluster. Its workers must
+        reach the store under the same path.
     client
-        A ``distributed.Client`` or cluster object to use instead; a client stays open.
+        A ``distributed.Client`` or cluster object, in place of the embedded cluster; a client
+        stays open.
     reuse
         Stores whose finished cells are reused where their parameters agree.
     overwrite
@@ -212,31 +212,35 @@ def execute(
 
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
-        thread = stack.enter_context(ThreadPoolExecutor(1, "sweep"))
+        thread = stack.enter_context(ThreadPoolExecutor(1))
         child = child or Child(BLOCK_TASK)
         stack.callback(child.close)  # the thread waits for it
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
 
+        timing: Timing | None = None
         measuring: Future[Timing] | None = None
         if not done:
             limit_s = TIMING_SHARE * (time_limit_s or TIME_LIMIT_S)
             measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
         connection: Client | None = None
-        threads = default_workers() if workers is None else workers
-        if scheduler is not None or client is not None:
-            from sweep.execution.cluster import connected, thread_count  # noqa: PLC0415  (slow)
+        embedded = workers is None and scheduler is None and client is None
+        if embedded and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        if not (embedded and _work_s(pipeline, unfinished, done, timing) < SMALL_RUN_S):
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
-            connection = stack.enter_context(connected(pipeline, scheduler, client))
-            threads = thread_count(connection)
-        timing = None if measuring is None else interrupts.await_result(measuring)
-        small = workers is None and connection is None and (
-            _work_s(pipeline, unfinished, done, timing) < SMALL_RUN_S)
+            # Scenes are timed while the workers' processes start.
+            connection = stack.enter_context(
+                connected(pipeline, workers=workers, scheduler=scheduler, client=client)
+            )
+        if timing is None and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        threads = 1 if connection is None else _thread_count(connection)
         if unfinished is None:
             if timing is None:
                 raise AssertionError(url)
-            blocks = blocks_of(
-                pipeline, timing.scene_s, 1 if small else threads, block_s, time_limit_s)
+            blocks = blocks_of(pipeline, timing.scene_s, threads, block_s, time_limit_s)
             scene_s = timing.scene_s
         else:
             blocks, scene_s = unfinished.blocks, scene_s_of(unfinished, done, timing)
@@ -254,14 +258,9 @@ def execute(
             unfinished, retry = drop_failed(unfinished)
         limit_s = block_time_limit_s(time_limit_s, scene_s * len(unfinished.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
-            if connection is None:
-                engine: Engine[Any] = OnThisMachine(
-                    unfinished, child, threads, sources, limit_s, small=small)
-            else:
-                from sweep.execution.on_cluster import OnCluster  # noqa: PLC0415  (slow to import)
-
-                engine = OnCluster(unfinished, connection, sources, limit_s)
-            computed = _compute_and_close(engine, interrupts, progress)
+            computed = _compute_and_close(
+                unfinished, child, connection, sources, limit_s, interrupts, progress
+            )
     return summary_of(open_store(url), computed, time.perf_counter() - started, retry)
 
 
@@ -284,13 +283,17 @@ def recompute(
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
+        connection: Client | None = None
         each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
+        if workers is not None or each_s * len(chosen) >= SMALL_RUN_S:
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+
+            connection = stack.enter_context(connected(store.pipeline, workers=workers))
         with _continuable_errors():
-            OnThisMachine(
-                store, child, default_workers() if workers is None else workers,
-                time_limit_s=block_time_limit_s(time_limit_s, each_s),
-                small=workers is None and each_s * len(chosen) < SMALL_RUN_S,
-            ).run(_waiting(store, chosen), Tally(store), interrupts)
+            _compute(
+                store, _waiting(store, chosen), Tally(store), child, connection, (),
+                block_time_limit_s(time_limit_s, each_s), interrupts,
+            )
 
 
 def _check_arguments(
@@ -356,15 +359,21 @@ def _work_s(
     return share * pipeline.size(Stage.scene) * timing.scene_s
 
 
-# The blocks, and the end of the store
+def _thread_count(client: Client) -> int:
+    from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
+
+    return max(thread_count(client), 1)
+
+
+# In the child, or on the cluster
 
 
 def _compute_and_close(
-    engine: Engine[Any], interrupts: Interrupts, progress: ProgressReport | None
+    store: RunStore, child: Child, client: Client | None, sources: Sequence[str],
+    time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
-    store = engine.store
-    with ThreadPoolExecutor(1, "sweep") as thread, writing(store.url, store.storage):
+    with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
@@ -376,7 +385,7 @@ def _compute_and_close(
             done = waiting.current
             tally.watch(waiting)
         tally.begin(done)
-        engine.run(waiting, tally, interrupts)
+        _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
         with closing(store.url, store.storage):
             _check_same_rule(store)
             if not store.finished:  # by another process that wrote it, too
@@ -410,6 +419,26 @@ def _waiting(store: RunStore, numbers: Sequence[int]) -> Waiting:
     if sampling is None or store.pipeline.stopping is None:
         return AnyOrder(numbers)
     return InWaves(store, store.pipeline.stopping, sampling, only=set(numbers))
+
+
+def _compute(
+    store: RunStore, waiting: Waiting, tally: Tally, child: Child, client: Client | None,
+    sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
+) -> None:
+    """Compute blocks on a cluster; without one in the child, as long as that is quick."""
+    with contextlib.ExitStack() as stack:
+        if client is None:
+            InChild(store, child, sources, time_limit_s).run(waiting, tally, interrupts)
+            following = waiting.next()
+            if following is None:
+                return
+            waiting.put_back(following)
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+
+            client = stack.enter_context(connected(store.pipeline))
+        from sweep.execution.on_cluster import OnCluster  # noqa: PLC0415  (slow to import)
+
+        OnCluster(store, client, sources, time_limit_s).run(waiting, tally, interrupts)
 
 
 @contextlib.contextmanager

@@ -16,7 +16,6 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from queue import SimpleQueue
 from types import FrameType
 from typing import IO, Any, Self, TypeVar
 
@@ -213,13 +212,13 @@ def serve(module: str) -> None:
     # Numba is slow to import, and the caller needs none of it.
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 
-    requests: SimpleQueue[bytes] = SimpleQueue()
-    threading.Thread(target=_read, args=(requests,), daemon=True).start()
     while True:
         answer: tuple[bool, Any]
         try:
-            # From the parent.
-            function, arguments, limit_s = pickle.loads(requests.get())  # noqa: S301
+            request = _message(sys.stdin.buffer)
+            if request is None:
+                return
+            function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (from the parent)
             with ending_after(limit_s):
                 answer = (False, function(*arguments))
         except SweepError as error:
@@ -227,13 +226,6 @@ def serve(module: str) -> None:
         except Exception as error:
             answer = (True, machine_fault(error) or traceback.format_exc())
         _send(answers, answer)
-
-
-def _read(requests: SimpleQueue[bytes]) -> None:
-    """Read requests until the caller is gone, or closes the pipe; then end this process."""
-    while (request := _message(sys.stdin.buffer)) is not None:
-        requests.put(request)
-    os._exit(0)
 
 
 def _send(pipe: IO[bytes] | None, content: Any) -> None:

@@ -35,6 +35,7 @@ from distributed import Client, Worker
 
 import sweep
 from sweep.execution import on_cluster
+from sweep.execution.cluster import QUIET_DASK_CONFIG
 from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
 from sweep.execution.status import close, status
@@ -65,10 +66,7 @@ trial = {trials}
 """
 
 MONITORS = {
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.tick.interval": "1s",
-    "distributed.admin.tick.cycle": "3s",
-    "distributed.scheduler.active-memory-manager.start": False,
+    **QUIET_DASK_CONFIG,
     "distributed.admin.system-monitor.interval": "600s",
     "distributed.worker.memory.monitor-interval": "600s",
 }

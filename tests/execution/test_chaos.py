@@ -199,11 +199,10 @@ class Chaos:
         whole(self._url, self._pipeline, self._reference)
 
     def _workers(self, process):
-        """Return the worker processes below one: of Dask, or children of the client itself."""
+        """Return the worker processes below one."""
         with contextlib.suppress(psutil.NoSuchProcess):
             below = psutil.Process(process.pid).children(recursive=True)
-            return [one for one in below if "spawn_main" in " ".join(self._words(one))
-                    or "child_process" in " ".join(self._words(one))]
+            return [one for one in below if "spawn_main" in " ".join(self._words(one))]
         return []
 
     @staticmethod

@@ -1,10 +1,12 @@
-"""The cluster of a run: a scheduler's, or the caller's."""
+"""The cluster of a run: embedded, on the loopback interface alone and quiet, or the caller's."""
 
 import contextlib
 import logging
 import os
 import signal
+import socket
 import subprocess
+import sys
 import time
 
 import psutil
@@ -13,19 +15,69 @@ from distributed import Client, LocalCluster
 
 import sweep
 from support.commands import started
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
+from sweep.execution import cluster as worker_versions
 from sweep.execution import on_cluster
-from sweep.execution.cluster import WorkerState, connected
+from sweep.execution.cluster import WorkerState, borrowed, embedded
 from sweep.execution.on_cluster import OnCluster
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
+from sweep.isolation.child_process import Interrupts
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.provenance import fingerprint
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 40}}
 )
+
+
+def test_embedded_cluster_listens_on_loopback_only_and_needs_no_certain_port(capfd):
+    # Dask's usual port for its page is taken, as by another run.
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            taken.bind(("127.0.0.1", 8787))
+            taken.listen()
+        except OSError:
+            pass  # by someone else, which is as good
+        with embedded(1) as client:
+            me = psutil.Process()
+            addresses = {
+                connection.laddr.ip
+                for process in (me, *me.children(recursive=True))
+                for connection in process.net_connections(kind="inet")
+                if connection.status == psutil.CONN_LISTEN
+            }
+            assert client.submit(sum, [1, 2]).result() == 3
+    assert addresses == {"127.0.0.1"}
+    told = capfd.readouterr()
+    assert told.out == told.err == ""
+
+
+def test_cluster_that_cannot_start_is_told_in_a_line(monkeypatch):
+    def refuse(**_):
+        raise RuntimeError("Cluster failed to start") from OSError(24, "Too many open files")
+
+    monkeypatch.setattr(clusters, "LocalCluster", refuse)
+    with pytest.raises(RunError) as raised, embedded(3):
+        pass
+    assert str(raised.value) == (
+        "3 worker processes cannot be started: OSError: [Errno 24] Too many open files"
+    )
+
+
+MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+
+
+def test_ctrl_c_while_workers_start_reaches_this_process_and_none_of_them():
+    with Interrupts() as interrupts:
+        with clusters._interrupts_held_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            child = subprocess.run([sys.executable, "-c", MASK], capture_output=True, check=True)
+        assert child.stdout == b"True\n"
+        with pytest.raises(KeyboardInterrupt):
+            interrupts.check()
 
 
 @pytest.mark.long
@@ -74,7 +126,7 @@ def local_cluster(workers=1, **options):
 
 
 def refusal(client):
-    with pytest.raises(ArgumentError) as raised, connected(PIPELINE, None, client):
+    with pytest.raises(ArgumentError) as raised, borrowed(client, PIPELINE):
         pass
     return str(raised.value)
 
@@ -82,7 +134,7 @@ def refusal(client):
 def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypatch):
     monkeypatch.setattr(clusters, "NO_WORKERS_TIMEOUT_S", 0.5)
     with local_cluster(0) as cluster:
-        assert refusal(cluster).startswith(
+        assert refusal(cluster) == (
             f"client = LocalCluster({cluster.scheduler_address}): no workers within 0 s; start some"
         )
         client = Client(cluster, set_as_default=False)
@@ -102,10 +154,10 @@ def test_workers_that_are_threads_of_the_caller_are_refused():
 
 def test_workers_with_other_versions_are_refused(tmp_path, monkeypatch):
     async def elsewhere(_, given):
-        return {"tcp://worker": clusters.WorkerIdentity(
+        return {"tcp://worker": worker_versions.WorkerIdentity(
             {**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [], "AVX2")}
 
-    monkeypatch.setattr(clusters, "_worker_identities", elsewhere)
+    monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
     with local_cluster(1, processes=False, protocol="tcp://") as cluster:
         for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
             with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
@@ -130,6 +182,58 @@ def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_p
             time.sleep(0.05)
         results = sweep.run(PIPELINE, store=tmp_path / "stopped.zarr", client=client)
         assert (results.detection == 1).all()
+
+
+HOSTILE = {
+    "distributed.scheduler.idle-timeout": "1ms",
+    "distributed.scheduler.no-workers-timeout": "1ms",
+    "distributed.scheduler.worker-ttl": "1ms",
+    "distributed.scheduler.allowed-failures": -1,
+    "distributed.scheduler.work-stealing": "perhaps",
+    "distributed.scheduler.worker-saturation": 1e-9,
+    "distributed.scheduler.blocked-handlers": ["register-client", "update-graph", "identity"],
+    "distributed.scheduler.preload": ["no_such_module"],
+    "distributed.scheduler.pickle": False,
+    "distributed.scheduler.http.routes": ["no.such.module"],
+    "distributed.worker.blocked-handlers": ["run", "compute-task"],
+    "distributed.worker.preload": ["no_such_module"],
+    "distributed.worker.lifetime.duration": "1s",
+    "distributed.worker.lifetime.stagger": "0s",
+    "distributed.worker.memory.pause": 1e-6,
+    "distributed.worker.memory.target": 1e-6,
+    "distributed.worker.memory.spill": 1e-6,
+    "distributed.worker.memory.terminate": 1e-6,
+    "distributed.worker.resources": {"GPU": 1},
+    "distributed.worker.connections.outgoing": 0,
+    "distributed.worker.daemon": "no",
+    "distributed.worker.http.routes": ["no.such.module"],
+    "distributed.worker.multiprocessing-method": "carrier pigeon",
+    "distributed.nanny.preload": ["no_such_module"],
+    "distributed.nanny.environ": {"PYTHONPATH": "/nowhere", "DASK_SCHEDULER": "sync"},
+    "distributed.comm.require-encryption": True,
+    "distributed.comm.default-scheme": "tls",
+    "distributed.comm.timeouts.connect": "1ms",
+    "distributed.comm.timeouts.tcp": "1ms",
+    "distributed.comm.socket-backlog": 0,
+    "distributed.comm.compression": "no such codec",
+    "distributed.comm.shard": "1 B",
+    "distributed.comm.tls.ca-file": "/nowhere/ca.pem",
+    "distributed.client.heartbeat": "1000h",
+    "distributed.deploy.lost-worker-timeout": "1ms",
+    "distributed.admin.log-format": "%(no such)s",
+    "distributed.admin.event-loop": "no such loop",
+    "distributed.diagnostics.nvml": "perhaps",
+    "distributed.dashboard.link": "{no such}",
+    "temporary-directory": "/proc/nowhere",
+    "scheduler": "sync",
+    "scheduler-address": "tcp://192.0.2.1:8786",
+}
+
+
+def computes():
+    """Tell whether an embedded cluster computes."""
+    with embedded(1) as client:
+        return client.submit(sum, [1, 2]).result(timeout=60) == 3
 
 
 @pytest.mark.parametrize(("states", "line"), [

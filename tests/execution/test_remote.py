@@ -22,7 +22,7 @@ import trustme
 from support.blocks import run_block
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
-from sweep.execution.cluster import connected
+from sweep.execution.cluster import external
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
 from sweep.experiment.grid import Block
@@ -500,8 +500,8 @@ def test_server_that_never_answers_is_given_up(monkeypatch):
     monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(ArgumentError, match="no answer within"), connected(
-            Pipeline.from_text(SMALL), address, None
+        with pytest.raises(ArgumentError, match="no answer within"), external(
+            address, Pipeline.from_text(SMALL)
         ):
             pass
 
@@ -510,7 +510,7 @@ def test_server_that_never_answers_is_given_up(monkeypatch):
 def test_what_is_no_address_is_told(address):
     with pytest.raises(
         ArgumentError, match="expected an address such as tcp://host:8786"
-    ), connected(Pipeline.from_text(SMALL), address, None):
+    ), external(address, Pipeline.from_text(SMALL)):
         pass
 
 

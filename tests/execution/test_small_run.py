@@ -1,16 +1,16 @@
-"""A run on this machine: its child processes, and their ends."""
+"""A small run: one child process instead of a cluster, with the same numbers and guarantees."""
 
+import contextlib
 import os
 import signal
-import threading
 
-import psutil
 import pytest
+from distributed import Client
 
 from support.here import Here
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreReplacedError
-from sweep.execution import engines
+from sweep.execution import engines as small_run
 from sweep.execution.progress import Tally
 from sweep.execution.runner import execute, recompute
 from sweep.experiment.pipeline import Pipeline
@@ -38,9 +38,23 @@ def undisturbed(pipeline, tmp_path_factory):
     return url
 
 
+@pytest.fixture
+def no_cluster(monkeypatch):
+    def refused(*_args, **_options):
+        pytest.fail("a cluster was started")
+
+    monkeypatch.setattr("sweep.execution.cluster.connected", refused)
+
+
+@pytest.fixture
+def client(cluster):
+    with Client(cluster, set_as_default=False) as connected:
+        yield connected
+
+
 @pytest.mark.long
-def test_engines_and_small_repair_take_one_child(pipeline, undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(engines, "Child", None)  # but that of the caller
+@pytest.mark.usefixtures("no_cluster")
+def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "small.zarr")
     summary = execute(pipeline, url, block_s=0.01)
     assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
@@ -53,25 +67,22 @@ def test_engines_and_small_repair_take_one_child(pipeline, undisturbed, tmp_path
 
 
 @pytest.mark.long
-def test_what_takes_longer_than_it_was_measured_gets_more_children(
-    pipeline, undisturbed, tmp_path, monkeypatch
+def test_what_takes_longer_than_it_was_measured_goes_to_a_cluster(
+    pipeline, undisturbed, client, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(engines, "SMALL_RUN_S", 0.0)
-    monkeypatch.setattr("sweep.execution.runner.default_workers", lambda: 3)
-    started = []
+    monkeypatch.setattr(small_run, "SMALL_RUN_LIMIT_S", 0.0)
+    asked = []
 
-    def start(module):
-        started.append(Child(module))
-        return started[-1]
+    @contextlib.contextmanager
+    def connected(_):
+        asked.append(True)
+        yield client
 
-    monkeypatch.setattr(engines, "Child", start)
+    monkeypatch.setattr("sweep.execution.cluster.connected", connected)
     url = str(tmp_path / "long.zarr")
     summary = execute(pipeline, url, block_s=1e-6)
-    assert len(started) == 2  # beside the first
+    assert asked == [True]
     assert summary.computed_blocks == summary.blocks == 12
-    assert not [child for child in psutil.Process().children() if "child_process" in str(
-        child.cmdline())]
-    assert not [one for one in threading.enumerate() if one.name.startswith("sweep")]
     assert same(url, undisturbed)
 
 
@@ -94,15 +105,15 @@ class Failing(Here):
 
 def compute(store, child):
     with child, Interrupts() as interrupts:
-        engines.OnThisMachine(store, child, time_limit_s=60).run(
+        small_run.InChild(store, child, time_limit_s=60).run(
             range(len(store.blocks)), Tally(store), interrupts)
 
 
 @pytest.mark.long
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
-    monkeypatch.setattr(engines, "MAX_DEATHS", 1)
-    monkeypatch.setattr(engines, "compute_blocks", suicide)
-    failed = r"block 0-2,0-6: machine fault on .*: its process ended: SIGKILL, as where memory"
+    monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
+    monkeypatch.setattr(small_run, "compute_blocks", suicide)
+    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
         compute(open_store(undisturbed), Child())
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import random
-from unittest import mock
 
 import pytest
 from distributed import Client, LocalCluster
@@ -11,10 +10,9 @@ import sweep
 from support import machine_faults
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
-from sweep.execution import on_cluster
+from sweep.execution import on_cluster as worker_faults
 from sweep.execution.block_task import compute_block
-from sweep.execution.cluster import WorkerState
-from sweep.execution.on_cluster import OnCluster
+from sweep.execution.on_cluster import OnCluster, WorkerFaults
 from sweep.execution.progress import Tally
 from sweep.execution.status import close
 from sweep.isolation.child_process import Interrupts
@@ -131,35 +129,30 @@ def test_worker_that_cannot_write_the_store_is_used_no_more(
 
 def test_only_a_worker_that_fails_much_of_what_others_compute_is_retired(monkeypatch):
     retired = []
-    states = {each: WorkerState(1, "running") for each in "ab"}
-    monkeypatch.setattr(on_cluster, "worker_states", lambda *_: states)
-    monkeypatch.setattr(on_cluster, "worker_that_failed", lambda _, key: key)
-    monkeypatch.setattr(on_cluster, "notice", retired.append)
+    monkeypatch.setattr(worker_faults, "worker_states", lambda *_: dict.fromkeys("ab", 1))
+    monkeypatch.setattr(worker_faults, "worker_that_failed", lambda _, key: key)
+    monkeypatch.setattr(WorkerFaults, "_retire", lambda _, worker: retired.append(worker))
     fault = MachineFaultError("full", "here")
-
-    def engine():
-        new = OnCluster(None, mock.Mock())
-        new.room()
-        return new
-
-    seldom = engine()
+    seldom = WorkerFaults(None)
     for number in range(300):
         if number % 10 == 0:
-            assert seldom._elsewhere(number, "a", fault).workers == ["b"]
-        seldom._blame(number)
+            assert seldom.others(number, "a", fault) == ["b"]
+        seldom.computed(number, 2)
     assert retired == []
-    often = engine()
-    for number in range(3):
-        assert often._elsewhere(number, "a", fault).workers == ["b"]
-        often._blame(number)
-    assert len(retired) == 1
-    del states["a"]
-    often._states = states
-    with pytest.raises(MachineFaultError):  # nobody is left to whom it could be given
-        often._elsewhere(9, "b", fault)
+    often = WorkerFaults(None)
+    for number in range(30):
+        others = often.others(number, "ab"[number % 2], fault)
+        assert others == ["ba"[number % 2]]
+        often.computed(number, 2 - len(retired))
+        monkeypatch.setattr(worker_faults, "worker_states",
+                            lambda *_: dict.fromkeys(set("ab") - set(retired), 1))
+        if retired:
+            break
+    assert retired == ["a"]
     for number in range(30, 40):  # the last one stays
-        often._blame(number)
-    assert len(retired) == 1
+        assert often.others(number, "b", fault) == []
+        often.computed(number, 2 - len(retired))
+    assert retired == ["a"]
 
 
 def outcome(client, url):

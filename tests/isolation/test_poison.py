@@ -134,8 +134,6 @@ def numbers(reference, pipeline, poisons):
 def see_who_died(log, poisons, store, workers):
     """Assert that no client died, and at most one worker for each block that holds poison.
 
-    One more may, before the blocks are cut, while scenes are timed.
-
     Returns the deaths by kind of process.
     """
     events = notes(log)
@@ -144,7 +142,7 @@ def see_who_died(log, poisons, store, workers):
              for kind in ("client", "worker", "child", "other")}
     assert kinds["client"] == kinds["other"] == 0, deaths
     blocks = {block_of(store, poison.cell) for poison in poisons if poison.deadly}
-    assert kinds["worker"] <= len(blocks) + 1
+    assert kinds["worker"] <= len(blocks)
     begun = {note["pid"] for note in events if (note["event"], note["kind"]) == ("start", "worker")}
     if not any(poison.how in ENDLESS for poison in poisons):
         # A worker that was ended for another's poison would have been replaced by one more. With a

@@ -38,7 +38,6 @@ from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.grid import detector_settings, scene_values
 from sweep.report.reference import TABLES
 
 TEXT = """
@@ -70,9 +69,9 @@ def broken(scene):
 
 pipeline = Pipeline.from_text(TEXT.format(scene="column_period_px = 3"))
 indices = [index.ravel() for index in np.indices((2, 2, 2))]
-values = scene_values(pipeline, indices)
+values = pipeline.experiment.scene_values(indices)
 scenes = build_scenes(values, 8)
-settings = detector_settings(pipeline)
+settings = pipeline.experiment.detectors
 (result,), _, _ = search(
     scenes, np.ones((8, 1), dtype=bool), settings, whole_frames(values, 8), [], keep=True
 )

@@ -66,10 +66,11 @@ WAYS = {
 
 def _kind():
     """Return what this process is: worker, child, client or other."""
-    words, child = " ".join(sys.orig_argv), "sweep.isolation.child_process"
-    if child in words:  # of a worker, or of the client, whose worker it is
-        above = Path(f"/proc/{os.getppid()}/cmdline").read_text()
-        return "child" if child in above else "worker"
+    words = " ".join(sys.orig_argv)
+    if "sweep.isolation.child_process" in words:
+        return "child"
+    if "--multiprocessing-fork" in words:
+        return "worker"
     if "-m sweep " in words:
         return "client"
     return "other"

@@ -19,7 +19,7 @@ from sweep.errors import MachineFaultError
 from sweep.experiment.pipeline import Pipeline
 
 TOP = Path(compilation.__file__).parent.parent
-UNIT = "from sweep.model.exposure import _unit; print(_unit(5), _unit.py_func(5))"
+UNIT = "from sweep.model.renderers import _unit; print(_unit(5), _unit.py_func(5))"
 """Compiles little: a function of one file that calls one of another."""
 
 
@@ -47,7 +47,7 @@ def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
         "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
     )
     before, after, value, folder = run(
-        "import numba; before = numba.config.CACHE_DIR; import mine, sweep.model.exposure as s"
+        "import numba; before = numba.config.CACHE_DIR; import mine, sweep.model.renderers as s"
         "; s._unit(1); print(repr(before), repr(numba.config.CACHE_DIR), mine.twice(3),"
         " mine.twice.stats.cache_path)",
         top=f"{TOP}{os.pathsep}{tmp_path}",
@@ -60,7 +60,7 @@ def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
 def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package, tmp_path):
     cached = str(tmp_path / "cached")
     first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
-    assert list(Path(cached).glob("*/exposure._unit*.nbc"))
+    assert list(Path(cached).glob("*/renderers._unit*.nbc"))
     other = package / "sweep" / "model" / "coverage.py"
     text = other.read_text()
     assert "np.uint64(31)" in text
@@ -80,9 +80,9 @@ def test_read_only_package_is_compiled_once_for_the_user_or_else_in_each_process
     environment = {"HOME": own, "XDG_CACHE_HOME": f"{own}/.cache"}
     value, interpreted = run(UNIT, top=package, **environment)
     assert float(value) == float(interpreted)
-    assert bool(list(tmp_path.glob("home/.cache/**/exposure._unit*.nbc"))) == home
+    assert bool(list(tmp_path.glob("home/.cache/**/renderers._unit*.nbc"))) == home
     cached, hits = run(
-        "import sweep.model.exposure as s; from sweep.compilation import is_cached; "
+        "import sweep.model.renderers as s; from sweep.compilation import is_cached; "
         "cached = is_cached(s.__name__, '_unit'); s._unit(5); "
         "print(cached, sum(s._unit.stats.cache_hits.values()))", top=package, **environment)
     assert (cached, hits) == (str(home), str(int(home)))

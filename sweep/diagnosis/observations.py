@@ -16,8 +16,8 @@ from sweep.errors import ArgumentError
 from sweep.messages import nearest, plain
 from sweep.model.calibration import MAX_BYTES, Calibration, calibration_of, read_tree
 from sweep.model.image_file import read_regular
-from sweep.model.marker import dictionary_names, marker_corners
-from sweep.model.pose import mirrored, rotation_of_vector
+from sweep.model.marker import dictionary_names
+from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
 from sweep.typing import Floats
 
 SAID = ("tvec_x_m", "tvec_y_m", "tvec_z_m", "range_m", "rvec_x", "rvec_y", "rvec_z")
@@ -281,24 +281,22 @@ def _camera(camera: str | os.PathLike[str] | Calibration | None) -> Calibration 
 
 def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) -> tuple[
         Floats, Floats]:
-    """Return positions and rotation vectors (n, 3) of corners, TL, TR, BR, BL, by IPPE."""
-    import cv2  # noqa: PLC0415  (slow to import, and needed for corners alone)
+    """Return positions and rotation vectors (n, 3) of corners, TL, TR, BR, BL, by guarded IPPE."""
+    # Slow to import, and needed for corners alone.
+    from sweep.measure.solver import both_planar_solutions  # noqa: PLC0415
+    from sweep.photographs.pose_fit import Lens  # noqa: PLC0415
+    from sweep.photographs.truth import cameras_of  # noqa: PLC0415
 
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px],
-                       [0, 0, 1]])
-    points = marker_corners(np.array([size_m]))[0]
-    found: list[tuple[Floats, Floats]] = []
-    for row in np.stack([values[name] for name in CORNERS], axis=-1):
-        solved, rvec, tvec = cv2.solvePnP(
-            points, row.reshape(4, 2), matrix, np.array(camera.distortion),
-            flags=cv2.SOLVEPNP_IPPE)
-        if not solved:
-            raise ArgumentError("observations", "", f"row {len(found) + 1}: the corners have no "
-                                "pose; expected top left, top right, bottom right, bottom left")
-        found.append((np.asarray(tvec, dtype=np.float64).ravel(),
-                      np.asarray(rvec, dtype=np.float64).ravel()))
-    position, rotation = np.stack(found, axis=1)
-    return position, rotation
+    corners = np.stack([values[name] for name in CORNERS], axis=-1).reshape(-1, 4, 2)
+    lens = Lens.of(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, tuple(camera.distortion))
+    cameras = cameras_of(lens, len(corners))
+    rotation, position = both_planar_solutions(corners, cameras, np.full(len(corners), size_m))
+    solved = np.isfinite(position[:, 0]).all(axis=-1)
+    if not solved.all():
+        row = int(np.argmin(solved)) + 1
+        raise ArgumentError("observations", "", f"row {row}: the corners have no "
+                            "pose; expected top left, top right, bottom right, bottom left")
+    return position[:, 0], vector_of_rotation(rotation[:, 0])
 
 
 def _yaw(rotation: Floats) -> Floats:

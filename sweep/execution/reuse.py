@@ -390,7 +390,8 @@ def _compute(
     values: dict[str, NDArray[Any]],
 ) -> None:
     """Compute variables that an old store lacks in some scenes, where it has their truth."""
-    rows = np.flatnonzero(scenes & np.isfinite(values["true_tvec_m"]).all(axis=-1))
+    has_truth = np.isfinite(values["true_tvec_m"]).all(axis=-1)
+    rows = np.flatnonzero(scenes & has_truth.reshape(-1))
     if not (variables and len(rows)):
         return
     drawn = pipeline.experiment.scene_values([index[rows] for index in block_indices(block)])

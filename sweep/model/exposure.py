@@ -164,14 +164,14 @@ def track(marker: MovingMarker, times_s: Floats) -> tuple[Floats, NDArray[np.int
         if folds:
             states[k] = MEANINGLESS
         # The sign of the line of sight along the normal, which is the columns' cross product.
-        facing = 0.0
+        towards = 0.0
         for i in range(3):
             a, b = (i + 1) % 3, (i + 2) % 3
             normal = p[a, 0] * p[b, 1] - p[b, 0] * p[a, 1]
-            facing += normal * (motion.translation[i] + motion.velocity[i] * times_s[k])
+            towards += normal * (motion.translation[i] + motion.velocity[i] * times_s[k])
         if behind == len(marker.outline):
             states[k] = BEHIND
-        elif behind > 0 or (marker.flat and not facing > 0.0):
+        elif behind > 0 or (marker.flat and not towards > 0.0):
             states[k] = MEANINGLESS
     return extents, states
 

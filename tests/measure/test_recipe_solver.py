@@ -44,7 +44,6 @@ import json
 import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
-from sweep.experiment.facts import parts
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.reference import TABLES
 
@@ -70,7 +69,7 @@ print(json.dumps({
     "rotation": [column.tolist() for column in columns["rotation_error_deg"]],
     "grey": columns["reprojection_error_px"][0].tolist(),
     "message": message,
-    "kept": [part.reason for part in parts(pipeline) if part.name == "pixels kept"],
+    "kept": [part.reason for part in pipeline.facts.parts if part.name == "pixels kept"],
     "table": TABLES["solvers"]().rows, "parameters": TABLES["estimator"]().markdown(),
 }))
 '''

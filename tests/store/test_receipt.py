@@ -29,7 +29,7 @@ TEXT = """
 seed = 3
 pose = { jitter_px = 0.5 }
 axes = { side_px = [8, 13, 30] }
-precision = { detection_rate = 0.2, max_trials = 70 }
+search = { precision = { detection_rate = 0.2 }, max_trials = 70 }
 """
 
 

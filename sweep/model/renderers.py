@@ -586,9 +586,9 @@ def supersample(
     ``mean + (1 - share) * background``. Samples lie in the middle of N x N cells of the pixel or,
     if ``jittered``, at random within them.
     """
-    modules, quiet, _, _, levels, inverse, optics = marker
+    cells, quiet, _, _, levels, inverse, optics = marker
     intrinsics, distortion = optics.intrinsics, optics.lens
-    n = modules.shape[0]
+    n = cells.shape[0]
     total = per_side * per_side
     for i in range(mean.shape[0]):
         for j in range(mean.shape[1]):
@@ -619,7 +619,7 @@ def supersample(
                 hits += 1
                 white = True
                 if 0.0 <= column < n and 0.0 <= line < n:
-                    white = modules[int(line), int(column)]
+                    white = cells[int(line), int(column)]
                 level += levels[2] if white else levels[1]
             mean[i, j] = level / total
             share[i, j] = hits / total

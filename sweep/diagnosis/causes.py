@@ -212,8 +212,8 @@ def _scale_columns(_: Observations, points: Floats, spread: Floats) -> Floats:
     return np.asarray((points * spread[:, None, None])[..., None])
 
 
-def _depth_columns(_: Observations, points: Floats, spread: Floats) -> Floats:
-    return np.asarray((points * [0.0, 0.0, 1.0] * spread[:, None, None])[..., None])
+def _depth_columns(rows: Observations, points: Floats, spread: Floats) -> Floats:
+    return _scale_columns(rows, points * [0.0, 0.0, 1.0], spread)
 
 
 def _along_sight(points: Floats) -> Floats:

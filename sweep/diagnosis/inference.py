@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -290,12 +291,12 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Meas
     n, some = len(said), np.full(len(said), np.nan)
     spread = np.maximum(0.002, 0.005 * np.linalg.norm(truth, axis=1))
     position = np.where([True, False, True], truth, np.nan)
-    speed = np.where(np.nan_to_num(rows.speed).any(), np.nanmean(
-        np.append(rows.speed, 0.0)), np.nan) * np.ones(n)
-    new = Observations(**{**vars(rows), "said": said, "tape": np.linalg.norm(truth, axis=1),
-        "tape_sd": spread, "position": position, "position_sd": spread,
-        "lateral": True, "yaw": some, "yaw_said": some, "yaw_mirrored": some, "yaw_sd": some,
-        "speed": speed})
+    moves = np.nan_to_num(rows.speed).any()
+    speed = np.full(n, np.nanmean([*rows.speed, 0.0]) if moves else np.nan)
+    new = dataclasses.replace(
+        rows, said=said, lateral=True, tape=np.linalg.norm(truth, axis=1), tape_sd=spread,
+        position=position, position_sd=spread, yaw=some, yaw_said=some, yaw_mirrored=some,
+        yaw_sd=some, speed=speed)
     row, which, _ = measured(new)
     means, variances = [], []
     for each in (a, b):

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from sweep.errors import ArgumentError
+from sweep.measure.solver import both_planar_solutions
 from sweep.messages import nearest, plain
-from sweep.model.calibration import MAX_BYTES, Calibration, calibration_of, read_tree
+from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import read_regular
 from sweep.model.marker import dictionary_names
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
+from sweep.photographs.truth import camera_of_file, cameras_of, lens_of
 from sweep.typing import Floats
 
 SAID = ("tvec_x_m", "tvec_y_m", "tvec_z_m", "range_m", "rvec_x", "rvec_y", "rvec_z")
@@ -25,8 +27,10 @@ TAPE = ("tape_m", "tape_sd_m", "x_m", "y_m", "z_m", "position_sd_m", "yaw_deg", 
         "speed_m_s")
 CORNERS = tuple(f"corner{k}_{axis}_px" for k in range(4) for axis in "xy")
 COLUMNS = {*SAID, *TAPE, *CORNERS}
-POSITIVE = ("tape_m", "tape_sd_m", "position_sd_m", "yaw_sd_deg")
 """Columns of a file of observations; further ones are refused, empty cells are unknown."""
+
+POSITIVE = ("tape_m", "tape_sd_m", "position_sd_m", "yaw_sd_deg")
+"""Columns whose numbers are above 0."""
 
 TAPE_SD_M, TAPE_SHARE = 0.002, 0.005
 """Standard deviation of a tape if none is given: the larger of 2 mm and 0.5 %."""
@@ -155,7 +159,8 @@ def read_observations(
     for name, value in (("size_m", size_m), ("zero_sd_m", zero_sd_m)):
         if value is not None and not 0 < value < math.inf:
             raise ArgumentError(name, value, "expected metres above 0")
-    known = _camera(camera)
+    known = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
+        os.fspath(camera))
     values = {name: _numbers(name, columns[name], count) if name in columns
               else np.full(count, np.nan) for name in COLUMNS}
     said, rvec = (np.stack([values[name] for name in SAID[k : k + 3]], axis=-1) for k in (0, 4))
@@ -269,27 +274,11 @@ def _numbers(name: str, cells: Sequence[Any], count: int) -> Floats:
     return numbers
 
 
-def _camera(camera: str | os.PathLike[str] | Calibration | None) -> Calibration | None:
-    if camera is None or isinstance(camera, Calibration):
-        return camera
-    try:
-        return calibration_of(read_tree(read_regular(os.fspath(camera), MAX_BYTES)))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ArgumentError("camera", plain(camera), reason) from None
-
-
 def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) -> tuple[
         Floats, Floats]:
     """Return positions and rotation vectors (n, 3) of corners, TL, TR, BR, BL, by guarded IPPE."""
-    # Slow to import, and needed for corners alone.
-    from sweep.measure.solver import both_planar_solutions  # noqa: PLC0415
-    from sweep.photographs.pose_fit import Lens  # noqa: PLC0415
-    from sweep.photographs.truth import cameras_of  # noqa: PLC0415
-
     corners = np.stack([values[name] for name in CORNERS], axis=-1).reshape(-1, 4, 2)
-    lens = Lens.of(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, tuple(camera.distortion))
-    cameras = cameras_of(lens, len(corners))
+    cameras = cameras_of(lens_of(camera), len(corners))
     rotation, position = both_planar_solutions(corners, cameras, np.full(len(corners), size_m))
     solved = np.isfinite(position[:, 0]).all(axis=-1)
     if not solved.all():

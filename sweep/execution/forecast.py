@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreError
-from sweep.evaluation.block import run_cells
-from sweep.evaluation.results import to_dataset_layout
+from sweep.evaluation.block import compute_block, run_cells
 from sweep.execution.limits import (
     BLOCK_S,
     BLOCKS_PER_S,
@@ -40,7 +39,7 @@ from sweep.execution.limits import (
     WAVE_BLOCK_S,
 )
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, Blocks, block_indices
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs, shows_photographs
 from sweep.experiment.pipeline import Pipeline
@@ -410,10 +409,9 @@ def _first_wave(pipeline: Pipeline, rule: Stopping) -> dict[str, NDArray[Any]]:
     axes = pipeline.experiment.scene_axes
     block = Block((0,) * len(axes), tuple(
         rule.ends[0] if axis.name == TRIAL else len(axis) for axis in axes))
-    cells = run_cells(pipeline, block_indices(block))
+    values = compute_block(pipeline, block)
     return {
-        variable.name: in_order_of_results(pipeline, variable, to_dataset_layout(
-            variable, pipeline, block, cells.columns[variable.name]))
+        variable.name: in_order_of_results(pipeline, variable, values[variable.name])
         for variable in pipeline.experiment.variables
         if variable.name in {"detection", *rule.variables}
     }

@@ -191,17 +191,18 @@ ORTHOGONAL = 1e-3
 """Largest deviation of RᵀR from the identity; files have few digits."""
 
 
-def camera_of_file(written: str, size: tuple[int, int]) -> Calibration:
-    """Return the camera of ``FILE`` or ``FILE#NAME`` for photographs of a size in pixels.
+def camera_of_file(written: str, size: tuple[int, int] | None = None) -> Calibration:
+    """Return the camera of ``FILE`` or ``FILE#NAME``, for photographs of a size in pixels.
 
     Raises
     ------
     ArgumentError
-        If there is none, or it is of another frame size.
+        If there is none, or it is of another frame size than given.
     """
     path, name = file_and_camera(written, lambda each: Path(each).is_file())
     calibration = _camera("camera", written, _tree("camera", path), name)
-    _check_size("camera", written, calibration, size)
+    if size is not None:
+        _check_size("camera", written, calibration, size)
     return calibration
 
 

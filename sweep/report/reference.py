@@ -51,10 +51,7 @@ def reference(names: Sequence[str] = ()) -> Findings:
     if not names:
         tables = [_table("subjects", ["subject", "rows"],
                          [[name, str(len(make().frame))] for name, make in TABLES.items()])]
-    numbers = {
-        table.caption: [dict(zip(table.headings, row, strict=True)) for row in table.rows]
-        for table in tables
-    }
+    numbers = {table.caption: table.as_json()["rows"] for table in tables}
     return Findings(tables, numbers, then=("sweep reference NAME", "prints a table, or a parameter")
                     if not names else ("", ""))
 
@@ -86,8 +83,6 @@ def _parameter_row(parameter: Parameter) -> list[str]:
     values = parameter.expected()
     if parameter.name == "dictionary":
         values = "a predefined dictionary of the installed OpenCV"
-    elif parameter.name == "renderer":
-        values = "a string"
     drawable = "; can be drawn" if parameter.declaration.drawable else ""
     return [parameter.name, shown, parameter.unit, f"{values}{drawable}",
             parameter.declaration.meaning]

@@ -137,12 +137,14 @@ def nearest(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
     """Return "; did you mean ...?" with the most similar known word, or "" if none is similar.
 
     Letters' cases, underscores and hyphens do not count. ``cutoff``: least share of equal letters.
+    The word itself is never suggested: it is known, and wrong for another reason.
 
     >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
     ('; did you mean tilt_deg?', '; did you mean marker_id?')
     """
     if len(word) > MAX_WORD_LENGTH:
         return ""
+    known = [name for name in known if name != word]
     close = [name for name in known if _letters(name) == _letters(word)]
     close = close or [name for name in known if word and name.startswith(word)]
     simple = {_letters(name): name for name in known}

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, PipelineError, PluginError, SweepError
-from sweep.evaluation.block import detections_for, run_cells
+from sweep.evaluation.block import detections_for, run_cells, scenes_at, search_batch
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult
-from sweep.evaluation.search import search, whole_frames
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES
@@ -556,22 +555,17 @@ class SolverTrial:
         return self.first.columns[name][0]
 
     def _faults_of_all(self) -> list[str]:
-        """Return what is raised if all single markers are solved in one call.
+        """Return what is raised if all detected targets are solved in one call.
 
         A run solves them one by one then, which takes long and hides it.
         """
-        if self.pipeline.experiment.shows_boards:
-            return []
-        values = self.pipeline.experiment.scene_values([np.arange(SCENES)])
-        scenes = build_scenes(values, SCENES)
-        (searched,), _, _ = search(
-            scenes, np.ones((SCENES, 1), dtype=bool), self.pipeline.experiment.detectors,
-            whole_frames(values, SCENES), [], keep=True,
-        )
+        batch = scenes_at(self.pipeline, [np.arange(SCENES)])
+        (searched,), _, _ = search_batch(
+            self.pipeline, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
         (setting,) = self.pipeline.experiment.estimators
         rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
         try:
-            build(setting)(detections_for(setting, values, scenes, searched, rows))
+            build(setting)(detections_for(setting, batch.values, batch.scenes, searched, rows))
         except PluginError as error:
             return [str(error)]
         return []

@@ -224,6 +224,21 @@ def scenes_at(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> SceneB
     return SceneBatch(values, scenes, visibility, targets)
 
 
+def search_batch(
+    pipeline: Pipeline, batch: SceneBatch, wanted: Masks, failures: list[Failure], *, keep: bool,
+    keys: NDArray[np.uint64] | None = None,
+) -> tuple[list[SearchResult], float, Floats]:
+    """Render scenes once and search them with each detector setting of an experiment.
+
+    All else as `sweep.evaluation.search.search`.
+    """
+    return search(
+        batch.scenes, wanted, pipeline.experiment.detectors,
+        whole_frames(batch.values, len(batch.scenes)), failures, keep=keep, keys=keys,
+        targets=batch.targets, board_settings=pipeline.experiment.board_settings,
+    )
+
+
 def compute_block(pipeline: Pipeline, block: Block) -> dict[str, NDArray[Any]]:
     """Return every variable of a block in the dataset's dimensions: a function of cells and seed.
 
@@ -320,12 +335,10 @@ def _run_batch(
     geometry_s = time.perf_counter() - start
 
     builds = [build(estimator) for estimator in estimating]
-    results, render_s, row_s = search(
-        batch.scenes, searched & visible[:, None], settings,
-        whole_frames(batch.values, len(need)), failures,
-        keep=any(each.needs_images for each in builds), targets=batch.targets,
+    results, render_s, row_s = search_batch(
+        pipeline, batch, searched & visible[:, None], failures,
+        keep=any(each.needs_images for each in builds),
         keys=pipeline.experiment.image_keys(indices) if any(map(is_recorded, settings)) else None,
-        board_settings=pipeline.experiment.board_settings,
     )
 
     start = time.perf_counter()

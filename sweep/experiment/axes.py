@@ -112,6 +112,11 @@ class Axis:
             return False
         return {type(value) for value in self.values} not in ({bool}, {int}, {float})
 
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its values are numbers, and not labels or switches."""
+        return not self.labelled and not isinstance(self.values[0], bool)
+
     def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return the values [start, stop) as coordinates: numbers, booleans or strings."""
         part = self.values[start:stop]

@@ -159,6 +159,10 @@ NOT_IN_IMAGE = {
 """Parameters of the scene's stage that do not change its image."""
 
 
+TARGET_SECTIONS = ("marker", "board", "target")
+"""Sections of a pipeline whose parameters tell targets apart."""
+
+
 # --------------------------------------------------------------------------------------------------
 # The experiment: what a pipeline asks for, resolved once in each process.
 
@@ -178,6 +182,15 @@ class Experiment:
     def scene_axes(self) -> tuple[Axis, ...]:
         """The axes that blocks are cut along."""
         return self.grid.axes_of(Stage.scene)
+
+    @cached_property
+    def target_axes(self) -> tuple[Axis, ...]:
+        """The axes along which targets differ by more than a number: compared, never averaged."""
+        return tuple(
+            axis for axis in self.scene_axes
+            if len(axis) > 1 and axis.name != TRIAL and not axis.is_numeric and any(
+                PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
+                if name in PARAMETERS))
 
     @cached_property
     def detectors(self) -> list[AnyDetectorSetting]:

@@ -49,7 +49,6 @@ from sweep.report.report_data import (
     by_configuration,
     configurations,
     course_of,
-    is_numeric,
     settings_of,
 )
 from sweep.report.table import Column, Table, Value, each_cell, table_of
@@ -233,7 +232,7 @@ def along_axis(
 ) -> Grouped:
     """Return an analysis along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
     axis = data.pipeline.axis(along)
-    groups = data.along(along, MAX_BINS if axis is None or is_numeric(axis) else MAX_ROWS)
+    groups = data.along(along, MAX_BINS if axis is None or axis.is_numeric else MAX_ROWS)
     if angles and data.angle_axis and along != data.angle_axis:
         several = len(settings_of(data, stages, (along,)).combinations) > 1
         groups = data.along(data.angle_axis, MAX_ANGLE_PANELS if several else MAX_ANGLES,
@@ -307,7 +306,7 @@ def _configurations(data: ReportData) -> Figure | None:
     axes = {axis.name: axis for axis in data.pipeline.axes}
     covers = [name for name, some in known.settings.axes.items()
               if len(some) == data.length(name)
-              and (not is_numeric(axes[name]) or data.length(name) < MIN_DRAWN)]
+              and (not axes[name].is_numeric or data.length(name) < MIN_DRAWN)]
     return Grouped(data, known.settings, known.summary, (), known.settings.grouping.notes).figure(
         "configurations", f"Configurations compared: {', '.join(known.settings.grouping.dims)}",
         "Share of the poses looked for that are solved, and the median errors, of each "
@@ -329,7 +328,7 @@ MAX_BARS = 24
 def _outcomes(data: ReportData) -> Figure:
     names = [name for name in (data.size_axis, *data.scene_axes, data.size)
              if name is not None and name != IDS
-             and data.pipeline.axis(name) not in data.target_axes]
+             and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
     axis = names[0] if names else None
     found = grouped(data, failure_composition, data.along(axis, MAX_BARS) if axis else None)
     counts = found.summary["count"].sum(

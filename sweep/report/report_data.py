@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
+from sweep.analysis.dataset import is_grid_axis, of_photographs
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.analysis.requirements import (
     SIZES_BESIDE,
@@ -26,7 +27,7 @@ from sweep.analysis.requirements import (
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
 from sweep.experiment.axes import TRIAL, Axis, Distribution
-from sweep.experiment.parameters import PARAMETERS, WORLD, Stage
+from sweep.experiment.parameters import WORLD, Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.measure.flags import DetectionStatus, uncounted_values
@@ -49,9 +50,6 @@ CONFIGURATION = "configuration"
 """Dimension of tables that have a row for each configuration."""
 
 AREA_BINS = 24
-
-TARGET_SECTIONS = ("marker", "board", "target")
-"""Sections of a pipeline whose parameters tell targets apart."""
 
 DRAWN_BINS = 10
 """Bins of a drawn parameter."""
@@ -124,11 +122,6 @@ def chosen_of(name: str, length: int, most: int) -> Grouping:
     chosen = tuple(np.linspace(0, length - 1, most).round().astype(int).tolist())
     note = f"{most} of the {length:,} values of {name} are shown."
     return Grouping((name,), chosen=((name, chosen),), notes=(note,))
-
-
-def is_numeric(axis: Axis) -> bool:
-    """Return whether an axis' values are numbers, and not labels or switches."""
-    return not axis.labelled and not isinstance(axis.values[0], bool)
 
 
 def by_configuration(
@@ -264,13 +257,12 @@ class ReportData:
         return tuple(axis.name for axis in self.pipeline.axes_of(*stages) if len(axis) > 1)
 
     @property
-    def target_axes(self) -> tuple[Axis, ...]:
-        """Axes of the scene along which targets differ by more than a number."""
-        return tuple(
-            axis for axis in self.pipeline.axes
-            if axis.name in self.scene_axes and not is_numeric(axis) and any(
-                PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
-                if name in PARAMETERS))
+    def effect_axes(self) -> tuple[Axis, ...]:
+        """Axes of the scene whose values see the same draws, such as noise or JPEG quality."""
+        if of_photographs(self.results):
+            return ()
+        return tuple(axis for axis in self.pipeline.axes
+                     if axis.name in self.scene_axes and not is_grid_axis(axis.name, self.results))
 
     @property
     def scene_axes(self) -> tuple[str, ...]:
@@ -317,7 +309,7 @@ class ReportData:
             raise KeyError(name)
         if len(axis) <= most:
             return Grouping((name,))
-        if binned and is_numeric(axis):
+        if binned and axis.is_numeric:
             return bins_of(name, np.asarray(self.results[name].values, dtype=np.float64), most)
         return chosen_of(name, len(axis), most)
 
@@ -386,7 +378,7 @@ def course_of(
     per = usual_conditions(data.results) if per is None else per
     conditions = [name for name in per if name not in data.setting_axes]
     ordered = [name for name in conditions
-               if name in data.scene_axes and is_numeric(axes[name])]
+               if name in data.scene_axes and axes[name].is_numeric]
     ordered.sort(key=lambda name: (
         name != data.size_axis, name not in SIZES_BESIDE, name in ANGLES))
     along = ordered[0] if ordered else None
@@ -489,15 +481,16 @@ class Settings:
 
 def settings_of(
     data: ReportData, stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *,
-    targets: bool = True,
+    scene: Sequence[Axis] | None = None,
 ) -> Settings:
-    """Return the combinations of the settings of some stages, and of targets.
+    """Return the combinations of the settings of some stages, and of axes of the scene.
 
     If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
-    spaced. ``without`` are axes that are left out, since a figure is along them.
+    spaced. ``without`` are axes that are left out, since a figure is along them. ``scene`` are
+    those of targets by default.
     """
-    chosen = {axis.name: len(axis)
-              for axis in (*(data.target_axes if targets else ()), *data.pipeline.axes_of(*stages))
+    scene = data.pipeline.experiment.target_axes if scene is None else scene
+    chosen = {axis.name: len(axis) for axis in (*scene, *data.pipeline.axes_of(*stages))
               if len(axis) > 1 and axis.name not in without}
     while math.prod(chosen.values()) > MAX_CONFIGURATIONS and max(chosen.values()) > 2:
         chosen[max(chosen, key=lambda name: chosen[name])] -= 1
@@ -545,13 +538,19 @@ class Configurations:
 
 
 def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
-    """Return the configurations of a store, in order, by targets, too, or with them pooled."""
+    """Return the configurations of a store, in order, by targets, too, or with them pooled.
+
+    Of a store with neither settings nor targets to compare, by the values of its effects.
+    """
     return data.once(
         ("configurations", targets), lambda: _configurations(data, targets=targets))
 
 
 def _configurations(data: ReportData, *, targets: bool) -> Configurations:
-    settings = settings_of(data, targets=targets)
+    settings = settings_of(data, scene=data.pipeline.experiment.target_axes if targets else ())
+    if targets and not settings.axes:
+        # Nothing else varies on the same draws: the values of an effect are what is compared.
+        settings = settings_of(data, scene=data.effect_axes)
     names, summary = by_configuration(
         data.pipeline, data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
     axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]

@@ -14,25 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sweep.evaluation.block import detections_for
+from sweep.evaluation.block import SceneBatch, detections_for, scenes_at, search_batch
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
+from sweep.evaluation.search import DetectionSource, SearchResult, detection_source
 from sweep.experiment.axes import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
-from sweep.measure.detectors import (
-    AnyDetectorSetting,
-    DetectorSetting,
-    FindFunction,
-    full_frame_reason,
-    make_detector,
-)
+from sweep.measure.detectors import AnyDetectorSetting, DetectorSetting, full_frame_reason
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
-from sweep.model.scene import Scenes, build_scenes
 from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------
@@ -244,10 +237,11 @@ class Costs:
 class _Condition:
     """The scenes of a condition, ready to be measured."""
 
-    scenes: Scenes
-    values: dict[str, Any]
+    batch: SceneBatch
     searches: list[SearchResult]
     """The result of each detector setting, with the image that it searches of each scene."""
+    sources: list[DetectionSource]
+    """What finds targets in an image, of each detector setting."""
 
 
 @single_threaded()
@@ -274,10 +268,7 @@ def measure(
     """
     started = time.perf_counter()
     settings, estimating = pipeline.experiment.detectors, pipeline.experiment.estimators
-    configurations = _Configurations(
-        [make_detector(setting) for setting in settings], estimating,
-        [build(estimator) for estimator in estimating],
-    )
+    configurations = _Configurations(estimating, [build(each) for each in estimating])
 
     def prepared_with(most: int) -> list[_Condition]:
         chosen = []
@@ -291,11 +282,11 @@ def measure(
     left_s = limit_s - (time.perf_counter() - started) - (1 + LEAST_ROUNDS) * estimation_s
     # Beside the rounds, each scene is rendered and searched once.
     most = max(int(TRIAL_SCENES * left_s / ((3 + LEAST_ROUNDS) * search_s)), 1)
-    if any(len(condition.scenes) == TRIAL_SCENES for condition in prepared) or most == 1:
+    if any(len(condition.batch.scenes) == TRIAL_SCENES for condition in prepared) or most == 1:
         prepared = prepared_with(most)
     parts, detected_share = configurations.parts(prepared)
     shape = (len(prepared), len(settings), len(estimating))
-    frames = np.array([len(condition.scenes) for condition in prepared])
+    frames = np.array([len(condition.batch.scenes) for condition in prepared])
     visible = np.array([len(condition.searches[0].images) > 0 for condition in prepared])
 
     def costs(seconds: Floats) -> Costs:
@@ -327,9 +318,8 @@ def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
 
 @dataclass(frozen=True, slots=True)
 class _Configurations:
-    """The detector settings and the estimators, ready to be timed."""
+    """The estimators, ready to be timed, and their settings."""
 
-    finders: Sequence[FindFunction]
     settings: Sequence[EstimatorSetting]
     estimators: Sequence[PoseEstimator]
 
@@ -341,17 +331,18 @@ class _Configurations:
         For each condition and detector setting: the search of all scenes, then each estimator.
         """
         parts: list[Callable[[], Any]] = []
-        detected_share = np.zeros((len(conditions), len(self.finders)))
+        detected_share = np.zeros((len(conditions), len(conditions[0].sources)))
         for c, condition in enumerate(conditions):
-            sides = condition.scenes.frame.max(axis=1).tolist()
-            for d, find in enumerate(self.finders):
-                images = condition.searches[d].images
-                parts.append(partial(_search_all, find, images, condition.scenes, sides))
-                rows = np.flatnonzero(condition.searches[d].flags == DetectionStatus.detected)
-                detected_share[c, d] = len(rows) / len(condition.scenes)
+            batch = condition.batch
+            for d, (source, found) in enumerate(
+                zip(condition.sources, condition.searches, strict=True)
+            ):
+                parts.append(partial(_search_all, source, found.images))
+                rows = np.flatnonzero(found.flags == DetectionStatus.detected)
+                detected_share[c, d] = len(rows) / len(batch.scenes)
                 for setting, estimate in zip(self.settings, self.estimators, strict=True):
                     detections = detections_for(
-                        setting, condition.values, condition.scenes, condition.searches[d],
+                        setting, batch.values, batch.scenes, found,
                         np.resize(rows, BATCH if len(rows) else 0),
                     )
                     parts.append(partial(_estimate_all, estimate, detections))
@@ -374,14 +365,12 @@ class _Configurations:
         return max(spent[0], 1e-6), spent[1]
 
 
-def _search_all(
-    find: FindFunction, images: Mapping[int, Grey], scenes: Scenes,
-    sides: Sequence[int],
-) -> None:
+def _search_all(source: DetectionSource, images: Mapping[int, Grey]) -> None:
     for row, image in images.items():
-        # If it raises, the run has flagged the pose; the attempt has a cost as well.
+        # If it raises, the run has flagged the pose; the attempt has a cost as well. A view is
+        # another object: the source remembers what it found in the image that it saw last.
         with suppress(Exception):
-            find(image, scenes.dictionary[row], sides[row])
+            source(row, image[:])
 
 
 def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
@@ -396,19 +385,22 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
     count = len(indices[0]) if indices else 1
-    values = pipeline.experiment.scene_values(indices)
-    scenes = build_scenes(values, count, pipeline.experiment.scene_plugins)
-    rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
+    batch = scenes_at(pipeline, indices)
+    rows = np.flatnonzero(batch.visibility == DetectionStatus.not_run)
     if 0 < len(rows) < count:
         return _prepare(pipeline, [index[rows] for index in indices], most)
     if count > most:
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
         return _prepare(pipeline, [index[chosen] for index in indices], most)
-    settings = pipeline.experiment.detectors
-    wanted = np.full((count, len(settings)), len(rows) > 0)
-    full = whole_frames(values, count)
-    searches, _, _ = search(scenes, wanted, settings, full, [], keep=True)
-    return _Condition(scenes, values, searches)
+    experiment = pipeline.experiment
+    wanted = np.full((count, len(experiment.detectors)), len(rows) > 0)
+    searches, _, _ = search_batch(pipeline, batch, wanted, [], keep=True)
+    sources = [
+        detection_source(setting, batch.scenes, batch.targets, None, on_board)
+        for setting, on_board in zip(
+            experiment.detectors, experiment.board_settings, strict=True)
+    ]
+    return _Condition(batch, searches, sources)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -452,13 +444,9 @@ def measure_renderers(
     interrupts
         Checked between two measurements.
     """
-    count = len(samples[0][0])
-    plugins = pipeline.experiment.scene_plugins
-    scenes = [
-        build_scenes(pipeline.experiment.scene_values(indices), count, plugins)
-        for indices in samples
-    ]
-    rows = np.flatnonzero(visibility_flags(scenes[reference]) == DetectionStatus.not_run)
+    batches = [scenes_at(pipeline, indices) for indices in samples]
+    scenes = [batch.scenes for batch in batches]
+    rows = np.flatnonzero(batches[reference].visibility == DetectionStatus.not_run)
     boxes = [marker_boxes(each)[rows] for each in scenes]
     windows = np.concatenate(
         [np.min([box[:, :2] for box in boxes], axis=0),

@@ -71,7 +71,8 @@ def measure_trade(
     url
         A finished store.
     per
-        Scene axes; each combination of their values is a condition of its own.
+        Scene axes; each combination of their values is a condition of its own. Axes of targets
+        (markers, boards, dictionaries) always are.
     limit_s
         Time limit of the measurement in seconds, in which the accuracy is read, too, as far as it
         leaves 30 % of them.
@@ -110,7 +111,7 @@ def measure_trade(
                 f"{url}: the detections of {plugin.name} were recorded: there is no search whose "
                 "time could be measured"
             )
-    per = list(dict.fromkeys(per))
+    per = list(dict.fromkeys((*per, *(axis.name for axis in stored.experiment.target_axes))))
     _check(url, stored, results, per)
     # The same versions and files must be measured as were run.
     pipeline = Pipeline.from_text(

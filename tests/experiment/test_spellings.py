@@ -2,6 +2,8 @@
 
 import cv2
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.board_rules import read_board
@@ -10,6 +12,7 @@ from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS
+from sweep.messages import nearest
 from sweep.store.lifecycle import open_store
 
 OPENCV = {
@@ -62,6 +65,11 @@ def test_of_several_dictionaries_the_nearest_are_named(written, meant):
         PARAMETERS["dictionary"].check(written)
     with pytest.raises(PipelineError, match=f"; did you mean {meant}\\?"):
         Pipeline.from_text("[pose]\nside_px = 40", [f'dictionary=["{written}", "36h11"]'])
+
+
+@given(st.sampled_from(sorted(PARAMETERS)))
+def test_a_name_that_is_known_is_never_suggested_in_its_own_place(name):
+    assert f"did you mean {name}?" not in nearest(name, list(PARAMETERS))
 
 
 @pytest.mark.parametrize("name", sorted(PARAMETERS))

@@ -49,7 +49,19 @@ dictionary = ["DICT_4X4_50", "DICT_6X6_250"]
 side_px = [15, 20, 40]
 trial = 20
 """
+EFFECT = f"""{CAMERA}
+[pose]
+jitter_px = 0.5
+tilt_deg = 30
+[scene]
+noise_grey = 2
+[axes]
+side_px = [20, 40]
+jpeg_quality = [20, 90]
+trial = 20
+"""
 STORES = {
+    "effect": (EFFECT, []),
     "tutorial": (TUTORIAL, ["distance_m=[1, 3, 5]", "tilt_deg=[30, 60]", "trial=12"]),
     "targets": (TARGETS, []),
     "one pose": (f"{CAMERA}[pose]\nside_px = 40\n", []),
@@ -94,10 +106,12 @@ def numbers_of(results):
 
 def configurations_of(results, name):
     """Return the configurations of a store, by label."""
-    axis = {"tutorial": "cornerRefinementMethod", "targets": "dictionary"}.get(name)
+    axis = {"tutorial": "cornerRefinementMethod", "targets": "dictionary",
+            "effect": "jpeg_quality"}.get(name)
     if axis is None:
         return {"as set": results}
-    return {str(value): results.sel({axis: value}) for value in results[axis].values}
+    prefix = "jpeg_quality " if name == "effect" else ""
+    return {f"{prefix}{value}": results.sel({axis: value}) for value in results[axis].values}
 
 
 def value_of(cell):

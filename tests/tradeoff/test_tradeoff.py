@@ -120,6 +120,30 @@ def store(tmp_path_factory):
     return made(tmp_path_factory.mktemp("trade"), TRADE, "trade")
 
 
+def test_targets_are_conditions_and_boards_are_searched_as_in_a_run(tmp_path):
+    url = made(tmp_path, f"""{CAMERA}
+[marker]
+dictionary = "DICT_4X4_50"
+[board]
+squares_x = 6
+squares_y = 5
+square_m = 0.02
+[estimator]
+solver = "iterative"
+[axes]
+trial = 4
+[axes.target.zip]
+kind = ["none", "charuco"]
+distance_m = [0.1, 0.25]
+size_m = [0.015, 0.015]
+""", "targets")
+    content = json.loads(told(url, "--json", "--seconds", 2))
+    assert content["coords"]["target"]["data"] == ["none, 0.1, 0.015", "charuco, 0.25, 0.015"]
+    assert [line.partition(":")[0] for line in content["advice"]] == [
+        "target = none, 0.1, 0.015", "target = charuco, 0.25, 0.015"]
+    assert np.isfinite(content["data_vars"]["cost_ms"]["data"]).all()
+
+
 @pytest.fixture(scope="module")
 def renderer_store(tmp_path_factory):
     return made(tmp_path_factory.mktemp("renderers"), RENDERERS, "renderers")

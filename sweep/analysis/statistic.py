@@ -40,6 +40,9 @@ OVER_ALL = (1, 2, 3)
 MAX_BLOCK = 1 << 17
 """Poses in a block: a thread needs 25 MB for so many."""
 
+MAX_SHARED = 1 << 20
+"""Poses of which views are kept for all statistics: what they compute takes some 200 MB."""
+
 
 class Blocks(Generic[ViewT]):
     """The poses of some groups, in blocks along the cells and the draws.
@@ -67,22 +70,28 @@ class Blocks(Generic[ViewT]):
         self._cuts = [
             [slice(start, start + step) for start in range(0, max(length, 1), step)]
             for length, step in zip((cells, draws), steps, strict=True)]
-        self._single: ViewT | None = None
+        self._blocks = list(itertools.product(*self._cuts))
+        self._views: dict[int, ViewT] = {}
 
     def map(self, function: Callable[[ViewT], ResultT]) -> list[ResultT]:
         """Return what a function gives of the view of each block."""
-        blocks = list(itertools.product(*self._cuts))
-        if len(blocks) == 1:
-            # All statistics share the view, which keeps what it has computed.
-            self._single = self._single or self._view(self._arrays)
-            return [function(self._single)]
+        def of_block(number: int) -> ResultT:
+            return function(self._view_of(number))
 
-        def of_block(cut: tuple[slice, ...]) -> ResultT:
-            return function(self._view(
-                {name: array[:, *cut] for name, array in self._arrays.items()}))
+        blocks = range(len(self._blocks))
+        if self._threads is None or len(blocks) == 1:
+            return list(map(of_block, blocks))
+        return list(self._threads.map(of_block, blocks))
 
-        return list(map(of_block, blocks) if self._threads is None
-                    else self._threads.map(of_block, blocks))
+    def _view_of(self, number: int) -> ViewT:
+        """Return the view of a block; of few poses all statistics share it, and what it keeps."""
+        if number in self._views:
+            return self._views[number]
+        cut = self._blocks[number]
+        view = self._view({name: array[:, *cut] for name, array in self._arrays.items()})
+        if len(self._blocks) == 1 or self.poses <= MAX_SHARED:
+            self._views[number] = view
+        return view
 
     def gather(
         self, function: Callable[[ViewT], tuple[NDArray[Any], ...]]

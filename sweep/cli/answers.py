@@ -275,7 +275,7 @@ def error_model(options: argparse.Namespace) -> int:
         library.error_model_file.check_error_model_file(output)
     data = library.report_data.read_report_data(options.store)
     results = library.decisions.selected(data.results, options.at, data.pipeline)
-    data = dataclasses.replace(data, results=results).in_memory()
+    data = dataclasses.replace(data, results=results)
     return answered(options, library.error_model_file.model_findings(data, outputs))
 
 

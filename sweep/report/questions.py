@@ -134,7 +134,7 @@ def tradeoff(
     trade, renderers = measure_trade(store, per, limit_s, progress, question=question)
     if figure is not None:
         write_figure([trade_figure(trade, criterion)], figure)
-    found = trade_lines(read_report_data(store).in_memory(), trade, budget_ms)
+    found = trade_lines(read_report_data(store), trade, budget_ms)
     frames, sampled = trade.attrs["frames"], trade.attrs["sampled"]
     few = [] if frames >= sampled else [
         (f"costs are those of {frames:,} of {sampled:,} sampled images; more --seconds, or markers "
@@ -203,7 +203,6 @@ def report(
     page = Path(output or f"report.{form}")
     data = read_report_data(store, require, per, command)
     if error_model:
-        data = data.in_memory()
         written_error_models(data, error_model)
     count, answer = write_report(data, page, form, Path(figures) if figures else None)
     size = f", {byte_count(page.stat().st_size)}" if page.is_file() else ""

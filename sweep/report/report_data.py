@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import itertools
 import math
@@ -146,8 +145,8 @@ def by_configuration(
 # --------------------------------------------------------------------------------------------------
 # The data of a report: a store's results, the roles of its axes, and analyses computed once.
 
-MAX_LOADED_BYTES = 600_000_000
-"""Results up to this size are loaded at once: many figures read the same values, and many small
+MAX_READ_BYTES = 600_000_000
+"""Results up to this size are read at once: many figures need the same values, and many small
 chunks are slow to read."""
 
 AREA_RATIO = 2.0
@@ -166,7 +165,7 @@ class ReportData:
     store
         Path or URL of the store.
     results
-        Its dataset, lazy.
+        Its dataset; lazy if it is large.
     pipeline
         The experiment.
     run_metadata
@@ -323,13 +322,6 @@ class ReportData:
 
     # Analyses.
 
-    def in_memory(self) -> ReportData:
-        """Return the data of a small store loaded; those of a large store stay lazy."""
-        if self.results.nbytes > MAX_LOADED_BYTES:
-            return self
-        with store_errors(self.store):
-            return dataclasses.replace(self, results=self.results.load())
-
     def analysed(self, analysis: Analysis, grouping: Grouping | None = None) -> xr.Dataset:
         """Return the result of an analysis, loaded; each is computed once.
 
@@ -430,7 +422,7 @@ def read_report_data(
             trade = xr.open_zarr(
                 store.storage, group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
-        results = open_dataset(store.url)
+        results = open_dataset(store.url, MAX_READ_BYTES)
     required = tuple(require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,

@@ -275,7 +275,6 @@ def write_report(
     check_output(output, folders, data.store)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
-    data = data.in_memory()
     _check_complete(data)
     title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))

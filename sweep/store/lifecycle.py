@@ -397,8 +397,10 @@ def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
         raise StoreError(not_a_store(url)) from None
 
 
-def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
+def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset:
     """Open a store's results, lazily; also those of an unfinished one.
+
+    Results of at most ``read_bytes`` are read at once, which is faster than through Dask.
 
     Raises
     ------
@@ -418,7 +420,12 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
             storage = store.storage if finished else as_committed(store, done)
-            dataset: xr.Dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
+            dataset: xr.Dataset = xr.open_zarr(
+                storage, chunks=None, consolidated=False, zarr_format=3)
+            if dataset.nbytes <= read_bytes:
+                dataset = dataset.load()
+            else:
+                dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
             # Short, and asked for one by one.
             together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
             dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})

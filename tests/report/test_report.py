@@ -169,7 +169,7 @@ def test_drawings_take_the_colours_of_the_page(page):
 
 
 def kinds(url):
-    return [figure.name for figure in figures_of(opened(url).in_memory())]
+    return [figure.name for figure in figures_of(opened(url))]
 
 
 @pytest.mark.long

@@ -295,6 +295,7 @@ def _yaws(rows: Observations) -> str:
 AGREE = "agree"
 FLIPS = "flips"
 STRAIGHT = "z_for_range"
+UNITS_MISTAKEN = "units"
 CAUSES = (
     Cause(AGREE, "the numbers agree with what is expected", 4.0, _as_it_is, _no_columns, _always,
           "nothing to test"),
@@ -305,7 +306,7 @@ CAUSES = (
           _focal_ways, _depth_columns, _always,
           "photograph a ruler at a known distance: f is its pixels times distance / length; "
           "compare the file's image size with the image's"),
-    Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0, _unit_ways,
+    Cause(UNITS_MISTAKEN, "units taken for one another (m, cm, mm, inch, foot)", 1.0, _unit_ways,
           _scale_columns, _always, "print size and tvec with their units"),
     Cause(STRAIGHT, "z taken for the straight distance", 1.5, _as_it_is, _no_columns,
           _straight, "compare the tape with sqrt(x² + y² + z²)"),

@@ -18,7 +18,7 @@ TOP = HERE.parents[1]
 QUICK = {
     "analysis": (["1e4", "60"], ["CALLS = dict(list(CALLS.items())[:2])"]),
     "detectors": (["--scenes", "8", "--noise", "0", "--only", "none"], []),
-    "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS, COUNT = 1, 3, 5.0, 1, 24",
+    "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS, COUNT = 1, 3, 3.0, 1, 24",
                        "OTHERS = {}"]),
     "fit": (["1", "3"], []),
     "kernel": ([], ["SIZES = BOARD_SIZES = SIZES[:1]", "POSES = {640: 20}", "REPEATS = 1",
@@ -32,7 +32,11 @@ QUICK = {
     "renderers": ([], ["SIDES, LENSES, SCENES = (8,), ((),), 2"]),
     "scale": (["--workers", "2", "--waves", "2", "--block-s", "0.1"], []),
     "size": (["{folder}", "smallest_marker"], [
-        "compared = lambda name, folder: bool(searched(name, folder))"]),  # without the grid
+        # A coarse question, without the grid.
+        ("search_choice = lambda pipeline, *rest, whole=search_choice, **more: whole("
+         "Pipeline.from_text(pipeline.text, ['size_m=[0.02, 0.08]', 'tilt_deg=[0]', "
+         "'search.max_trials=300']), *rest, **more)"),
+        "compared = lambda name, folder: bool(searched(name, folder))"]),
     "stopping": (["--workers", "1"], [
         "CASES = {'paper_fig4': (['distance_m=[0.1, 0.3]', 'tilt_deg=[0]'], 'detection_rate')}",
         "CASES['paper_fig4'][0].append('search.precision={ detection_rate = 0.2 }')",

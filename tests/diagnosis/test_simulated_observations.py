@@ -109,6 +109,8 @@ def observation(seed, pairs):
         side = rows.side_px
         for name in sorted(names, key=SINGLE.index):
             rows = spoil(rows, name, rng)
+            if name == "size":
+                side = rows.side_px  # of the marker as it is, which the image shows
         if (rows.said[:, 2] > 0).all():
             break
     bias = rows.expected[0]

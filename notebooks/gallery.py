@@ -247,7 +247,7 @@ trial = 200
         """\
 results = sweep.run("calibration.toml", store="runs/calibration.zarr")
 fx = calibration_summary(camera_calibrations(results, [20], coefficients=0)).sel(
-    intrinsic="fx", views=20)
+    intrinsic="fx_px", views=20)
 xr.concat([fx.rmse, fx.mean_std], xr.Variable("is", ["RMS", "told by OpenCV"])).assign_attrs(
     long_name="error of fx", units="px").plot.line(x="tilt_deg", yscale="log")
 """),

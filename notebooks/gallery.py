@@ -217,7 +217,8 @@ trial = 12
 """,
         """\
 sweep export twins.toml shots
-sweep photos shots/images --camera shots/cameras/camera-0.opencv.yml --board board.toml --set cornerRefinementMethod=subpix
+sweep photos shots/images --camera shots/cameras/camera-0.opencv.yml --board board.toml \\
+    --set cornerRefinementMethod=subpix
 sweep compare runs/images.zarr plain.toml -o twins.png
 """,
         (("board.toml", """\
@@ -283,7 +284,7 @@ def make(picture: Picture) -> None:
     for name, content in ((f"{picture.name}.toml", picture.pipeline), *picture.others):
         Path(name).write_text(content)
     if picture.lines.startswith("sweep "):
-        for line in picture.lines.splitlines():
+        for line in picture.lines.replace("\\\n", "").splitlines():
             command = [sys.executable, "-m", *line.split()]
             status = subprocess.run(  # noqa: S603
                 command, check=False, stdout=subprocess.DEVNULL).returncode

@@ -476,7 +476,7 @@ def _told(line: Series) -> str:
 def _name_points(axes: Axes, named: Sequence[tuple[float, float, str]]) -> None:
     """Write names beside points, below or above, as near as other names leave room."""
     written: list[tuple[float, float, float]] = []  # left end, right end, base line in points
-    scale = 72 / axes.get_figure(root=True).dpi
+    scale = 72 / axes.figure.dpi
     floor = axes.transAxes.transform((0, 0))[1] * scale
     for x, y, text in named:
         left, base = axes.transData.transform((x, y)) * scale + (5, 0)

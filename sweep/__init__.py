@@ -1,7 +1,13 @@
 """How well will I know the pose? Experiments with fiducial markers, against the truth.
 
+Every public function stands here with all that it takes. Its example runs: ``folder`` is the path
+of an empty folder, and for `photos`, `fit`, `twins` and `compare` it has three photographs of a
+ChArUco board in ``shots``, the calibration ``camera.json`` and the board's file ``board.toml``.
+Stores that one example makes are read by others. Lengths are in metres, pixels (``_px``) or
+millimetres (``_mm``), angles in degrees (``_deg``) or radians (``_rad``), as the names say.
+
 Importing this package is quick: NumPy, Numba, Dask and xarray are imported when a function needs
-them. It has more than 400 lines, for each public function stands here with all that it takes.
+them.
 """
 
 from __future__ import annotations
@@ -143,7 +149,7 @@ def run(
     --------
     >>> results = sweep.run(
     ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [20, 40], "trial": 10}},
-    ...     store=folder / "two_sizes.zarr", workers=1,
+    ...     store=folder / "two_sizes.zarr",
     ... )
     >>> dict(results.detection.sizes)
     {'side_px': 2, 'trial': 10}
@@ -211,7 +217,7 @@ def limit(
     >>> limits = sweep.limit(
     ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [5, 40]}},
     ...     require=["detection >= 0.5"], along="side_px", max_trials=40,
-    ...     store=folder / "limit.zarr", workers=1,
+    ...     store=folder / "limit.zarr",
     ... )
     >>> limits["value"].item()
     40.0
@@ -343,6 +349,14 @@ def photos(
     ------
     ArgumentError, PipelineError, StoreError, RunError
         As for :func:`run`; photographs, cameras and boards that do not fit are told in a line.
+
+    Examples
+    --------
+    >>> shots = sweep.photos(
+    ...     folder / "shots", camera=folder / "camera.json", board=folder / "board.toml",
+    ...     store=folder / "shots.zarr")
+    >>> dict(shots.detection.sizes)  # photographs, and markers of the board
+    {'trial': 3, 'marker_id': 10}
     """
     home, name = library.folder.record_home(store)
     prepared = library.prepare.prepare(
@@ -392,6 +406,14 @@ def twins(
     ------
     ArgumentError, PipelineError, StoreError, RunError
         As for :func:`run`; also if the store is not of photographs.
+
+    Examples
+    --------
+    >>> simulated = sweep.twins(
+    ...     folder / "shots.zarr", {"blur_px": 0.6, "noise_grey": 2.0},
+    ...     store=folder / "twins.zarr")
+    >>> simulated.true_tvec_m.shape  # photographs, markers, and x, y, z in metres
+    (3, 10, 3)
     """
     named = "twins" if isinstance(scene, Mapping) else scene
     parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene)
@@ -441,6 +463,14 @@ def fit(
     ------
     ArgumentError, PipelineError, StoreError
         As for :func:`photos`; photographs to which nothing can be fitted are told in a line.
+
+    Examples
+    --------
+    >>> found = sweep.fit(
+    ...     folder / "shots", camera=folder / "camera.json", board=folder / "board.toml",
+    ...     markers=2, check=False)
+    >>> round(found.found.scene["blur_px"], 1)
+    0.6
     """
     fitted = library.folders.fit_folder(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
@@ -490,7 +520,7 @@ def size(
     ...     "pose": {"jitter_px": 0.5}, "axes": {"side_px": [4, 40]},
     ...     "require": {"all": ["detection >= 0.5"]},
     ...     "search": {"smallest": "side_px", "max_trials": 60},
-    ... }, store=folder / "smallest.zarr", workers=1)
+    ... }, store=folder / "smallest.zarr")
     >>> found.answers[found.best].value, found.answers[found.best].next
     (40.0, 4.0)
     """
@@ -628,6 +658,18 @@ def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
     ------
     StoreError, DatasetError
         If there is no store, fewer than 2,000 solved poses, or several settings.
+
+    Examples
+    --------
+    >>> drawn = sweep.run({
+    ...     "pose": {"side_px": {"uniform": [40, 80]}, "tilt_deg": {"uniform": [0, 60]},
+    ...              "azimuth_deg": {"uniform": [0, 360]}, "jitter_px": 0.5},
+    ...     "scene": {"noise_grey": 2.0}, "axes": {"trial": 2200},
+    ... }, store=folder / "drawn.zarr")
+    >>> error_model = sweep.error_model(folder / "drawn.zarr")
+    >>> at = error_model.at(drawn.true_rvec[:3], drawn.true_tvec_m[:3])  # (3, 3) each
+    >>> at.covariance.shape, at.covariance.dims
+    ((3, 6, 6), ('pose', 'row', 'column'))
     """
     return library.detection.error_model(store)
 
@@ -671,6 +713,12 @@ def measure_tradeoff(
     ------
     ArgumentError, PipelineError, StoreError, RunError
         As for :func:`run`; also if costs cannot be measured here.
+
+    Examples
+    --------
+    >>> found = sweep.measure_tradeoff(folder / "two_sizes.zarr", limit_s=0.5)
+    >>> found.data.detection_ms.item() > 0  # milliseconds a frame
+    True
     """
     library.questions.check_trade(criterion, limit_s, budget_ms)
     figure = None if output is None else os.fspath(output)
@@ -727,6 +775,16 @@ def compare(
     ------
     ArgumentError, PipelineError, StoreError, RunError, DatasetError
         As for :func:`twins`; also for stores that are no pair.
+
+    Examples
+    --------
+    >>> again = sweep.run(folder / "two_sizes.zarr", store=folder / "again.zarr")
+    >>> found = sweep.compare(folder / "two_sizes.zarr", folder / "again.zarr")
+    >>> int(found.data.detections_compared), int(found.data.detections_differing)
+    (20, 0)
+    >>> found = sweep.compare(folder / "shots.zarr", folder / "twins.zarr")
+    >>> found.data.detection_rate.values.tolist()  # photographs, simulated
+    [1.0, 1.0]
     """
     figure = None if output is None else os.fspath(output)
     library.output_file.figure_file(figure)
@@ -781,6 +839,12 @@ def write_report(
     ------
     ArgumentError, StoreError, DatasetError
         For what cannot be required, or written.
+
+    Examples
+    --------
+    >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
+    >>> found.numbers["figures"], (folder / "report.html").exists()
+    (5, True)
     """
     return library.questions.report(
         os.fspath(store), None if output is None else os.fspath(output), require=require, per=per,

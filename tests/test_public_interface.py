@@ -2,6 +2,8 @@
 
 import ast
 import doctest
+import inspect
+import re
 import shutil
 import subprocess
 import sys
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import sweep
+from support.board_photographs import POSES, write_set
 from support.here import calls_here
 from sweep import library
 from sweep.errors import ArgumentError, PipelineError, SweepError
@@ -51,14 +54,36 @@ def test_every_public_name_exists_and_is_listed():
         sweep.runs  # noqa: B018
 
 
+FUNCTIONS = {name: function for name in dir(sweep)
+             if inspect.isfunction(function := getattr(sweep, name))}
+
+FIRST = ("run", "photos", "twins")
+"""Functions whose examples make the stores that examples of others read."""
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_public_function_says_what_it_takes_returns_and_raises(name):
+    described = inspect.getdoc(FUNCTIONS[name])
+    for heading in ("Parameters", "Returns", "Raises", "Examples"):
+        assert f"\n{heading}\n{'-' * len(heading)}\n" in described
+    parameters = described.partition("Parameters\n---")[2].partition("Returns\n---")[0]
+    named = re.findall(r"^(\w+(?:, \w+)*)$", parameters, re.MULTILINE)
+    assert sorted(", ".join(named).split(", ")) == sorted(
+        inspect.signature(FUNCTIONS[name]).parameters)
+
+
 @pytest.mark.usefixtures("no_child")
-def test_examples_of_the_docstrings_run(tmp_path):
+def test_the_example_of_every_public_function_runs(tmp_path):
+    """All in one folder: below half a minute."""
+    write_set(tmp_path, POSES[:3])
     runner = doctest.DocTestRunner()
     finder = doctest.DocTestFinder(recurse=False)
-    for function in (sweep.run, sweep.open, sweep.require):
-        (test,) = finder.find(function, globs={"sweep": sweep, "folder": tmp_path})
+    for name in (*FIRST, *(name for name in FUNCTIONS if name not in FIRST)):
+        function = FUNCTIONS[name]
+        inside = vars(sys.modules[function.__module__])
+        (test,) = finder.find(function, globs=inside | {"sweep": sweep, "folder": tmp_path})
         assert test.examples
-        assert runner.run(test).failed == 0
+        assert runner.run(test).failed == 0, name
 
 
 @pytest.mark.long

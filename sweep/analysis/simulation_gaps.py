@@ -438,7 +438,7 @@ def simulation_gap(
     for name, attributes in _attributes().items():
         values = np.stack([gap[name] for gap in gaps], axis=-1)  # (..., configurations, bins)
         own = ("source", *dims) if values.ndim == 3 else dims
-        variables[name] = (own, values.reshape(*values.shape[:-2], *shape), attributes)
+        variables[name] = (own, values.reshape((*values.shape[:-2], *shape)), attributes)
     coordinates = {
         **pair.coordinates, **pair.binning.coordinates(pair.binned), "source": list(SOURCES),
     }

@@ -239,7 +239,8 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
     turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
     errors = np.concatenate(
         [position / np.linalg.norm(estimate, axis=1)[:, None], rotation], axis=1)
-    ratio = np.where(np.isfinite(other) & (other > 0), chosen / other, 0.0)
+    known = np.isfinite(other) & (other > 0)  # a solver may return one solution alone
+    ratio = np.divide(chosen, other, out=np.zeros(len(other)), where=known)
     return errors, turned, estimate, ratio, flipped == Flipped.flipped
 
 

@@ -461,6 +461,37 @@ REFERENCE: dict[str, Any] = {
 """A line that marks a reference, such as a bound."""
 
 
+NAME_PT = 8
+"""Size of the names beside points; a letter is about 0.6 of it wide."""
+
+
+def _told(line: Series) -> str:
+    """Return what the legend says: of points with names, whether they are "on the front"."""
+    if line.texts and line.label.endswith((" yes", " no")):
+        words, _, answer = line.label.rpartition(" ")
+        return words if answer == "yes" else f"not {words}"
+    return line.label
+
+
+def _name_points(axes: Axes, named: Sequence[tuple[float, float, str]]) -> None:
+    """Write names beside points, below or above, as near as other names leave room."""
+    written: list[tuple[float, float, float]] = []  # left end, right end, base line in points
+    scale = 72 / axes.figure.dpi
+    floor = axes.transAxes.transform((0, 0))[1] * scale
+    for x, y, text in named:
+        left, base = axes.transData.transform((x, y)) * scale + (5, 0)
+        right = left + 0.6 * NAME_PT * len(text)
+        offset = next(
+            (each for each in (-11, 4, -22, 15, -33, 26)
+             # The layout, which comes later, takes some of the height for legend and labels.
+             if base + each > floor and all(
+                 right < start or end < left or abs(base + each - line) > 1.6 * NAME_PT
+                 for start, end, line in written)), 4)
+        written.append((left, right, base + offset))
+        axes.annotate(text, (x, y), (5, offset), textcoords="offset points", fontsize=NAME_PT,
+                      color=INK)
+
+
 def draw_lines(
     axes: Axes, series: Sequence[Series], labels: tuple[str, str], *, share: bool = False,
     level: float | None = None,
@@ -488,6 +519,7 @@ def draw_lines(
     axes.set_ylim(bottom, top)
     plain_ticks(axes.yaxis, logarithmic=logarithmic_y, share=share)
     many = max((len(line.y) for line in series), default=0) > MANY_POINTS
+    named: list[tuple[float, float, str]] = []
     for k, line in enumerate(series):
         colour, shape = COLOURS[k % len(COLOURS)], SHAPES[k % len(SHAPES)]
         finite, front = np.isfinite(line.y), line.label.endswith(" yes")
@@ -496,7 +528,7 @@ def draw_lines(
         shift = 0.0 if many or line.texts else DODGE * (k - (len(series) - 1) / 2)
         dodged = offset_copy(axes.transData, axes.get_figure(root=True), shift, 0, "points")
         axes.plot(
-            line.x, y, transform=dodged, color=colour, marker=shape, label=line.label, zorder=3,
+            line.x, y, transform=dodged, color=colour, marker=shape, label=_told(line), zorder=3,
             linestyle=DASHES[k % len(DASHES)] if front or not line.texts else "",
             markersize=3.2 if many else 5, markeredgecolor=PAPER, markeredgewidth=0.4,
             drawstyle="steps-post" if line.texts else "default")
@@ -513,21 +545,20 @@ def draw_lines(
             line.x[beyond], np.full(beyond.sum(), top), linestyle="", marker=shape, color=colour,
             transform=dodged, clip_on=False,
             markerfacecolor=PAPER, markersize=3 if many else 5, zorder=4)
-        for j, text in enumerate(line.texts if front or len(line.texts) <= MAX_NAMED else ()):
-            axes.annotate(text, (line.x[j], y[j] if finite[j] else top),
-                          (5, 4 if j % 2 else -11), textcoords="offset points", fontsize=8,
-                          color=INK)
+        if front or len(line.texts) <= MAX_NAMED:
+            named += zip(line.x, np.where(finite, y, top), line.texts, strict=False)
     if level is not None:
         axes.axhline(level, **REFERENCE)
     plain_ticks(axes.xaxis, logarithmic=logarithmic_x)
     values = np.unique(x)
     if 0 < values.size <= MAX_OWN_TICKS and not any(line.texts for line in series):
         axes.set_xticks(values, coordinates(values.tolist()))
+    _name_points(axes, named)
     axes.grid(visible=True)
     axes.set(xlabel=labels[0], ylabel=labels[1])
     _finish(axes, any(np.isfinite(line.y).any() for line in series))
     if len(series) > 1:
-        names = [line.label for line in series]
+        names = [_told(line) for line in series]
         columns = max(1, min(len(names), LINE_WIDTH_CHARS // (max(map(len, names)) + 6)))
         axes.legend(
             loc="lower left", bbox_to_anchor=(-0.02, 1.02), ncols=columns, borderaxespad=0,

@@ -214,7 +214,7 @@ def limit_figure(limits: xr.Dataset) -> Figure:
     never = limits["reach"] == Reach.never
     drawn = limits[["value", "low", "high"]].where(~never)
     drawn = drawn.rename({"low": "value_low", "high": "value_high"}).assign_coords(limits.coords)
-    column = Column(axis_label(limits, along), "value")
+    column = Column(f"limit of {axis_label(limits, along)}", "value")
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
     return Figure(
         "limit", title, "", table_of(drawn.drop_vars(along), title, ordered, [column], limits),

@@ -112,7 +112,7 @@ def measured(rows: Observations) -> tuple[Integers, Integers, Floats]:
 def predict(rows: Observations, causes: Sequence[Cause], correction: Correction) -> Predicted:
     """Return what the tape should read by each way (c,) of undoing causes."""
     points = np.einsum("cij,nj->cni", correction.matrix, rows.said)
-    side = np.clip(rows.side_px, *SIDE_LIMITS_PX)[:, None]
+    side = np.clip(rows.side_px * correction.square[:, None], *SIDE_LIMITS_PX)[..., None]
     bias, bias_sd, noise, lateral = rows.expected
     points = points * (1.0 - bias / side)
     sight = points / np.linalg.norm(points, axis=-1, keepdims=True)
@@ -140,7 +140,7 @@ def predict(rows: Observations, causes: Sequence[Cause], correction: Correction)
     along = (onto * sight[:, row]).sum(axis=-1)
     tape = np.where(component == 3, rows.tape_sd[row], rows.position_sd[row])
     variance = tape**2 + distance**2 * (
-        (along * noise / side[row, 0]) ** 2 + (1.0 - along**2) * (lateral / focal) ** 2)
+        (along * noise / side[:, row, 0]) ** 2 + (1.0 - along**2) * (lateral / focal) ** 2)
     return Predicted(mean, seen, variance)
 
 

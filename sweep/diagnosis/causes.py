@@ -65,6 +65,8 @@ class Correction(NamedTuple):
         The middles (c, causes): how many times too large what was said is.
     labels
         Name of each way, empty for a number that may be anything.
+    square
+        How many times larger the square is in the image than f size / z of what was said (c,).
     """
 
     log_weight: Floats
@@ -72,6 +74,7 @@ class Correction(NamedTuple):
     spread: Floats
     ratio: Floats
     labels: tuple[str, ...]
+    square: Floats
 
     def times(self, other: Correction) -> Correction:
         """Return all combinations of the ways of two causes."""
@@ -81,12 +84,13 @@ class Correction(NamedTuple):
             np.concatenate([self.spread[a], other.spread[b]], axis=1),
             np.concatenate([self.ratio[a], other.ratio[b]], axis=1),
             tuple(f"{self.labels[i]}; {other.labels[j]}".strip("; ")
-                  for i, j in zip(a, b, strict=True)))
+                  for i, j in zip(a, b, strict=True)),
+            self.square[a] * other.square[b])
 
     def one(self, way: int) -> Correction:
         """Return one of the ways."""
         return Correction(self.log_weight[[way]], self.matrix[[way]], self.spread[[way]],
-                          self.ratio[[way]], (self.labels[way],))
+                          self.ratio[[way]], (self.labels[way],), self.square[[way]])
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,8 @@ class Cause:
 def unscaled(weight: ArrayLike, matrix: Floats, labels: Sequence[str]) -> Correction:
     """Return ways without a ratio."""
     nothing = np.zeros((len(labels), 1))
-    return Correction(np.log(weight), matrix, nothing, nothing + 1.0, tuple(labels))
+    return Correction(np.log(weight), matrix, nothing, nothing + 1.0, tuple(labels),
+                      np.ones(len(labels)))
 
 
 def _as_it_is(_: Observations) -> Correction:
@@ -160,7 +165,8 @@ def ratios(
     labels = (*named.values(), *[""] * (len(weight) - len(named)))
     some = weight > 0
     return Correction(np.log(weight[some]), matrix[some], spread[some, None],
-                      np.exp(log_ratio)[some, None], labels[: int(some.sum())])
+                      np.exp(log_ratio)[some, None], labels[: int(some.sum())],
+                      np.ones(int(some.sum())))
 
 
 def size_ratios(dictionary: str) -> dict[float, str]:
@@ -195,12 +201,16 @@ def _size_ways(rows: Observations) -> Correction:
 
 
 def _unit_ways(_: Observations) -> Correction:
-    named = {ratio**sign: f"{'longer' if sign > 0 else 'shorter'} by {ratio:.4g}"
-             for ratio in UNITS for sign in (1, -1)}
+    # A size in other units makes tvec as long as it is itself, and f size / z stays the side in the
+    # image; a tvec in other units does not.
+    ratio = np.tile([unit**sign for unit in UNITS for sign in (1, -1)], 2)
+    of_tvec = np.arange(len(ratio)) >= len(ratio) // 2
+    labels = tuple(
+        f"{'tvec' if tvec else 'size_m'} {'longer' if each > 1 else 'shorter'} by "
+        f"{max(each, 1 / each):.4g}" for each, tvec in zip(ratio, of_tvec, strict=True))
     return Correction(
-        np.full(len(named), -np.log(len(named))),
-        np.eye(3) / np.array(list(named))[:, None, None], np.full((len(named), 1), NAMED_SD),
-        np.array(list(named))[:, None], tuple(named.values()))
+        np.full(len(ratio), -np.log(len(ratio))), np.eye(3) / ratio[:, None, None],
+        np.full((len(ratio), 1), NAMED_SD), ratio[:, None], labels, np.where(of_tvec, ratio, 1.0))
 
 
 def _focal_ways(_: Observations) -> Correction:
@@ -295,7 +305,6 @@ def _yaws(rows: Observations) -> str:
 AGREE = "agree"
 FLIPS = "flips"
 STRAIGHT = "z_for_range"
-UNITS_MISTAKEN = "units"
 CAUSES = (
     Cause(AGREE, "the numbers agree with what is expected", 4.0, _as_it_is, _no_columns, _always,
           "nothing to test"),
@@ -306,7 +315,7 @@ CAUSES = (
           _focal_ways, _depth_columns, _always,
           "photograph a ruler at a known distance: f is its pixels times distance / length; "
           "compare the file's image size with the image's"),
-    Cause(UNITS_MISTAKEN, "units taken for one another (m, cm, mm, inch, foot)", 1.0, _unit_ways,
+    Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0, _unit_ways,
           _scale_columns, _always, "print size and tvec with their units"),
     Cause(STRAIGHT, "z taken for the straight distance", 1.5, _as_it_is, _no_columns,
           _straight, "compare the tape with sqrt(x² + y² + z²)"),

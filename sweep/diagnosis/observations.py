@@ -56,6 +56,9 @@ UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
 """Side of the square where neither camera nor size are known."""
 
+LENGTHS_M = (1e-5, 1e7)
+"""Lengths between which positions and tapes can be, in whatever unit."""
+
 READABLE_PX = 4.0
 """Sides below this cannot be read: the numbers are in other units than the size."""
 
@@ -189,6 +192,10 @@ def read_observations(
     for name in POSITIVE:
         if (values[name] <= 0).any():
             raise ArgumentError("observations", "", f"{name}: expected numbers above 0")
+    lengths = np.nan_to_num(np.concatenate([said, position, values["tape_m"][:, None]], axis=1))
+    if not ((np.abs(lengths) < LENGTHS_M[1]).all() and (said[:, 2] > LENGTHS_M[0]).all()):
+        raise ArgumentError("observations", "", "positions and tapes: expected metres between "
+                            f"{LENGTHS_M[0]:g} and {LENGTHS_M[1]:g}")
     if not np.isfinite([values["tape_sd_m"], values["position_sd_m"]]).any():
         notes.append("no uncertainty of the tape is given: 2 mm or 0.5 % are assumed")
 
@@ -251,6 +258,9 @@ def _read_csv(path: str) -> dict[str, list[str]]:
     rows = [[cell.strip() for cell in row] for row in rows if any(row)]
     if not rows:
         raise ArgumentError("observations", plain(path), "is empty: expected a header and rows")
+    if twice := {name for name in rows[0] if rows[0].count(name) > 1}:
+        raise ArgumentError("observations", plain(path), f"column {plain(min(twice))} is there "
+                            "twice")
     for number, row in enumerate(rows[1:], 1):
         if len(row) != len(rows[0]):
             raise ArgumentError("observations", plain(path), f"row {number} has {len(row)} cells, "
@@ -278,6 +288,10 @@ def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) ->
         Floats, Floats]:
     """Return positions and rotation vectors (n, 3) of corners, TL, TR, BR, BL, by guarded IPPE."""
     corners = np.stack([values[name] for name in CORNERS], axis=-1).reshape(-1, 4, 2)
+    frame = (camera.width_px, camera.height_px)
+    if all(frame) and (corners > np.array(frame, dtype=np.float64)).any():
+        raise ArgumentError("observations", "", "corners lie beyond the camera file's image of "
+                            f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
     cameras = cameras_of(lens_of(camera), len(corners))
     rotation, position = both_planar_solutions(corners, cameras, np.full(len(corners), size_m))
     solved = np.isfinite(position[:, 0]).all(axis=-1)

@@ -77,6 +77,7 @@ def test_next_measurement_is_where_predictions_differ():
     ({"rang_m": [1.0], "tape_m": [1.0]}, "range_m"),
     ({"range_m": [1.0], "tape_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m"),
     ({"range_m": [1.0], "tape_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
+    ({"range_m": [1e300], "tape_m": [1.0]}, "expected metres between"),
     ({}, "no rows"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
@@ -123,3 +124,17 @@ def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):
     assert main([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["causes"][0]["causes"] == ["size"]
     assert main(["diagnose", str(path), "--set", "sise_m=1"]) == 2
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("range_m,range_m,tape_m\n1,2,1\n")
+    with pytest.raises(sweep.ArgumentError, match="range_m is there twice"):
+        sweep.diagnose(path)
+
+
+def test_corners_beyond_the_cameras_image_are_refused():
+    corners = {f"corner{k}_{axis}_px": [1500.0 + 100 * (k in at)]
+               for axis, at in (("x", (1, 2)), ("y", (2, 3))) for k in range(4)}
+    with pytest.raises(sweep.ArgumentError, match="1280 x 720"):
+        sweep.diagnose({**corners, "tape_m": [1.0]}, camera=CAMERA, size_m=0.1)

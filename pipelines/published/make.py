@@ -1,6 +1,6 @@
 """Run the register's pipelines again and write its tables.
 
-python pipelines/published/make.py [--quick] [--predict] [NAME ...]
+python pipelines/published/make.py [--table] [--quick] [NAME ...]
 """
 
 import argparse
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from scipy.stats import binomtest
 
 import sweep
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -22,7 +23,7 @@ RESAMPLES = 100
 
 
 def solved(part, name):
-    """The values of the solved poses, all other dimensions stacked."""
+    """Return the values of the solved poses, all other dimensions stacked."""
     values = part[name].where(part.estimate == EstimateStatus.solved)
     inner = [each for each in ("xyz", "corner", "xy") if each in values.dims]
     outer = [each for each in values.dims if each not in inner]
@@ -125,11 +126,40 @@ def interval(results, entry):
     return float(found[:, 0].min()), float(np.median(found[:, 1])), float(found[:, 2].max())
 
 
+def verdict(entry):
+    predicted, measured = entry["prediction"], entry["measured"]
+    inside = (predicted["low"] - measured["reading_error"] <= measured["value"]
+              <= predicted["high"] + measured["reading_error"])
+    return "hit" if inside else "miss"
+
+
+def table():
+    """Return the register's table, from its files alone."""
+    lines = ["| study | of | quantity | predicted | measured | verdict |", "|" + " --- |" * 6]
+    hits = []
+    for name, entry in entries().items():
+        predicted, measured = entry["prediction"], entry["measured"]
+        hits.append(verdict(entry) == "hit")
+        why = f": {measured['explanation']}" if "explanation" in measured else ""
+        unit = "" if entry["unit"] == "1" else f" {entry['unit']}"
+        lines.append(
+            f"| [{name}](register/{name}.toml) | {entry['kind']} | {entry['title']} | "
+            f"{predicted['low']:.3g} to {predicted['high']:.3g}{unit} | {measured['value']:g} ± "
+            f"{measured['reading_error']:g} | {verdict(entry)}{why} |")
+    exact = binomtest(sum(hits), len(hits)).proportion_ci(method="exact")
+    return "\n".join([*lines, "", f"{sum(hits)} hits of {len(hits)}: {sum(hits) / len(hits):.0%} "
+                      f"(95 % interval {exact.low:.0%} to {exact.high:.0%})."])
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--quick", action="store_true", help="at most 8 trials")
+    parser.add_argument("--table", action="store_true", help="only print the table of the files")
     options = parser.parse_args()
+    print(table(), flush=True)
+    if options.table:
+        return
     for name, entry in entries().items():
         if not options.names or name in options.names:
             again = interval(results_of(entry["pipeline"], options.quick), entry)

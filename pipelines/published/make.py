@@ -147,8 +147,8 @@ def table():
             f"{predicted['low']:.3g} to {predicted['high']:.3g}{unit} | {measured['value']:g} ± "
             f"{measured['reading_error']:g} | {verdict(entry)}{why} |")
     exact = binomtest(sum(hits), len(hits)).proportion_ci(method="exact")
-    return "\n".join([*lines, "", f"{sum(hits)} hits of {len(hits)}: {sum(hits) / len(hits):.0%} "
-                      f"(95 % interval {exact.low:.0%} to {exact.high:.0%})."])
+    share = f"{sum(hits)} hits of {len(hits)}: {sum(hits) / len(hits):.0%}"
+    return "\n".join([*lines, "", f"{share} (95 % interval {exact.low:.0%} to {exact.high:.0%})."])
 
 
 def main():

@@ -1,5 +1,6 @@
 """Published figures as pipelines: they can be read, and one of them comes out as its page says."""
 
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -55,3 +56,12 @@ def test_the_errors_in_fmac_s_box_are_those_of_the_page(tmp_path):
     # Ten standard deviations of a standard deviation of 3,200 heavy-tailed numbers are about 20 %.
     np.testing.assert_allclose(errors.std(axis=0), [4.6, 3.4, 12.8], rtol=0.2)
     assert 14 < errors[:, 2].mean() < 22
+
+
+def test_the_page_has_the_register_s_table():
+    make = runpy.run_path(str(FOLDER / "make.py"))
+    assert make["table"]() in (FOLDER / "README.md").read_text()
+    assert len(make["entries"]()) >= 10
+    for entry in make["entries"]().values():
+        assert {"source", "read", "given", "assumed", "prediction", "measured"} <= entry.keys()
+        assert make["verdict"](entry) == "hit" or entry["measured"]["explanation"]

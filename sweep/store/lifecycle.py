@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import json
+import math
 import os
 import shutil
 import time
@@ -397,6 +398,23 @@ def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
         raise StoreError(not_a_store(url)) from None
 
 
+POSES_TOGETHER = 1 << 20
+"""Poses of a Dask chunk: a task for each block would take longer than reading the block."""
+
+
+def _together(store: RunStore) -> dict[str, int]:
+    """Return the lengths of Dask chunks along the axes, each chunk of whole blocks side by side."""
+    experiment = store.pipeline.experiment
+    settings = math.prod(len(axis) for axis in store.pipeline.axes) // max(
+        math.prod(store.blocks.lengths), 1)
+    extents = list(store.blocks.extents)
+    for k in reversed(range(len(extents))):
+        times = max(POSES_TOGETHER // max(settings * math.prod(extents), 1), 1)
+        extents[k] = min(extents[k] * times, store.blocks.lengths[k])
+    return {axis.name: extent
+            for axis, extent in zip(experiment.scene_axes, extents, strict=True)}
+
+
 def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset:
     """Open a store's results, lazily; also those of an unfinished one.
 
@@ -425,7 +443,8 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
             if dataset.nbytes <= read_bytes:
                 dataset = dataset.load()
             else:
-                dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
+                dataset = xr.open_zarr(
+                    storage, chunks=_together(store), consolidated=False, zarr_format=3)
             # Short, and asked for one by one.
             together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
             dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})

@@ -140,12 +140,11 @@ def table():
     for name, entry in entries().items():
         predicted, measured = entry["prediction"], entry["measured"]
         hits.append(verdict(entry) == "hit")
-        why = f": {measured['explanation']}" if "explanation" in measured else ""
         unit = "" if entry["unit"] == "1" else f" {entry['unit']}"
         lines.append(
             f"| [{name}](register/{name}.toml) | {entry['kind']} | {entry['title']} | "
             f"{predicted['low']:.3g} to {predicted['high']:.3g}{unit} | {measured['value']:g} ± "
-            f"{measured['reading_error']:g} | {verdict(entry)}{why} |")
+            f"{measured['reading_error']:g} | {verdict(entry)} |")
     exact = binomtest(sum(hits), len(hits)).proportion_ci(method="exact")
     share = f"{sum(hits)} hits of {len(hits)}: {sum(hits) / len(hits):.0%}"
     return "\n".join([*lines, "", f"{share} (95 % interval {exact.low:.0%} to {exact.high:.0%})."])

@@ -89,7 +89,7 @@ class ImageSearch:
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
         """Return what is found in an image of scene ``row``."""
-        dictionary, target = self.scenes.dictionary[row], self.targets.targets[row]
+        dictionary, target = self.scenes.targets[row].dictionary, self.targets.targets[row]
         if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
             return self._last[2]  # another marker of a photograph
         found = self.find(image, dictionary, int(self.scenes.frame[row].max()))

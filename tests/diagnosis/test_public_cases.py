@@ -16,8 +16,7 @@ def test_public_cases_are_ranked_as_their_threads_found_out():
     assert sum([found] in causes[:2] for found, causes in known) >= 0.9 * len(known)
 
 
-def test_the_guide_has_the_table_that_the_script_prints():
+def test_the_guide_has_the_rows_whose_threads_found_the_cause():
     guide = (FOLDER / "README.md").read_text()
-    assert sum(word != "|" for word in guide.split()) <= 1200
     for case, found in CASES["cases"]():
-        assert CASES["row"](case, found) in guide
+        assert (CASES["row"](case, found) in guide) == bool(case["found"])

@@ -43,9 +43,10 @@ def pipeline_of(text, **options):
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.[pt]*")), ids=lambda path: path.name)
-def test_the_guide_shows_it(path):
-    assert f"<!-- file: {path.name} -->\n" in GUIDE
-    assert path.read_text() + "```\n" in GUIDE
+def test_the_guide_links_it_and_shows_what_it_holds(path):
+    assert f"]({path.name})" in GUIDE
+    if f"<!-- file: {path.name} -->\n" in GUIDE:
+        assert path.read_text() + "```\n" in GUIDE
 
 
 def test_the_pipeline_runs_with_all_four():

@@ -122,8 +122,9 @@ def interval(results, entry):
                 random.integers(part.sizes["trial"], size=part.sizes["trial"]), dims="trial")))
             for _ in range(RESAMPLES)]
         found.append(np.nanquantile(resampled, [0.025, 0.5, 0.975]))
-    found = np.array(found)
-    return float(found[:, 0].min()), float(np.median(found[:, 1])), float(found[:, 2].max())
+    intervals = np.array(found)
+    return (float(intervals[:, 0].min()), float(np.median(intervals[:, 1])),
+            float(intervals[:, 2].max()))
 
 
 def verdict(entry):

@@ -180,18 +180,6 @@ def test_blocks_are_of_languages_that_are_held():
     assert {block.language for block in BLOCKS} <= {"sh", "python", "toml", "text", "markdown"}
 
 
-def test_list_of_commands_names_each_command_and_flag(capsys):
-    usage, = (block.text for block in BLOCKS
-              if block.language == "text" and block.text.startswith("sweep run"))
-    for line in usage.splitlines():
-        flags = re.findall(r"--[a-z-]+", line)
-        flags_exist([line.split()[1], *flags], capsys)
-    with pytest.raises(SystemExit, match="0"):
-        main(["--help"])
-    commands = {line.split()[1] for line in usage.splitlines()}
-    assert commands <= set(re.findall(r"[a-z]+", capsys.readouterr().out))
-
-
 def cells(row):
     return len(re.split(r"(?<!\\)\|", row.strip().strip("|")))
 

@@ -179,8 +179,7 @@ def plan(options: argparse.Namespace) -> int:
                 "title": pipeline.title,
                 "camera": pipeline.facts.camera,
                 "notes": [
-                    *pipeline.facts.camera_notes,
-                    *pipeline.facts.pose_notes,
+                    *pipeline.facts.notes,
                     *bound,
                 ],
                 "views": views.ranges(),
@@ -202,9 +201,7 @@ def plan(options: argparse.Namespace) -> int:
     for line in pipeline.facts.camera_notes:
         say(f"  {line}")
     say(f"\nPoses\n  {views.line()}")
-    for line in pipeline.facts.pose_notes:
-        say(f"  {line}")
-    for line in bound:
+    for line in (*pipeline.facts.pose_notes, *pipeline.facts.detector_notes, *bound):
         say(f"  {line}")
     say("\nDimensions")
     width = max((len(axis.name) for axis in pipeline.axes), default=0)

@@ -169,6 +169,14 @@ def _centre_notes(facts: CameraFacts) -> list[str]:
                 f"{name} = {_text(ends)}: far from the centre of the frame of {frame}; is it that "
                 "of another frame size?"
             )
+    halves = facts.width_px[0] / 2, facts.height_px[0] / 2
+    if (facts.cx_px, facts.cy_px) == tuple((half, half) for half in halves):
+        lines.append(
+            f"cx_px = {halves[0]:g}, cy_px = {halves[1]:g}: half the frame; with pixel (0, 0) at "
+            f"the pixel's centre, as here, the middle is {halves[0] - 0.5:g}, "
+            f"{halves[1] - 0.5:g}: subtract 0.5 if the program that gave them has its corner there "
+            "(pipelines/half_pixel/README.md)"
+        )
     return lines
 
 
@@ -516,10 +524,22 @@ class Facts:
         """The lines that `sweep plan` and the start of a run print."""
         if PHOTOGRAPHS in self.grid.given:
             return []
-        return [
-            *self.camera_notes, *self.pose_notes,
-            *self._corner_square_notes(),
-        ]
+        return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
+
+    @cached_property
+    def detector_notes(self) -> list[str]:
+        """A line for each property of the detections that may surprise."""
+        return [*self._corner_square_notes(), *self._offset_notes()]
+
+    def _offset_notes(self) -> list[str]:
+        """Return how far corners are beside the camera's convention: OpenCV's own apriltag ones."""
+        if "apriltag" not in self.grid.values_of("cornerRefinementMethod"):
+            return []
+        return [(
+            "cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of and "
+            "below those of its other refinements, and of its calibrations: half a pixel in "
+            "position and direction (pipelines/half_pixel/README.md)"
+        )]
 
     def _corner_square_notes(self) -> list[str]:
         """Return what to set where OpenCV's default threshold loses markers beside squares."""

@@ -1,9 +1,10 @@
-"""How often is a marker found where there is none, by dictionary and `errorCorrectionRate`?
+"""Rates of false markers, by dictionary and `errorCorrectionRate`.
 
 Images without markers: blurred noise; rectangles in random places and greys; squares with a black
 border and random bits, the worst that a scene can show, for which the rate is known in closed form;
 scikit-image's samples where it is installed; and photographs of a folder, whose own board is
-painted over. A candidate is a quadrilateral whose bits were read, accepted or not; of random bits each square.
+painted over. A candidate is a
+quadrilateral whose bits were read, accepted or not; of random bits each square.
 
 Usage: rates.py [IMAGES] [FOLDER=DICTIONARY ...]
 """
@@ -74,7 +75,7 @@ def photographs(folder, board):
 def samples():
     """Return scikit-image's own pictures; none where it is not installed."""
     try:
-        from skimage import data
+        from skimage import data  # noqa: PLC0415  (not everywhere installed)
     except ModuleNotFoundError:
         return []
     names = ("astronaut", "brick", "camera", "coffee", "coins", "grass", "gravel", "page", "text")

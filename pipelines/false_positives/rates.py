@@ -3,8 +3,8 @@
 Images without markers: blurred noise; rectangles in random places and greys; squares with a black
 border and random bits, the worst that a scene can show, for which the rate is known in closed form;
 scikit-image's samples where it is installed; and photographs of a folder, whose own board is
-painted over. A candidate is a
-quadrilateral whose bits were read, accepted or not; of random bits each square.
+painted over. A candidate is a quadrilateral whose bits were read, accepted or not; of random bits
+each square.
 
 Usage: rates.py [IMAGES] [FOLDER=DICTIONARY ...]
 """

@@ -29,6 +29,13 @@ CORNERS = tuple(f"corner{k}_{axis}_px" for k in range(4) for axis in "xy")
 COLUMNS = {*SAID, *TAPE, *CORNERS}
 """Columns of a file of observations; further ones are refused, empty cells are unknown."""
 
+WHOLE = (SAID[:2], SAID[4:], CORNERS)
+"""Columns of which a row has all or none."""
+
+NEEDED = {"tape_sd_m": ("tape_m",), "position_sd_m": ("x_m", "y_m", "z_m"),
+          "yaw_sd_deg": ("yaw_deg",), "yaw_deg": ("rvec_x", CORNERS[0])}
+"""Column -> columns of which a row needs one beside it."""
+
 POSITIVE = ("tape_m", "tape_sd_m", "position_sd_m", "yaw_sd_deg")
 """Columns whose numbers are above 0."""
 
@@ -166,6 +173,7 @@ def read_observations(
         os.fspath(camera))
     values = {name: _numbers(name, columns[name], count) if name in columns
               else np.full(count, np.nan) for name in COLUMNS}
+    _check_complete(values)
     said, rvec = (np.stack([values[name] for name in SAID[k : k + 3]], axis=-1) for k in (0, 4))
     notes: list[str] = []
     if np.isfinite(values[CORNERS[0]]).all() and not np.isfinite(said[:, 2]).all():
@@ -221,6 +229,22 @@ def read_observations(
             f"row {row + 1}: {said[row, 2]:g} m for a square of {size_m:g} m is a side of "
             f"{rows.side_px[row]:.2g} px, which no detector reads: units of tvec or size_m differ")
     return Observations(**{**vars(rows), "notes": tuple(notes)})
+
+
+def _check_complete(values: Mapping[str, Floats]) -> None:
+    """Raise ArgumentError where a row has a part of a vector, or a number without its companion."""
+    for names in WHOLE:
+        given = np.isfinite([values[name] for name in names])
+        for row in np.flatnonzero(given.any(axis=0) & ~given.all(axis=0)):
+            missing = next(name for name, there in zip(names, given[:, row], strict=True)
+                           if not there)
+            raise ArgumentError("observations", "", f"row {row + 1}: {missing} is missing: give "
+                                f"all of {names[0]} ... {names[-1]}, or none")
+    for name, others in NEEDED.items():
+        alone = np.isfinite(values[name]) & ~np.isfinite([values[o] for o in others]).any(axis=0)
+        if alone.any():
+            raise ArgumentError("observations", "", f"row {int(np.argmax(alone)) + 1}: {name} "
+                                f"needs {' or '.join(others)} beside it")
 
 
 SETTINGS: dict[str, type] = {

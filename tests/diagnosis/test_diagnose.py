@@ -71,6 +71,11 @@ def test_next_measurement_is_where_predictions_differ():
 
 
 @pytest.mark.parametrize(("columns", "words"), [
+    ({"tvec_z_m": [1], "tape_m": [1], "rvec_x": [0.1]}, "rvec_y is missing"),
+    ({"tvec_z_m": [1], "tape_m": [1], "tvec_x_m": [0.1]}, "tvec_y_m is missing"),
+    ({"tvec_z_m": [1], "tape_m": [1], "corner2_x_px": [9]}, "corner0_x_px is missing"),
+    ({"tvec_z_m": [1], "tape_m": [1], "position_sd_m": [0.1]}, "needs x_m or y_m or z_m"),
+    ({"tvec_z_m": [1], "tape_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
     ({"range_m": [1.0, 2.0], "tape_m": [1.0, ""]}, "row 2: expected tape_m"),

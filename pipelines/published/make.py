@@ -137,6 +137,7 @@ def verdict(entry):
 def table():
     """Return the register's table, from its files alone."""
     lines = ["| study | of | quantity | predicted | measured | verdict |", "|" + " --- |" * 6]
+    explained = []
     hits = []
     for name, entry in entries().items():
         predicted, measured = entry["prediction"], entry["measured"]
@@ -146,9 +147,14 @@ def table():
             f"| [{name}](register/{name}.toml) | {entry['kind']} | {entry['title']} | "
             f"{predicted['low']:.3g} to {predicted['high']:.3g}{unit} | {measured['value']:g} ± "
             f"{measured['reading_error']:g} | {verdict(entry)} |")
+        if run := entry.get("explained"):
+            explained.append(f"- {name}: with {run['by']} the same pipeline gives {run['low']:.3g} "
+                             f"to {run['high']:.3g}{unit}.")
     exact = binomtest(sum(hits), len(hits)).proportion_ci(method="exact")
     share = f"{sum(hits)} hits of {len(hits)}: {sum(hits) / len(hits):.0%}"
-    return "\n".join([*lines, "", f"{share} (95 % interval {exact.low:.0%} to {exact.high:.0%})."])
+    return "\n".join([
+        *lines, "", f"{share} (95 % interval {exact.low:.0%} to {exact.high:.0%}).", "",
+        "Misses that a second run explains:", "", *explained])
 
 
 def main():
@@ -165,6 +171,10 @@ def main():
             again = interval(results_of(entry["pipeline"], options.quick), entry)
             print(f"{name}: {again[0]:.4g} to {again[2]:.4g} {entry['unit']}, "
                   f"middle {again[1]:.4g}", flush=True)
+            if run := entry.get("explained"):
+                low, _, high = interval(
+                    results_of(entry["pipeline"], options.quick, **run["changes"]), entry)
+                print(f"{name}, {run['by']}: {low:.4g} to {high:.4g} {entry['unit']}", flush=True)
 
 
 if __name__ == "__main__":

@@ -283,7 +283,7 @@ def paired_table(
     """Return the table of `compare` of some kinds of error.
 
     Beside it there is the first's mean absolute error of the poses that both solved, and whether
-    any cell has two draws, ``drawn``. ``level`` is that of the intervals of errors.
+    any cell has two draws, ``drawn``. ``level`` is that of all intervals.
     """
     stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
     if stopped:
@@ -311,7 +311,7 @@ def paired_table(
         *(statistic for quantity in quantities for statistic in _differences(quantity, level)),
     ]
     table = aggregate(first, inputs, kept, statistics, Pair, bins, stopped=stopped)
-    return table.assign(_tested(table, stopped_level(LEVEL) if stopped else LEVEL))
+    return table.assign(_tested(table, stopped_level(level) if stopped else level))
 
 
 def _of_common_trials(
@@ -364,14 +364,14 @@ def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
         Mean(quantity.named("first"), f"first mean absolute {words}", quantity.units,
              lambda pair: np.sqrt(both_squares(pair)[..., :1]), solved),
         RootMeanSquareRatio(f"{quantity.name}_rmse_ratio", f"second RMS {words} over the first",
-                            "1", both_squares, solved),
+                            "1", both_squares, solved, level),
     ]
     if quantity is not ROTATION:
         return differences
     return [*differences, RootMeanSquareRatio(
         f"{quantity.name}_rmse_unflipped_ratio",
         f"second RMS {words} over the first, flipped in neither", "1", both_squares,
-        lambda pair: pair.first.unflipped & pair.second.unflipped)]
+        lambda pair: pair.first.unflipped & pair.second.unflipped, level)]
 
 
 def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:

@@ -11,6 +11,9 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import compare
+from sweep.analysis.comparisons import paired_table
+from sweep.analysis.intervals import LEVEL
+from sweep.analysis.poses import QUANTITIES
 from sweep.report.report_data import (
     CONFIGURATION,
     Configurations,
@@ -67,6 +70,10 @@ RANGE = Quantity("range RMSE ratio", "range_rmse_ratio")
 PAIRED = ("detection difference, points", "solved difference, points", "rotation RMSE ratio",
           "range RMSE ratio")
 """Headings of the paired quantities."""
+
+DECIDING_LEVEL = 1.0 - (1.0 - LEVEL) / len(PAIRED)
+"""Level of the intervals that decide: two equal configurations are told apart by any of the four
+quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are shown."""
 
 VERDICTS = {1: "better", 0: "not decided", -1: "worse"}
 
@@ -243,20 +250,36 @@ def _against_each(
     grouping, at = known.settings.grouping, known.settings.combinations[best]
     chosen = {name: list(some) for name, some in grouping.chosen}
     reference = with_configuration(data.results, at).isel(chosen)
-    table = data.once(("against", tuple(at.items()), grouping), lambda: compare(
+    tables = data.once(("against", tuple(at.items()), grouping), lambda: paired(
         data.results.isel(chosen), reference, grouping.dims))
-    _, rows = by_configuration(data.pipeline, table, grouping.dims)
-    return [() if k == best else _differences(rows.isel({CONFIGURATION: k}))
+    shown, deciding = (
+        by_configuration(data.pipeline, each, grouping.dims)[1] for each in tables)
+    return [() if k == best else _differences(*(
+        each.isel({CONFIGURATION: k}) for each in (shown, deciding)))
             for k in range(len(known.names))]
 
 
-def _differences(row: xr.Dataset) -> tuple[Difference, ...]:
-    flipped = int(row["only_first_flipped"]) + int(row["only_second_flipped"])
+def paired(
+    first: xr.Dataset, second: xr.Dataset, kept: Sequence[str] = ()
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return the table of `sweep.analysis.compare`, and that with the intervals that decide."""
+    return compare(first, second, kept), paired_table(
+        first, second, kept, None, QUANTITIES[:2], DECIDING_LEVEL)
+
+
+def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, ...]:
+    """Return how the second of two configurations differs from the first."""
+    return _differences(*paired(first, second))
+
+
+def _differences(shown: xr.Dataset, deciding: xr.Dataset) -> tuple[Difference, ...]:
+    flipped = int(shown["only_first_flipped"]) + int(shown["only_second_flipped"])
     rotation = UNFLIPPED if 0 < flipped < MIN_FLIPPED else ROTATION
     out = []
     for each in (DETECTION, SOLVED, rotation, RANGE):
-        (numbers,) = Column("", each.variable, each.scale).cells(row)
-        above, below = numbers.low > each.equal, numbers.high < each.equal
+        numbers, ends = (
+            Column("", each.variable, each.scale).cells(row)[0] for row in (shown, deciding))
+        above, below = ends.low > each.equal, ends.high < each.equal
         verdict = int(above) - int(below) if each.large_is_good else int(below) - int(above)
         out.append(Difference(
             each.words, numbers.value, numbers.low, numbers.high, each.unit, verdict))

@@ -1,0 +1,41 @@
+"""Two equal configurations are told apart in at most one comparison of twenty."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from support.pose_errors import poses_with_law, power_law
+from sweep.measure.flags import EstimateStatus
+from sweep.report.comparison import differences_of, overall
+
+DRAWS = {
+    "normal": None,
+    "Student's t, 4": lambda rng, size: rng.standard_t(4, size),
+    "lognormal": lambda rng, size: rng.choice([-1.0, 1.0], size) * rng.lognormal(0, 0.8, size),
+}
+AXES = {"distance_m": [1.0], "tilt_deg": [10.0, 40.0], "solver": ["ippe", "sqpnp"]}
+
+
+def told_apart(seed, trials, normal):
+    """Return the verdict on two solvers with the same law of errors, and one failure in twenty."""
+    results = poses_with_law(seed, {**AXES, "trial": range(trials)}, power_law, normal=normal)
+    failed = np.random.default_rng(seed).random(results.estimate.shape) < 0.05
+    results["estimate"] = results.estimate.where(~failed, EstimateStatus.solver_failed)
+    first, second = (results.sel(solver=name) for name in AXES["solver"])
+    return overall(differences_of(first, second))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("trials", [30, 100, 400])
+@pytest.mark.parametrize("law", DRAWS)
+def test_two_equal_configurations_are_seldom_told_apart(law, trials):
+    """2,000 simulations; a sound rule is refused with a probability below 1e-6."""
+    count = 2000
+    told = sum(told_apart(seed, trials, DRAWS[law]) != 0 for seed in range(count))
+    print(f"{law}, 2 x {trials} draws: told apart in {told / count:.2%} of {count}")
+    assert told <= binom.ppf(1 - 1e-6, count, 0.05)
+
+
+def test_a_difference_that_four_quantities_may_show_by_chance_is_not_decided():
+    """Of 60 pairs of equal ones at most 14 are told apart: chance alone exceeds that in 3e-7."""
+    assert sum(told_apart(seed, 50, None) != 0 for seed in range(60)) <= 14

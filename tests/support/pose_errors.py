@@ -1,5 +1,6 @@
 """Datasets of poses whose errors follow a known law of distance, side and viewing angle."""
 
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +25,12 @@ azimuth_deg = {{ uniform = [0, 360] }}
 """
 FX, SIZE_M = 900.0, 0.165
 
-GUIDE = Path(__file__).parents[2] / "sweep" / "analysis" / "README.md"
-MARK = "<!-- reader of error models -->\n```python\n"
+READER = Path(__file__).parents[2] / "pipelines" / "pose_errors.py"
 
 
 def reader_of_the_guide():
-    """Return the function that the guide reads error models by."""
-    code = GUIDE.read_text().partition(MARK)[2].partition("```")[0]
-    namespace = {}
-    exec(code, namespace)  # noqa: S102
-    return namespace["pose_errors"]
+    """Return the function without packages that users copy to read error models."""
+    return runpy.run_path(READER)["pose_errors"]
 
 
 def minimal_turn(direction):

@@ -136,7 +136,7 @@ def verdict(entry):
 
 def table():
     """Return the register's table, from its files alone."""
-    lines = ["| study | of | quantity | predicted | measured | verdict |", "|" + " --- |" * 6]
+    lines = ["| study | quantity | predicted | measured | verdict |", "|" + " --- |" * 5]
     explained = []
     hits = []
     for name, entry in entries().items():
@@ -144,7 +144,7 @@ def table():
         hits.append(verdict(entry) == "hit")
         unit = "" if entry["unit"] == "1" else f" {entry['unit']}"
         lines.append(
-            f"| [{name}](register/{name}.toml) | {entry['kind']} | {entry['title']} | "
+            f"| [{name}](register/{name}.toml) | {entry['title']} | "
             f"{predicted['low']:.3g} to {predicted['high']:.3g}{unit} | {measured['value']:g} ± "
             f"{measured['reading_error']:g} | {verdict(entry)} |")
         if run := entry.get("explained"):

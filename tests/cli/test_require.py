@@ -56,7 +56,7 @@ def test_what_the_pipeline_requires_is_decided(require):
     first, second = (line.split() for line in out.splitlines() if line.startswith("not met"))
     assert " ".join(first).startswith(
         "not met detection_rate >= 0.8 solver=ippe_square 0.167 (0.0829")
-    assert " ".join(first).endswith("side_px=11 1 of 2")
+    assert " ".join(first).endswith("side_px=11 1 of 2 60")
     assert "solver=iterative" in second
     assert out.splitlines()[-1] == "next: sweep report two.zarr"
 
@@ -121,7 +121,7 @@ def test_a_store_is_not_worse_than_itself(require):
 
 @pytest.mark.long
 def test_a_worse_store_is_not_met(folder, require):
-    noisy = Pipeline.from_text(TEXT, ["noise_grey=12"])
+    noisy = Pipeline.from_text(TEXT, ["noise_grey=8", "blur_px=1.5"])
     close(by_hand(str(folder / "noisy.zarr"), noisy))
     code, out, _ = require("noisy.zarr", "rotation_rmse_unflipped_deg <= 90", "--per", "",
                            "--at", "side_px=40", "--against", "two.zarr")

@@ -403,7 +403,8 @@ def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     assert json.loads(state.stdout)["blocks_done"] == len(committed(store))
     before = len(committed(store))
     ran = command("run", path, "--store", url, "--json")
-    assert (ran.returncode, ran.stderr) == (0, "")
+    complaints = [line for line in ran.stderr.splitlines() if "poses/s" not in line]
+    assert (ran.returncode, complaints) == (0, []), "progress is told on slow machines"
     told = json.loads(ran.stdout)
     assert told["computed_blocks"] == len(store.blocks) - before
     assert told["crashed"] == 0

@@ -156,9 +156,10 @@ def summary_line(limits: xr.Dataset) -> str:
     decided = are_decided(limits)
     open_limits, count = int((~decided).sum()), decided.size
     easy, hard = ("small", "large") if limits.attrs["harder"] == "upwards" else ("large", "small")
-    return (f"{open_limits:,} limits of {count:,} are not decided to one value of the grid (more "
-            f"--max-trials decide more); read from {easy} to {hard} values of "
-            f"{limits.attrs['along']}")
+    decision = (
+        f"{open_limits:,} limits of {count:,} are not decided to one value of the grid (more "
+        "--max-trials decide more)") if open_limits else "all limits are decided"
+    return f"{decision}; read from {easy} to {hard} values of {limits.attrs['along']}"
 
 
 def limit_findings(limits: xr.Dataset) -> Findings:

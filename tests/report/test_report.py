@@ -277,13 +277,13 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
 # Trade, Markdown, files.
 
 def small_trade():
-    names = ["none \u00b7 ippe_square", "subpix \u00b7 ippe_square"]
+    names = ["ippe", "iterative"]
     shape = ("side_px", "treatment")
     values = np.array([[0.2, 0.3], [0.4, 0.6]])
     columns = {"cost_ms": values, "rotation_p95_deg": 1 / values, "rotation_median_deg": values,
                "solved_rate": values, "detection_rate": values}
     return xr.Dataset({name: (shape, column) for name, column in columns.items()},
-                      {"side_px": [14.0, 40.0], "treatment": np.array(names, dtype=object)})
+                      {"side_px": [20.0, 40.0], "treatment": np.array(names, dtype=object)})
 
 
 @pytest.mark.long

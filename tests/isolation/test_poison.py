@@ -348,7 +348,8 @@ def test_poison_among_ten_thousand_scenes_costs_itself_alone(poisons, thousands,
     ran, seconds, log = run_poisoned(
         tmp_path, THOUSANDS, poisons, "--workers", 2, "--json", *limit, timeout=900
     )
-    assert (ran.returncode, ran.stderr) == (0, "")
+    complaints = [line for line in ran.stderr.splitlines() if "poses/s" not in line]
+    assert (ran.returncode, complaints) == (0, []), "progress is told on slow machines"
     assert differing(url, reference, pipeline, poisons) == {}
     told = json.loads(ran.stdout)
     assert {flag: told[flag] for flag in ("crashed", "failed")} == numbers(

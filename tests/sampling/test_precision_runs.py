@@ -94,7 +94,7 @@ def test_repair_computes_the_needed_scenes_of_damaged_blocks(at_once, tmp_path):
 def test_fixed_trials_and_waves_reuse_each_other(first, second, tmp_path):
     pipelines = {
         "fixed": Pipeline.from_text(
-            (TEXT % 0.1).split("precision")[0].replace(
+            (TEXT % 0.1).split("search")[0].replace(
                 "side_px = [8, 13, 30]", "side_px = [8, 13, 30], trial = 150"), name="fixed"),
         "waves": precise(WIDTHS[-1]),
     }

@@ -381,7 +381,7 @@ def _print_cell(again: Reproduction) -> None:
     say(f"--at {again.at}")
     for line in again.changes:
         say(f"changed since the store was created: {line}")
-    say("\n".join(library.scenes.value_lines(again.variables, again.recomputed, again.stored)))
+    say(library.scenes.value_table(again.variables, again.recomputed, again.stored).text())
     if again.inspection is not None:
         left, top, right, bottom = again.inspection.window
         ids = ", ".join(str(marker_id) for marker_id, _ in again.inspection.decoded) or "none"

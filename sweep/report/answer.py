@@ -27,6 +27,7 @@ from sweep.report.error_model_file import error_model_tables
 from sweep.report.figures import (
     board_tables,
     errors_table,
+    interval_note,
     precision_tables,
     sentences,
     signed_errors_table,
@@ -275,7 +276,8 @@ def _notes(data: ReportData, known: Configurations) -> str:
     return warnings + sentences(
         "A board counts as detected if at least one of its markers is."
         if data.pipeline.experiment.shows_boards else "",
-        *known.settings.grouping.notes, data.pooled(*known.settings.axes))
+        interval_note(data), *known.settings.grouping.notes,
+        data.pooled(*known.settings.axes))
 
 
 def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:

@@ -24,9 +24,7 @@ from sweep.analysis import (
 from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.binning import Bins
 from sweep.analysis.dataset import of_photographs
-from sweep.analysis.poses import SIGNED
 from sweep.analysis.precision import Reached
-from sweep.analysis.quantiles import IntervalOf
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
 from sweep.experiment.experiment import target_word
@@ -119,30 +117,12 @@ def sentences(*parts: str) -> str:
     return " ".join(part for part in parts if part)
 
 
-def denominators(summary: xr.Dataset, name: str = "looked_for") -> str:
-    """Return a sentence with the denominators: ``Each value is of 40 to 200 poses ...``."""
-    what = {"looked_for": "poses looked for", "solved": "solved poses"}[name]
-    counts = summary[name].values[summary[name].values > 0]
-    if not counts.size:
-        return f"No {what}."
-    low, high = int(counts.min()), int(counts.max())
-    span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
-    return f"Each value is of {span} {what}."
-
-
-def interval_sentence(data: ReportData, summary: xr.Dataset) -> str:
-    """Return a sentence that says what intervals are over, or why there are none."""
-    photographs = of_photographs(data.results)
-    ends = [each for name, each in summary.items() if str(name).endswith(("_low", "_high"))]
-    if any(bool(np.isfinite(end).any()) for end in ends):
-        return "Intervals have 95 % and are over the " + (
-            "photographs, each with all its markers one draw." if photographs
-            else "random draws, conditional on the grid.")
-    few = "median_interval" in summary and bool(
-        (summary["median_interval"] == IntervalOf.too_few_draws).any())
-    return "No intervals: " + (
-        "too few photographs." if photographs else "too few draws." if few
-        else "nothing was drawn at random.")
+def interval_note(data: ReportData) -> str:
+    """Return a sentence that says what intervals are over."""
+    return "Intervals have 95 % and are over the " + (
+        "photographs, each with all its markers one draw; without, photographs are too few."
+        if of_photographs(data.results)
+        else "random draws, conditional on the grid; numbers without one have too few draws.")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -191,7 +171,7 @@ class Grouped:
         curves: Sequence[Column], *, counted: str = "looked_for", by: str = "",
         covers: Sequence[str] = (), marked: str = "",
     ) -> Figure:
-        """Return a figure; its caption also says what holds of all: intervals, counts, pooling."""
+        """Return a figure; its caption also says what is pooled, and what is not drawn."""
         dims, count = self.dims, self.summary.sizes[CONFIGURATION]
         if not by and (self.several or len(dims) > 1):
             by = CONFIGURATION if self.several else self.data.label(dims[0])
@@ -200,8 +180,7 @@ class Grouped:
         names = self.summary[CONFIGURATION].values
         return Figure(
             name, title, sentences(
-                text, interval_sentence(self.data, self.summary),
-                denominators(self.summary, counted) if counted in self.summary else "",
+                text,
                 f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
                 "over the whole grid; the table has all." if cut else "",
                 *self.notes, self.data.pooled(*dims, *self.settings.axes)),
@@ -415,7 +394,7 @@ def _ranking(data: ReportData) -> Figure | None:
             f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. "
             f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
             "rate expected if all were alike, with an adjusted p-value under 0.05.",
-            interval_sentence(data, summary), denominators(summary), data.pooled(*dims)),
+            data.pooled(*dims)),
         table, [DETECTED], shown=names[:WEAKEST], marked="weak", covers=(IDS,))
 
 
@@ -611,16 +590,9 @@ def board_tables(data: ReportData) -> list[Table]:
 
 
 def signed_errors_table(data: ReportData) -> Table:
-    """Return bias and spread in the camera's frame, with rows for each configuration."""
-    found = grouped(data, signed_error_statistics)
-    rows = [
-        [f"{quantity.words}, {quantity.unit}", str(name), *values]
-        for quantity in (each for group in SIGNED_GROUPS[1:] for each in SIGNED[group])
-        for name, *values in zip(found.summary[CONFIGURATION].values, *(
-            Column("", quantity.named(name)).cells(found.summary) for name in ("bias", "sd")),
-            strict=True)]
-    return Table.of("Bias and spread of the solved poses without flips, with 95 % intervals",
-                    ["error", CONFIGURATION, "bias", "standard deviation"], rows, stub=2)
+    """Return bias and spread in the camera's frame, with a row for each configuration."""
+    return grouped(data, signed_error_statistics).table(
+        "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved")
 
 
 def errors_table(errors: xr.Dataset, name: str) -> Table:

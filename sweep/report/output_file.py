@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import stat
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,13 +43,11 @@ def check_output_file(path: Path) -> None:
     Raises
     ------
     StoreError
-        If it is a folder, a disk, or a pipe that no process reads, or if it cannot be written.
+        If it is a folder, or if it cannot be written.
     """
     with write_errors_explained(path):
         if _is_replaced(path):
             check_folder_writable(_target(path).parent)
-        else:
-            os.close(_opened(path))
 
 
 def write_output_file(path: Path, content: bytes) -> None:
@@ -62,20 +59,26 @@ def write_output_file(path: Path, content: bytes) -> None:
         As :func:`check_output_file`, or if the disk is full.
     """
     with write_errors_explained(path):
-        if not _is_replaced(path):
-            with os.fdopen(_opened(path), "wb") as file:
-                file.write(content)
+        if _is_replaced(path):
+            write_whole(_target(path), content)
             return
-        write_whole(_target(path), content)
+        descriptor = _standard_stream(path)
+        with open(path if descriptor is None else os.dup(descriptor), "wb") as file:  # noqa: PTH123
+            file.write(content)
 
 
 def is_standard_stream(path: Path) -> bool:
     """Return whether a path is where this process prints, such as ``/dev/stdout``."""
-    try:
-        status = path.stat()
-    except (OSError, ValueError):
-        return False
-    return any(os.path.samestat(status, opened) for _, opened in _streams())
+    return _standard_stream(path) is not None
+
+
+def _standard_stream(path: Path) -> int | None:
+    """Return the descriptor of standard output or error if a path names it."""
+    for file in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                return file.fileno()
+    return None
 
 
 @contextlib.contextmanager
@@ -88,37 +91,14 @@ def write_errors_explained(path: Path) -> Iterator[None]:
 
 
 def _is_replaced(path: Path) -> bool:
-    """Return whether a path is, or will be, a file of its own; StoreError if it is no file."""
+    """Return whether a path is, or will be, a file of its own; StoreError if it is a folder."""
     try:
-        mode = path.stat().st_mode
+        path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return True
-    if stat.S_ISDIR(mode):
+    if path.is_dir():
         raise StoreError(f"{path}: cannot be written: it is a folder; choose a file in it")
-    if stat.S_ISBLK(mode):
-        raise StoreError(f"{path}: cannot be written: it is a disk; choose a file")
-    return stat.S_ISREG(mode) and not is_standard_stream(path)
-
-
-def _opened(path: Path) -> int:
-    """Return a descriptor that writes into a device, a pipe, or where this process prints.
-
-    A pipe that no process reads is an error rather than an endless wait.
-    """
-    status = path.stat()
-    for stream, opened in _streams():
-        if os.path.samestat(status, opened):
-            return os.dup(stream)
-    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
-    os.set_blocking(descriptor, True)
-    return descriptor
-
-
-def _streams() -> Iterator[tuple[int, os.stat_result]]:
-    """Yield the descriptors of standard output and error that are open, with their status."""
-    for file in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, OSError, ValueError):
-            yield file.fileno(), os.fstat(file.fileno())
+    return path.is_file() and not is_standard_stream(path)
 
 
 def _target(path: Path) -> Path:

@@ -25,7 +25,7 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
-from sweep.experiment.axes import TRIAL, Axis, Distribution
+from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.parameters import WORLD, Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
@@ -48,10 +48,8 @@ IDS = "marker_id"
 CONFIGURATION = "configuration"
 """Dimension of tables that have a row for each configuration."""
 
-AREA_BINS = 24
-
 DRAWN_BINS = 10
-"""Bins of a drawn parameter."""
+"""Bins of the area, and of a drawn parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,33 +85,12 @@ class Grouping:
         )
 
 
-def area_bins(low: float, high: float, count: int) -> Grouping:
-    """Return the grouping by bins of the area, of equal ratio, between two areas in px²."""
-    areas = np.geomspace(low, high, count + 1)
-    areas[[0, -1]] = low, np.nextafter(high, np.inf)
-    return Grouping(
-        bins=((AREA, tuple(areas.tolist())),),
-        notes=(f"Areas are grouped into {count} bins of equal ratio.",),
-    )
-
-
-def drawn_bins(name: str, distribution: Distribution) -> Grouping:
-    """Return the grouping of a drawn parameter by bins of equal probability."""
-    edges = distribution.at(np.arange(1, DRAWN_BINS) / DRAWN_BINS)
-    ends = (-np.inf, np.inf)
-    if distribution.kind == "uniform":
-        ends = (distribution.a, float(np.nextafter(distribution.b, np.inf)))
-    note = f"The draws of {name} are grouped into {DRAWN_BINS} bins of equal probability."
-    return Grouping(bins=((name, (ends[0], *edges.tolist(), ends[1])),), notes=(note,))
-
-
 def bins_of(name: str, values: Floats, most: int) -> Grouping:
-    """Return the grouping of an axis' values (n,) into ``most`` bins of about as many each."""
-    groups = np.array_split(np.sort(values), most)
-    between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(groups)]
-    edges = (float(groups[0][0]), *between, float(np.nextafter(groups[-1][-1], np.inf)))
-    note = f"The {len(values):,} values of {name} are grouped into {len(edges) - 1} bins."
-    return Grouping(bins=((name, edges),), notes=(note,))
+    """Return the grouping of values (n,) into ``most`` bins of about as many each, none empty."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
+    edges[-1] = np.nextafter(edges[-1], np.inf)
+    note = f"Values of {name} are grouped into {len(edges) - 1} bins of about as many each."
+    return Grouping(bins=((name, tuple(edges.tolist())),), notes=(note,))
 
 
 def chosen_of(name: str, length: int, most: int) -> Grouping:
@@ -148,6 +125,9 @@ def by_configuration(
 MAX_READ_BYTES = 600_000_000
 """Results up to this size are read at once: many figures need the same values, and many small
 chunks are slow to read."""
+
+MAX_AREAS = 1_000_000
+"""Areas by which bins are made."""
 
 AREA_RATIO = 2.0
 """Areas vary if the largest exceeds the smallest by this factor."""
@@ -221,28 +201,27 @@ class ReportData:
         return [name for name in (self.size_axis, self.angle_axis) if name]
 
     @functools.cached_property
-    def area_range(self) -> tuple[float, float]:
-        """The smallest and the largest area, px², of the poses looked for; NaN if there is none."""
+    def areas(self) -> Floats:
+        """Areas, px², of the poses looked for (n,), or of a part of very many."""
         first = {axis.name: 0 for axis in self.pipeline.axes_of(Stage.detection)}
-        detection = self.results["detection"].isel(first)
-        area = self.results[AREA]
-        area = area.where(~detection.isin(uncounted_values(DetectionStatus)) & (area > 0))
+        detection, area = (self.results[name].isel(first, missing_dims="ignore")
+                           for name in ("detection", AREA))
         with store_errors(self.store):
-            ends = xr.Dataset({"low": area.min(), "high": area.max()}).compute()
-        return float(ends["low"]), float(ends["high"])
+            counted = ~detection.isin(uncounted_values(DetectionStatus)) & (area > 0)
+            values = np.ravel(area.where(counted)).astype(np.float64)
+        known: Floats = values[np.isfinite(values)]
+        return known[:: max(1, known.size // MAX_AREAS)]
 
     @property
     def areas_vary(self) -> bool:
         """Whether areas differ for other reasons than an axis of sizes or angles."""
         expected = {*SIZE_AXES, *ANGLES}
-        reasons = {*VIEW_PARAMETERS, *expected, *WORLD, "yaw_deg", "pitch_deg", "size_m"}
-        drawn = bool(reasons & self.pipeline.distributions.keys())
-        axes = {axis.name for axis in self.pipeline.axes if len(axis) > 1}
-        together = {name for axis in self.pipeline.axes for name, _ in axis.zipped}
-        if not drawn and not axes & (reasons - expected) and not together & reasons:
+        reasons = {*VIEW_PARAMETERS, *WORLD, *expected, "yaw_deg", "pitch_deg", "size_m"}
+        varied = {axis.name for axis in self.pipeline.axes if len(axis) > 1} - expected
+        varied |= {name for axis in self.pipeline.axes for name, _ in axis.zipped}
+        if not (varied | self.pipeline.distributions.keys()) & reasons or not self.areas.size:
             return False
-        low, high = self.area_range
-        return high > AREA_RATIO * low
+        return bool(self.areas.max() > AREA_RATIO * self.areas.min())
 
     @property
     def size(self) -> str | None:
@@ -300,9 +279,9 @@ class ReportData:
             If the axis does not exist.
         """
         if name == AREA:
-            return area_bins(*self.area_range, min(most, AREA_BINS))
+            return bins_of(name, self.areas, DRAWN_BINS)
         if name in self.drawn_parameters:
-            return drawn_bins(name, self.pipeline.distributions[name])
+            return bins_of(name, np.ravel(self.results[name]).astype(np.float64), DRAWN_BINS)
         axis = self.pipeline.axis(name)
         if axis is None:
             raise KeyError(name)

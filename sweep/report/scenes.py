@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 import shlex
+import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure as Canvas
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sweep.errors import SweepError
@@ -24,7 +28,7 @@ from sweep.experiment.schema import VARIABLES, Variable
 from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.report.report_data import AREA, ReportData, store_errors
-from sweep.report.table import coordinate, number, plural
+from sweep.report.table import Table, coordinate, number, plural
 
 # --------------------------------------------------------------------------------------------------
 # One scene as a picture, with the truth and the detections drawn on it.
@@ -40,7 +44,6 @@ CHESSBOARD: Colour = (178, 114, 0)
 AXES: tuple[Colour, Colour, Colour] = ((0, 0, 230), (0, 170, 0), (230, 80, 0))
 PAPER: Colour = (255, 255, 255)
 INK: Colour = (40, 40, 40)
-FAINT: Colour = (110, 110, 110)
 
 LEGEND: tuple[tuple[str, Colour], ...] = (
     ("true outline", TRUTH), ("detected corners (dot: the first)", DETECTED),
@@ -53,9 +56,6 @@ CHESSBOARD_LEGEND = ("corners of the chessboard", CHESSBOARD)
 
 MAX_SIDE = 900
 MIN_SIDE = 560
-LINE_HEIGHT = 26
-CAPTION_SIDE = 1200
-"""Pixels of a picture's width from which on its caption grows with it."""
 
 SHIFT = 4
 """Fractional bits of the drawn coordinates."""
@@ -70,6 +70,12 @@ SMALL = 0.08
 
 INSET = 0.36
 """Share of a picture's smaller side that this takes."""
+
+CAPTION_DPI = 100
+"""Dots an inch of the caption, which grows with pictures wider than `CAPTION_PX`."""
+
+CAPTION_PX, CAPTION_CHARS, CAPTION_COLUMNS = 1000, 90, 4
+"""Pixels, characters, and entries of the legend across a caption."""
 
 
 def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
@@ -86,7 +92,15 @@ def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
         First line of the caption: the pose on its grid. Then come what was drawn at random, flags
         and errors, and the legend.
     """
-    return _captioned(_with_inset(draw_outlines(scene), scene), scene, title)
+    picture = _with_inset(draw_outlines(scene), scene)
+    texts = [title, _drawn_text(scene), result_text(scene)]
+    caption = _caption("\n".join(filter(None, texts)), _legend(scene),
+                       max(picture.shape[1], MIN_SIDE))
+    width = max(picture.shape[1], caption.shape[1])
+    return np.vstack([
+        cv2.copyMakeBorder(
+            part, 0, 0, spare := (width - part.shape[1]) // 2, width - part.shape[1] - spare,
+            cv2.BORDER_CONSTANT, value=PAPER) for part in (picture, caption)])
 
 
 def cut_to_marker(scene: SceneInspection) -> SceneInspection:
@@ -122,29 +136,17 @@ def _with_inset(canvas: NDArray[np.uint8], scene: SceneInspection) -> NDArray[np
     inset = draw_outlines(cut, INSET * min(height, width))
     line = max(2, round(max(height, width) / 600))
     frame = scale * (np.array([x0, y0, x1, y1]) - np.tile(scene.window[:2], 2))
-    centre = (frame[:2] + frame[2:]) / 2
-    room = 3 * line
-    size = np.array(inset.shape[1::-1])
-    corner = np.where(centre < np.array([width, height]) / 2,
-                      np.array([width, height]) - size - room, room)
-    to = np.append(corner, corner + size)
-    for colour, thickness in ((INK, 3 * line), (PAPER, line)):
-        cv2.line(canvas, centre.astype(int).tolist(), (corner + size // 2).tolist(), colour,
-                 thickness, cv2.LINE_AA)
-    x, y = frame[:2].astype(int)
-    u, v = frame[2:].astype(int)
-    canvas[y:v, x:u] = draw_outlines(cut, scale=scale)
-    canvas[to[1] : to[3], to[0] : to[2]] = inset
-    for box in (frame + np.array([-1, -1, 1, 1]) * 2 * line, to):
+    size, room = np.array(inset.shape[1::-1]), np.array([width, height])
+    corner = np.where((frame[:2] + frame[2:]) < room, room - size - 3 * line, 3 * line)
+    x, y = corner
+    canvas[y : y + size[1], x : x + size[0]] = inset
+    for box in (frame + np.array([-1, -1, 1, 1]) * 2 * line, np.append(corner, corner + size)):
         for colour, thickness in ((INK, 3 * line), (PAPER, line)):
-            low, high = box.astype(int)[:2].tolist(), box.astype(int)[2:].tolist()
-            cv2.rectangle(canvas, low, high, colour, thickness)
+            cv2.rectangle(canvas, box[:2].tolist(), box[2:].tolist(), colour, thickness)
     return canvas
 
 
-def draw_outlines(
-    scene: SceneInspection, side: float = MAX_SIDE, *, scale: int | None = None
-) -> NDArray[np.uint8]:
+def draw_outlines(scene: SceneInspection, side: float = MAX_SIDE) -> NDArray[np.uint8]:
     """Return a scene enlarged to about a side, (H, W, 3), without a caption.
 
     Parameters
@@ -153,10 +155,8 @@ def draw_outlines(
         Image, truth and detections.
     side
         Pixels that the larger side has at most, unless the image has more.
-    scale
-        By which factor the image is enlarged; None follows from ``side``.
     """
-    scale = scale or _scale(scene, side)
+    scale = _scale(scene, side)
     enlarged = cv2.resize(
         scene.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
     )
@@ -210,8 +210,8 @@ def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
     ]
 
 
-def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) -> NDArray[np.uint8]:
-    """Return the picture with title, draws, result and legend below it."""
+def _legend(scene: SceneInspection) -> list[tuple[str, Colour]]:
+    """Return the entries of the legend that a scene needs."""
     legend = [LEGEND[0]]
     if np.isfinite(scene.markers).all(axis=(1, 2)).any():
         legend.append(LEGEND[1])
@@ -223,75 +223,25 @@ def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) ->
         legend.append((f"rejected candidates: {len(scene.rejected)}", REJECTED))
     if np.isfinite(scene.axes_px).all():
         legend += LEGEND[-3:]
-    width = max(canvas.shape[1], MIN_SIDE)
-    size = max(1.0, width / CAPTION_SIDE)
-    room = width / size - 32
-    texts = [(line, colour) for text, colour in (
-        (title, INK), (_drawn_text(scene), FAINT), (_ascii(result_text(scene)), INK),
-    ) for line in _wrapped(text, room, size)]
-    rows = [[legend[0]]]
-    for entry in legend[1:]:
-        if sum(_entry_width(text, size) for text, _ in (*rows[-1], entry)) > room:
-            rows.append([])
-        rows[-1].append(entry)
-    caption_height = round(size * (LINE_HEIGHT * (len(texts) + len(rows)) + 20))
-    page = np.full((canvas.shape[0] + caption_height, width, 3), PAPER, dtype=np.uint8)
-    left = (width - canvas.shape[1]) // 2
-    page[: canvas.shape[0], left : left + canvas.shape[1]] = canvas
-    y = canvas.shape[0] + size * LINE_HEIGHT
-    for text, colour in texts:
-        _text(page, text, 16 * size, y, colour, size)
-        y += size * LINE_HEIGHT
-    for row in rows:
-        x = 16.0
-        for text, colour in row:
-            box = [round(size * x), round(y - 12 * size)], [round(size * (x + 14)), round(y + size)]
-            cv2.rectangle(page, *box, colour, cv2.FILLED)
-            cv2.rectangle(page, *box, FAINT, 1)
-            _text(page, text, size * (x + 21), y, FAINT, size)
-            x += _entry_width(text, size)
-        y += size * LINE_HEIGHT
-    return page
+    return legend
 
 
-FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.52
-
-
-def _text(
-    page: NDArray[np.uint8], text: str, x: float, y: float, colour: Colour, size: float
-) -> None:
-    cv2.putText(page, text, (round(x), round(y)), FONT, size * FONT_SCALE, colour,
-                max(1, round(size)), cv2.LINE_AA)
-
-
-def _text_width(text: str, size: float) -> float:
-    """Return the width of a text, in units of ``size`` pixels."""
-    thickness = max(1, round(size))
-    return float(cv2.getTextSize(text, FONT, size * FONT_SCALE, thickness)[0][0]) / size
-
-
-def _ascii(text: str) -> str:
-    """Return text with the characters that OpenCV's font has."""
-    signs: dict[str, str | int | None] = {
-        "\u00b2": "2", "\u00b0": " deg", "\u2212": "-", "\u2013": "-", "\u221e": "inf"}
-    return text.translate(str.maketrans(signs))
-
-
-def _entry_width(text: str, size: float) -> float:
-    """Return the width of an entry of the legend, with its colour and the gap behind it."""
-    return 21 + _text_width(text, size) + 20
-
-
-def _wrapped(text: str, width: float, size: float) -> list[str]:
-    """Return a text of parts behind commas as lines that are not wider, as far as parts are."""
-    lines: list[str] = []
-    for part in text.split(", ") if text else []:
-        longer = f"{lines[-1]}, {part}" if lines else part
-        if lines and _text_width(longer, size) <= width:
-            lines[-1] = longer
-        else:
-            lines.append(part)
-    return lines
+def _caption(
+    text: str, legend: Sequence[tuple[str, Colour]], width: int
+) -> NDArray[np.uint8]:
+    """Return a legend below lines of text as a picture (h, w, 3) of about a width in px."""
+    scale = max(1.0, width / CAPTION_PX)
+    chars = round(CAPTION_CHARS * width / scale / CAPTION_PX)
+    lines = [part for line in text.split("\n") for part in textwrap.wrap(line, chars)]
+    canvas = Canvas((width / scale / CAPTION_DPI, 1), dpi=CAPTION_DPI * scale)
+    canvas.legend(
+        handles=[Patch(facecolor=css_colour(colour), label=entry) for entry, colour in legend],
+        title="\n".join(lines), alignment="left", frameon=False,
+        ncols=max(1, round(CAPTION_COLUMNS * width / scale / CAPTION_PX)))
+    encoded = io.BytesIO()
+    canvas.savefig(encoded, format="png", bbox_inches="tight", dpi=canvas.dpi)
+    return np.asarray(cv2.imdecode(np.frombuffer(encoded.getvalue(), np.uint8), cv2.IMREAD_COLOR),
+                      dtype=np.uint8)
 
 
 def _drawn_text(scene: SceneInspection) -> str:
@@ -315,37 +265,23 @@ def css_colour(colour: Colour) -> str:
 # --------------------------------------------------------------------------------------------------
 # Values of one cell as lines of text, with the stored values beside them.
 
-NAME_WIDTH, VALUE_WIDTH = 34, 44
-
-
-def value_lines(
+def value_table(
     variables: Sequence[Variable], recomputed: Mapping[str, NDArray[Any]],
     stored: Mapping[str, NDArray[Any]] | None,
-) -> list[str]:
-    """Return a line for each of the variables.
-
-    Each has the recomputed value with its unit, and the stored value if that differs.
-    """
-    lines = []
+) -> Table:
+    """Return a row for each variable: the recomputed value, and the stored one if it differs."""
+    rows = []
     for variable in variables:
         value = recomputed[variable.name]
-        text = _text_scene_values(variable, value)
-        line = f"  {variable.name:{NAME_WIDTH}} {text:{VALUE_WIDTH}} {variable.units}".rstrip()
+        text, beside = _text_scene_values(variable, value), ""
         if stored is not None and variable.name in stored:
-            line += _difference(variable, text, value, stored[variable.name])
-        lines.append(line)
-    return lines
-
-
-def _difference(
-    variable: Variable, text: str, value: NDArray[Any], stored: NDArray[Any]
-) -> str:
-    """Return a remark on the stored value; empty if it is the same."""
-    stored_text = _text_scene_values(variable, stored)
-    if stored_text != text:
-        return f"  (stored: {stored_text})"
-    same = np.array_equal(value, stored, equal_nan=variable.flags is None)
-    return "" if same else "  (stored: other last digits)"
+            other = stored[variable.name]
+            beside = _text_scene_values(variable, other)
+            if beside == text:
+                same = np.array_equal(value, other, equal_nan=variable.flags is None)
+                beside = "" if same else "other last digits"
+        rows.append([variable.name, text, variable.units, beside])
+    return Table.of("Values of the cell", ["variable", "value", "unit", "stored"], rows, words=True)
 
 
 MAX_NUMBERS = 12

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import os
+import re
 import shlex
 import time
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ from sweep.experiment.axes import Axis
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label
 from sweep.report.answer import Answer, answer
-from sweep.report.figure import Figure, css_variables, panel_svg, panels_file
+from sweep.report.figure import Figure, Panel, panels_file
 from sweep.report.figures import figures_of
 from sweep.report.output_file import (
     check_output_file,
@@ -176,10 +177,9 @@ def page(
         loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined, trim_blocks=not html, lstrip_blocks=not html)
     environment.filters |= {
-        "base64": _base64, "code": _code, "md": markdown_text, "panel_svg": panel_svg,
-        "quote": quote, "sentence_case": str.capitalize,
+        "base64": _base64, "code": _code, "md": markdown_text, "quote": quote,
+        "sentence_case": str.capitalize, "svg": _svg,
     }
-    environment.globals["css_variables"] = css_variables
     text = environment.get_template("page.html" if html else "page.jinja").render(
         policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
         scenes=scenes, require=require, base=quote(folder),
@@ -190,6 +190,11 @@ def page(
 def _base64(content: bytes | str) -> str:
     encoded = content.encode() if isinstance(content, str) else content
     return base64.b64encode(encoded).decode()
+
+
+def _svg(panel: Panel) -> bytes:
+    """Return a panel as SVG; hundredths of a point are enough."""
+    return re.sub(rb"(\.\d\d)\d+", rb"\1", panels_file([panel], ".svg"))
 
 
 def _code(text: str, language: str) -> str:

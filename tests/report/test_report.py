@@ -152,20 +152,11 @@ def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
     assert "<title>All &lt;axes&gt; &amp; &#34;kinds&#34; of $figures$</title>" in page
     assert read.images
     for tag, attributes in read.images:
-        assert attributes.get("alt" if tag == "img" else "aria-label")
+        assert tag == "img"
+        assert attributes.get("alt")
     assert read.tables
     assert None not in read.tables
     assert page.count("<h1>") == 1
-
-
-def test_drawings_take_the_colours_of_the_page(page):
-    svgs = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
-    assert len(svgs) >= 15
-    for svg in svgs:
-        assert "var(--ink)" in svg
-        assert not re.search(r"#(282828|7a7a7a|ffffff|000000|0072b2)\b", svg, re.IGNORECASE)
-    assert "prefers-color-scheme: dark" in page
-    assert "@media print" in page
 
 
 def kinds(url):
@@ -245,7 +236,7 @@ def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
         rejected = solved & ~kept
         right = 100 * (rejected & ~flipped).sum() / rejected.sum() if rejected.any() else math.nan
         assert row[6].split(" (")[0] == number(right)
-    assert "Flips kept<" in page.replace("\n", "")
+    assert 'alt="Flips kept: ' in page
     assert "Flips kept, threshold" not in page
     assert sum(int(row[2]) for row in rows[1:]) == (
         results["estimate"] == EstimateStatus.solved).sum()

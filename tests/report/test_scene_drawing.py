@@ -41,25 +41,26 @@ def test_what_is_drawn_in_place_stays_in_place(at):
     scene = inspected(at)
     picture, plain = draw_scene(scene, "title"), draw_outlines(scene)
     if at == "side_px=700":
-        assert np.array_equal(picture[:1200], plain)
+        assert np.array_equal(picture[:1200, : plain.shape[1]], plain)
     else:
         assert scene.detection.name != "detected"
         assert share_of(picture, DETECTED, (0, 0, 1600, 1200)) == 0
 
 
 def test_the_caption_names_what_was_drawn_and_fits_its_picture(monkeypatch):
-    texts = []
-    monkeypatch.setattr(scene_drawing.cv2, "putText", lambda page, text, at, font, size, *rest: (
-        texts.append((text, at[0] + scene_drawing.cv2.getTextSize(
-            text, font, size, rest[1])[0][0], page.shape[1]))))
+    said = []
+    caption = scene_drawing._caption
+    monkeypatch.setattr(scene_drawing, "_caption", lambda *given: (
+        said.append(given), caption(*given))[1])
     scene = inspected("side_px=60", whole_frame=False)
-    draw_scene(scene, ", ".join(f"axis_{k} {k}" for k in range(30)))
-    assert all(end <= width for _, end, width in texts), texts
-    words = " ".join(text for text, _, _ in texts)
+    picture = draw_scene(scene, ", ".join(f"axis_{k} {k}" for k in range(30)))
+    (text, legend, width), = said
+    assert picture.shape[1] <= 1.1 * width
+    words = f"{text} {legend}"
     assert f"drawn: azimuth_deg {float(scene.values['azimuth_deg']):.5g}" in words
-    for said in ("axis_29 29", "true outline", "detected corners (dot: the first)", "estimated x",
-                 "detected, area", "rotation error"):
-        assert said in words
+    for expected in ("axis_29 29", "true outline", "detected corners (dot: the first)",
+                     "estimated x", "detected, area", "rotation error"):
+        assert expected in words
 
 
 def test_a_cut_is_the_marker_with_its_surroundings_within_the_window():

@@ -308,8 +308,6 @@ class Pipeline(Grid):
             if similar := _similar(path):
                 reason = f"{str(reason).partition(';')[0]}{similar}"
             raise refusal([f"{source}: cannot be read: {reason}"]) from None
-        if len(encoded) > MAX_BYTES:
-            raise refusal([f"{source}: expected at most {MAX_BYTES:,} bytes"])
         try:
             text = encoded.decode()
         except UnicodeDecodeError as error:

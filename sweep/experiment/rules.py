@@ -32,14 +32,13 @@ from sweep.measure.detectors import OPENCV, DetectorSetting
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import plain, shown
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
-from sweep.model.image_file import MAX_PIXELS, image_size, read_image
+from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image
 from sweep.model.marker import (
     has_circles,
     marker_count,
     missing_package,
     opencv_dictionary_names,
 )
-from sweep.model.renderers import background_image
 from sweep.model.sensor import MAX_LEVEL, MIN_FRAME_PX
 
 # --------------------------------------------------------------------------------------------------
@@ -58,13 +57,9 @@ def check_backgrounds(reading: Reading) -> None:
             continue
         path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
         try:
-            width, height = image_size(path)
+            height, width = decode_grey(path).shape
             problem = _wrong_size(reading, value, width, height)
-            if problem is None or _wrong_size(reading, value, height, width) is None:
-                # Its EXIF tag may turn it.
-                height, width = background_image(str(Path(path).resolve())).shape
-                problem = _wrong_size(reading, value, width, height)
-                reading.files[value] = file_digest(Path(path)) or ""
+            reading.files[value] = file_digest(Path(path)) or ""
         except ValueError as error:
             reading.fault("scene.background", value, f"a level or an image file ({error})")
             continue

@@ -6,7 +6,7 @@ import codecs
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -226,33 +226,29 @@ def _check_region(named: dict[str, tuple[str, Any]]) -> None:
             )
     region = named.get("roi", ("", None))[1]
     if isinstance(region, dict):
-        for name in ("x_offset", "y_offset"):
-            if _number(name, region.get(name, 0)) != 0:
+        width, height = _size(named)
+        whole = {"x_offset": 0, "y_offset": 0, "width": width, "height": height}
+        for name, value in region.items():
+            if name in whole and _number(name, value) not in (0, whole[name]):
                 raise ValueError(
-                    f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "
-                    "frame; give the calibration of the frame as it is sent"
-                )
-        for name, whole in zip(("width", "height"), _size(named), strict=True):
-            if _number(name, region.get(name, 0)) not in (0, whole):
-                raise ValueError(
-                    f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "
-                    "frame; give the calibration of the frame as it is sent"
+                    f"roi with {name} = {plain(value)}: the matrix is that of the whole frame; "
+                    "give the calibration of the frame as it is sent"
                 )
 
 
 def _number(name: str, value: Any) -> float:
     """Return a finite number; ValueError if the value is none."""
-    number = math.nan
-    if isinstance(value, str) and "_" not in value:
-        try:
-            number = float(value)
-        except ValueError:
-            raise ValueError(f"{plain(name)}: {plain(value)} is not a number") from None
-    elif isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
+    try:
         number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
     if not abs(number) < 1e300:
         raise ValueError(f"{plain(name)}: {plain(value)} is not a finite number")
     return number
+
+
+BASE64 = "$base64$"
+"""Beginning of numbers that OpenCV writes as text that is none."""
 
 
 def _numbers(name: str, value: Any) -> tuple[list[float], tuple[int, int] | None]:
@@ -267,21 +263,15 @@ def _numbers(name: str, value: Any) -> tuple[list[float], tuple[int, int] | None
             shape = int(rows), int(columns)
         single = value.get("dt") == "f"
         value = value["data"]
-    if isinstance(value, str) and value.startswith("$base64$"):
-        raise ValueError(f"{plain(name)}: base64; write the file with numbers")
     if isinstance(value, str):
+        if value.startswith(BASE64):
+            raise ValueError(f"{plain(name)}: base64; write the file with numbers")
         value = value.split()
-    if value is None:
-        value = []
     if not isinstance(value, list):
-        value = [value]
+        value = [] if value is None else [value]
     if value and all(isinstance(row, list) for row in value):
-        if len({len(row) for row in value}) != 1:
-            raise ValueError(f"{plain(name)}: rows of unequal lengths")
         shape = len(value), len(value[0])
         value = [number for row in value for number in row]
-    if len(value) > 1000:
-        raise ValueError(f"{plain(name)}: {len(value):,} numbers are too many")
     numbers = [_number(name, each) for each in value]
     if shape is not None and shape[0] * shape[1] != len(numbers):
         raise ValueError(
@@ -377,24 +367,13 @@ def _covariance(name: str, value: Any, count: int) -> tuple[float, ...]:
 
 
 # --------------------------------------------------------------------------------------------------
-# YAML, JSON and OpenCV's XML read within bounds: any bytes give a tree or a reason, and soon.
+# The tree of a file in YAML, JSON or OpenCV's XML: dictionaries, lists and scalars.
 #
-# A tree has dictionaries, lists and scalars. Scalars of YAML and XML stay text, as written: what
-# is a number is decided by who expects one. Tags, anchors and references make no objects.
+# Scalars of YAML and XML stay text, as written: what is a number is decided by who expects one.
+# Tags make no objects.
 
 MAX_BYTES = 4_000_000
 """The largest file that is read; a calibration with all its image points is a tenth of that."""
-
-MAX_NODES = 300_000
-"""The most values of a tree; libyaml reads so many in about a second."""
-
-MAX_DEPTH = 30
-"""The deepest nesting."""
-
-_TAGS = ("tag:yaml.org,2002:opencv-", "tag:yaml.org,2002:python/tuple")
-"""Beginnings of the tags that mean a plain mapping or list; other tags may make objects."""
-
-_MATRIX_TAG = "tag:yaml.org,2002:opencv-matrix"
 
 _COMMENT = re.compile(r"^[ \t]*//[^\n]*$", re.MULTILINE)
 
@@ -407,24 +386,27 @@ def read_tree(content: bytes) -> Any:
     ValueError
         Why it has none, in words that follow the file's name and a colon.
     """
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES:,} bytes")
     if content.startswith(b"\x1f\x8b"):
         raise ValueError("compressed; unpack it")
-    text = _decoded(content)
+    text = _decoded(content).strip()
     if "\0" in text:
         raise ValueError("not text")
-    if not text.strip():
+    if not text:
         raise ValueError("empty")
-    beginning = text.lstrip()[:1]
     try:
-        if beginning == "<":
+        if text.startswith("<"):
             return _xml_tree(text)
-        if beginning == "{":
-            return _json_tree(text)
-        return _yaml_tree(text)
+        if text.startswith("{"):
+            # OpenCV writes comments into JSON, each on a line of its own.
+            return json.loads(_COMMENT.sub("", text), object_pairs_hook=_mapping)
+        if text.startswith("%YAML"):  # OpenCV's "%YAML:1.0" is no directive of YAML
+            text = text.partition("\n")[2]
+        return next(yaml.load_all(text, Loader=_TextLoader), None)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    except (ET.ParseError, json.JSONDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"not XML, JSON or YAML, or cut short: {reason}") from None
 
 
 def _decoded(content: bytes) -> str:
@@ -441,123 +423,45 @@ def _decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def _json_tree(text: str) -> Any:
-    try:
-        # OpenCV writes comments into JSON, each on a line of its own.
-        tree = json.loads(_COMMENT.sub("", text))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"not JSON, or cut short: {error.msg} in line {error.lineno}") from None
-    except ValueError:
-        raise ValueError("not JSON: a number of too many digits") from None
-    _check_size(tree)
+def _mapping(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    """Return the dictionary of keys and values; ValueError if a key is there twice."""
+    tree: dict[str, Any] = {}
+    for key, value in pairs:
+        if str(key) in tree:
+            raise ValueError(f"it has the key {plain(key)} twice")
+        tree[str(key)] = value
     return tree
 
 
-def _check_size(tree: Any) -> None:
-    """Demand a tree within the bounds."""
-    level, nodes = [tree], 0
-    for _ in range(MAX_DEPTH):
-        nodes += len(level)
-        if nodes > MAX_NODES:
-            raise ValueError(f"more than {MAX_NODES:,} values")
-        level = [
-            part for each in level if isinstance(each, (dict, list))
-            for part in (each.values() if isinstance(each, dict) else each)
-        ]
-        if not level:
-            return
-    raise ValueError("nested too deeply")
+class _TextLoader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignore[misc]
+    """A loader of YAML that ignores tags, and leaves scalars as they are written."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+        """Return the dictionary of a node."""
+        construct = self.construct_object
+        return _mapping([(construct(key, deep), construct(each, deep)) for key, each in node.value])
+
+
+_TextLoader.add_constructor("tag:yaml.org,2002:binary", lambda *_: BASE64)
 
 
 def _xml_tree(text: str) -> Any:
     # Entities are declared in document types; storages have none.
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+    if "<!DOCTYPE" in text:
         raise ValueError("XML with a document type, which no camera file has")
-    try:
-        root = ET.fromstring(text)  # noqa: S314  (no entities are declared)
-    except ET.ParseError as error:
-        raise ValueError(f"not XML, or cut short: {error}") from None
+    root = ET.fromstring(text)  # noqa: S314  (no entities are declared)
     if root.tag != "opencv_storage":
         raise ValueError(f"XML of another kind: <{plain(root.tag)}>, not <opencv_storage>")
-    return _element(root, 0)
+    return _element(root)
 
 
-def _element(element: ET.Element, depth: int) -> Any:
-    if depth > MAX_DEPTH:
-        raise ValueError("nested too deeply")
+def _element(element: ET.Element) -> Any:
     children = list(element)
     if not children:
         return (element.text or "").strip().strip('"')
     if all(child.tag == "_" for child in children):
-        return [_element(child, depth + 1) for child in children]
-    tree = {child.tag: _element(child, depth + 1) for child in children}
-    if len(tree) < len(children):
-        raise ValueError(f"XML that has an element of <{plain(element.tag)}> twice")
-    return tree
-
-
-def _yaml_tree(text: str) -> Any:
-    if text.startswith("%YAML"):  # OpenCV's "%YAML:1.0" is no directive of YAML
-        text = text.partition("\n")[2]
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    events = _Events(yaml.parse(text, Loader=loader))
-    try:
-        for event in events:
-            if isinstance(event, yaml.NodeEvent):
-                return events.node(event, 0)
-            if isinstance(event, yaml.StreamEndEvent):
-                break
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" in line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        raise ValueError(f"not YAML, or cut short: {problem}{line}") from None
-    raise ValueError("empty")
-
-
-class _Events:
-    """The events of a YAML parser, of which trees are made without recursion into objects."""
-
-    def __init__(self, events: Iterator[Any]) -> None:
-        self._events = events
-        self._nodes = 0
-
-    def __iter__(self) -> Iterator[Any]:
-        return self._events
-
-    def node(self, event: Any, depth: int) -> Any:
-        """Return the tree that begins with an event."""
-        self._nodes += 1
-        if self._nodes > MAX_NODES:
-            raise ValueError(f"more than {MAX_NODES:,} values")
-        if depth > MAX_DEPTH:
-            raise ValueError("nested too deeply")
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError("YAML with references (*), which no camera file has")  # noqa: TRY004
-        tag = event.tag or ""
-        if tag == "tag:yaml.org,2002:binary":
-            raise ValueError("YAML with base64; write the file with numbers")
-        if tag.startswith(("tag:", "!")) and tag != "!" and not tag.startswith(_TAGS) and (
-            not re.fullmatch("tag:yaml.org,2002:(str|float|int|seq|map|bool|null)", tag)
-        ):
-            cut = "; is the file cut short?" if _MATRIX_TAG.startswith(tag) else ""
-            raise ValueError(f"YAML with the tag {plain(tag)}, which no camera file has{cut}")
-        if isinstance(event, yaml.ScalarEvent):
-            return str(event.value)
-        if isinstance(event, yaml.SequenceStartEvent):
-            items = []
-            while not isinstance(inner := next(self._events), yaml.SequenceEndEvent):
-                items.append(self.node(inner, depth + 1))
-            return items
-        tree: dict[str, Any] = {}
-        while not isinstance(inner := next(self._events), yaml.MappingEndEvent):
-            key = self.node(inner, depth + 1)
-            if not isinstance(key, str):
-                raise ValueError("YAML with a key that is no text")  # noqa: TRY004
-            if key in tree:
-                raise ValueError(f"YAML that has the key {plain(key)} twice")
-            tree[key] = self.node(next(self._events), depth + 1)
-        return tree
+        return [_element(child) for child in children]
+    return _mapping([(child.tag, _element(child)) for child in children])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -209,7 +209,6 @@ def encoded(ending, image):
 NOISE = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
 FRAME = POSE + "[camera]\nwidth_px = 64\nheight_px = 48\n[scene]\nbackground = '%s'\n"
 JPEG = encoded(".jpg", NOISE)
-FRAME_HEADER = JPEG.find(b"\xff\xc0") + 5
 
 BROKEN_IMAGES = {
     "empty": (b"", "not an image"),
@@ -220,18 +219,7 @@ BROKEN_IMAGES = {
     "half a BMP": (encoded(".bmp", NOISE)[:2000], "not an image"),
     "half a PGM": (encoded(".pgm", NOISE)[:2000], "not an image"),
     "too little data": (png(64, 48, b"\0" * 100), "not an image"),
-    "no pixels": (png(0, 0, b""), "at most 500,000,000 pixels"),
-    "a PNG bomb": (png(60_000, 60_000, b"\0" * 10**6), "60000 x 60000; at most 500,000,000"),
-    "a smaller PNG bomb": (png(20_000, 20_000, b"\0" * 10**6), "it is 20000 x 20000, but width_px"),
-    "a JPEG bomb": (
-        JPEG[:FRAME_HEADER] + struct.pack(">HH", 20_000, 20_000) + JPEG[FRAME_HEADER + 4 :],
-        "it is 20000 x 20000, but width_px",
-    ),
-    "a BMP bomb": (
-        b"BM" + b"\0" * 12 + struct.pack("<Iii", 40, 30_000, -30_000) + b"\0" * 50,
-        "30000 x 30000; at most",
-    ),
-    "a PGM bomb": (b"P5 # so\n30000\n30000 255\n" + b"\0" * 50, "30000 x 30000; at most"),
+    "no pixels": (png(0, 0, b""), "not an image"),
     "a TIFF": (encoded(".tiff", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
     "a WebP": (encoded(".webp", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
     "another size": (encoded(".png", NOISE[:40]), "it is 64 x 40, but height_px = 48"),
@@ -240,7 +228,7 @@ BROKEN_IMAGES = {
 
 
 @pytest.mark.parametrize(("content", "expected"), BROKEN_IMAGES.values(), ids=BROKEN_IMAGES)
-def test_an_image_that_is_none_or_a_bomb_is_refused(content, expected, tmp_path, capfd):
+def test_an_image_that_is_none_is_refused(content, expected, tmp_path, capfd):
     (tmp_path / "image").write_bytes(content)
     lines = faults_of(Pipeline.from_text, FRAME % "image", folder=tmp_path)
     assert len(lines) == 1

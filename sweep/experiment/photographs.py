@@ -20,7 +20,7 @@ from sweep.errors import PluginError, SweepError
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.board_rules import board_of
 from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
-from sweep.measure.surroundings import BoardMarker
+from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain
 from sweep.model.board import Board
 from sweep.model.image_file import Part, reference
@@ -153,6 +153,18 @@ def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str
     return record, digest
 
 
+BESIDE_MODULES = 4.0
+"""Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing
+farther out influences the marker's corners."""
+
+
+def _around(marker: BoardMarker | None) -> Board | None:
+    """Return a marker of a board with what is printed around it; None of a marker alone."""
+    if marker is None:
+        return None
+    return with_neighbours(marker, float(np.ceil(clear_modules(marker))) + BESIDE_MODULES)
+
+
 @lru_cache(maxsize=8)
 def _board(document: str) -> Board:
     """Return the board of a record, the same object for the same document."""
@@ -191,8 +203,9 @@ def recorded_poses(
     trials, marker_id
         (N,) each: numbers of the photographs, and the markers.
     simulated
-        Whether the images are simulated, each marker by itself: image and ``on_board`` are then
-        left out, and trials beyond the photographs begin again with the first.
+        Whether the images are simulated, each marker by itself: in place of the image there is
+        ``neighbourhood``, the marker with its board's other prints around it (None of a single
+        one), and trials beyond the photographs begin again with the first.
 
     Raises
     ------
@@ -224,8 +237,12 @@ def recorded_poses(
         std[rows], source[rows] = record.std[at], record.source[at]
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
-    photograph = {"renderer": PHOTOGRAPH, "background": images, "on_board": on_board}
-    return ({} if simulated else photograph) | {
+    source_of_images = (
+        {"neighbourhood": [_around(each) for each in on_board]} if simulated
+        else {"renderer": PHOTOGRAPH, "background": images}
+    )
+    return source_of_images | {
+        "on_board": on_board,
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
         "truth": source, "truth_std": std,

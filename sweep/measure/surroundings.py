@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.board import Board, target_edges
+from sweep.model.board import Board, Print, target_edges
 from sweep.model.coverage import MarkerEdges
-from sweep.model.marker import BLACK, OUTSIDE, module_count
+from sweep.model.marker import BLACK, OUTSIDE, marker_corners, module_count
 from sweep.typing import Floats, Integers
 
 
@@ -34,6 +34,18 @@ def surroundings(marker: BoardMarker, margin: float) -> MarkerEdges:
     modules = module_count(board.dictionary)
     ends = _in_modules(marker, board.edges().ends)
     return clipped(MarkerEdges(ends, board.edges().sides), -margin, modules + margin)
+
+
+@lru_cache(maxsize=4096)
+def with_neighbours(marker: BoardMarker, margin: float) -> Board:
+    """Return a marker of a board as a target: with what is printed within ``margin`` modules."""
+    board, modules = marker.board, module_count(marker.board.dictionary)
+    around = MarkerEdges(_in_modules(marker, board.edges().ends), board.edges().sides)
+    printed = Print(clipped(around, -margin, modules + margin, OUTSIDE), 1 / modules, 0.5)
+    return Board(
+        board.dictionary, (board.marker_ids[marker.number],), marker_corners(np.ones(1)),
+        (printed,), np.empty((0, 3)), margin=margin,
+    )
 
 
 @lru_cache(maxsize=4096)
@@ -77,8 +89,8 @@ def _in_modules(marker: BoardMarker, ends: Floats) -> Floats:
     return np.asarray(np.round(points, 9), dtype=np.float64).reshape(-1, 4)
 
 
-def clipped(edges: MarkerEdges, low: float, high: float) -> MarkerEdges:
-    """Return the edges of what lies in the square from ``low`` to ``high``; beyond it is black.
+def clipped(edges: MarkerEdges, low: float, high: float, beyond: int = BLACK) -> MarkerEdges:
+    """Return the edges of what lies in the square from ``low`` to ``high``; around it ``beyond``.
 
     What is moved onto the square's border by clamping encloses the part inside, since the clamping
     moves nothing there; edges that cancel one another on the border are left out. ``edges`` enclose
@@ -94,8 +106,9 @@ def clipped(edges: MarkerEdges, low: float, high: float) -> MarkerEdges:
         [low, low, low, high], [high, low, high, high], [low, low, high, low],
         [low, high, high, high],
     ])
-    codes = np.array([[BLACK, OUTSIDE], [OUTSIDE, BLACK], [OUTSIDE, BLACK], [BLACK, OUTSIDE]])
-    ends, sides = np.concatenate([ends, square]), np.concatenate([sides, codes])
+    if beyond != OUTSIDE:
+        codes = [[beyond, OUTSIDE], [OUTSIDE, beyond], [OUTSIDE, beyond], [beyond, OUTSIDE]]
+        ends, sides = np.concatenate([ends, square]), np.concatenate([sides, codes])
     border = np.zeros(len(ends), dtype=bool)
     kept_ends, kept_sides = [], []
     for axis in range(2):

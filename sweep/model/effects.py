@@ -338,6 +338,22 @@ EFFECTS: tuple[Effect, ...] = (
         needs={"geometry_length_px": ("geometry_px",)}, random=True,
     ),
     Effect(
+        "ragged edges", "edges",
+        {
+            "edge_px": parameter(
+                0.0, "standard deviation, right and down, of shifts of the image that vary from "
+                "one module to the next, as a screen's raster, compression and a camera's colour "
+                "filter lead to; drawn anew for each frame, beside geometry_px",
+                unit="px", low=0, high=1000, drawable=True,
+            ),
+            "edge_length_px": parameter(
+                4.0, "distance at which the correlation of these shifts has fallen to 0.61",
+                unit="px", low=1, high=1e6, drawable=True,
+            ),
+        },
+        needs={"edge_length_px": ("edge_px",)}, random=True,
+    ),
+    Effect(
         "sharpening", "edges",
         {
             "sharpening": parameter(

@@ -65,8 +65,10 @@ def _unscaled(scenes: Scenes, rows: NDArray[np.intp]) -> Floats:
 
 def curved_rows(scenes: Scenes) -> NDArray[np.intp]:
     """Return the scenes (n,) whose sheets are bent or whose image is shifted."""
-    effects = scenes.effects
-    return np.flatnonzero((effects["curvature_per_m"] != 0) | (effects["geometry_px"] != 0))
+    return np.flatnonzero(np.any(
+        [scenes.effects[name] != 0 for name in ("curvature_per_m", "geometry_px", "edge_px")],
+        axis=0,
+    ))
 
 
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:

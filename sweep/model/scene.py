@@ -293,12 +293,13 @@ def build_scenes(
     ``distance_m``, and ``x_m``, ``y_m`` or, without these, the bearings; ``tilt_deg``,
     ``azimuth_deg``, ``roll_deg``, instead of which ``resolved_tilt_deg`` and so on count if they
     are there; and ``shift_u_px``, ``shift_v_px``: the drawn jitter. ``board`` is the board that a
-    scene shows in place of a marker, or None. Each is a :class:`Column`, or a value that
+    scene shows in place of a marker, or None; without it ``neighbourhood`` may be there, a marker
+    as a target with what is printed around it, or None. Each is a :class:`Column`, or a value that
     :meth:`Column.of` takes. ``plugins`` are needed if the scenes are to be rendered.
     """
     values = {
         **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None,
-        "board": None, **values,
+        "board": values.get("neighbourhood"), **values,
     }
 
     def column(name: str) -> Column:
@@ -345,7 +346,9 @@ def build_scenes(
                 overhang(dictionary)
                 + (0.0 if background == white and occlusion == 0 else float(width)),
             )
-            if board is None or (board.is_single and side_m(board, size_m) == size_m) else board
+            if board is None
+            or (not board.is_marker and board.is_single and side_m(board, size_m) == size_m)
+            else board
         ),
         "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
         "occlusion",

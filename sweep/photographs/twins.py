@@ -15,27 +15,21 @@ from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import PhotographRecord, read_record, shows_photographs
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.toml_text import MAX_BYTES, read_document
-from sweep.measure.surroundings import clear_modules
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
 
 NAME = "{}-twins"
 """Name of the twins of photographs of a name."""
 
-QUIET_ZONE = "quiet_zone_modules"
-
-MAX_QUIET_ZONE = 4.0
-"""The widest that a board makes it, in modules: nothing beyond influences the marker's corners."""
-
 
 def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1) -> Pipeline:
     """Return the pipeline that simulates the markers of photographs at their true poses.
 
-    Each image has one marker on a plain ground, with a quiet zone as wide as the board leaves clear
-    (unless the pipeline of the photographs has one). Camera, detectors, estimators,
-    rows and flags are those of the photographs, so that results pair: trial k has the poses of
-    photograph k modulo their number. What is drawn of the scene is drawn for each photograph and
-    repeat, and is the same for all its markers; noise and shifts are each marker's own.
+    Each image has one marker on a plain ground, with what its board has printed around it. Camera,
+    detectors, estimators, rows and flags are those of the photographs, so that results pair: trial
+    k has the poses of photograph k modulo their number. What is drawn of the scene is drawn for
+    each photograph and repeat, and is the same for all its markers; noise and shifts are each
+    marker's own.
 
     Parameters
     ----------
@@ -62,8 +56,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         raise ArgumentError("repeats", repeats, "expected at least 1")
     axis = pipeline.axis(TRIAL)
     trials = 1 if axis is None else len(axis)
-    record = _record(pipeline)
-    photographs = len(record.paths)
+    photographs = len(_record(pipeline).paths)
     if repeats > 1 and trials != photographs:
         raise ArgumentError(
             "repeats", repeats, f"expected 1, for the {trials} first of {photographs} photographs"
@@ -73,8 +66,6 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     document["scene"] = {
         **document.get("scene", {}), SIMULATED: True, **_ground(scene.get("black")), **scene,
     }
-    if QUIET_ZONE not in pipeline.given:
-        document["marker"] |= _quiet_zone(record)
     document.setdefault("axes", {})[TRIAL] = trials * repeats
     return Pipeline.from_dict(
         document, name=NAME.format(pipeline.name), source="scene", folder=pipeline.folder
@@ -90,17 +81,6 @@ def _ground(black: Any) -> dict[str, float]:
         return {} if black is None else {"background": float(black)}
     except (TypeError, ValueError):
         return {}  # the pipeline's check says what is wrong with it
-
-
-def _quiet_zone(record: PhotographRecord) -> dict[str, float]:
-    """Return what a board leaves clear around its markers.
-
-    Nothing, which is the default, without a board, or where prints touch the markers' corners, as
-    those of Kalibr's boards do.
-    """
-    clear = [clear_modules(each) for each in record.on_board(record.marker_id) if each is not None]
-    width = round(min([*clear, MAX_QUIET_ZONE]), 6)
-    return {QUIET_ZONE: width} if clear and width > 0 else {}
 
 
 def _record(pipeline: Pipeline) -> PhotographRecord:

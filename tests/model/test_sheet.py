@@ -243,6 +243,17 @@ def test_shifted_image_is_that_of_shifted_samples(geometry_px, length_px):
     assert_sampled(exact_frame(scenes, value), sampled_frame(value, 6, shifted), 6)
 
 
+def test_ragged_edges_are_a_second_field_of_shifts_beside_the_first():
+    value, scenes = scenes_of(
+        geometry_px=0.4, geometry_length_px=30.0, edge_px=0.3, edge_length_px=4.0, noise_key=77,
+        tilt_deg=30.0, width_px=28, height_px=26, side_px=14.0,
+    )
+    fields = [shift_of(shift_waves(*field)) for field in (
+        (0.4, 30.0, np.uint64(77)), (0.3, 4.0, np.uint64(77), "edge"))]
+    shifted = lambda points: fields[0](points) + fields[1](points)  # noqa: E731
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 6, shifted), 6)
+
+
 @pytest.mark.long
 def test_shifts_are_normal_and_correlated_as_said():
     # 4,000 frames; means of squares have a standard error of 1.41/sqrt(8,000) = 1.6 %, products

@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from support.board_photographs import BOARD, POSES, write_set
+from support.board_photographs import POSES, SIZE, VIEW, board, write_set
+from support.board_scenes import BoardPose, board_scene, levels_of
 from support.here import calls_here
 from sweep.errors import SweepError
 from sweep.evaluation.block import run_cells
+from sweep.evaluation.inspection import scene_image
 from sweep.execution.runner import execute
+from sweep.experiment.cell_selection import cell
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.photographs import read_record
 from sweep.experiment.pipeline import Pipeline
@@ -74,14 +77,28 @@ def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared)
     assert np.array_equal(twins.experiment.scene_values(some)["blur_px"].values, blur.ravel()[3:9])
 
 
-def test_the_quiet_zone_is_as_wide_as_the_board_leaves_clear(prepared):
-    twins = twin_pipeline(prepared, {})
-    clear = (BOARD["square_m"] - BOARD["marker_m"]) / 2 / (BOARD["marker_m"] / 6)
-    assert twins.fixed["quiet_zone_modules"] == pytest.approx(clear, abs=1e-6)
-    given = Pipeline.from_text(
-        prepared.to_toml(), ["quiet_zone_modules=2.5"], folder=prepared.folder
+@pytest.mark.parametrize("marker_id", [0, 4])
+def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_id):
+    scene = {"black": 35, "white": 210, "background": 120, "blur_px": 0.6}
+    twin = cell(twin_pipeline(prepared, scene), f"trial=0,marker_id={marker_id}")
+    record, _ = read_record(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    turn = record.rotation[0, marker_id]
+    corners = board().corners_m[marker_id]
+    # The whole board at a pose that has the marker where the twin has it.
+    shift = record.translation[0, marker_id] - turn @ corners.mean(axis=0)
+    scenes = board_scene(
+        board(), {"width_px": SIZE[0], "height_px": SIZE[1],
+                  **dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), VIEW, strict=True))},
+        BoardPose(turn, shift), blur_px=0.6,
     )
-    assert twin_pipeline(given, {}).fixed["quiet_zone_modules"] == 2.5
+    whole = levels_of(scenes, background=120.0, black=35.0, white=210.0)
+    around = 1.8 * (corners - corners.mean(axis=0)) + corners.mean(axis=0)  # 2.4 modules wider
+    x, y, z = (around @ turn.T + shift).T
+    pixels = np.stack([VIEW[0] * x / z + VIEW[2], VIEW[1] * y / z + VIEW[3]], axis=1)
+    inside = np.zeros(whole.shape, np.uint8)
+    cv2.fillConvexPoly(inside, np.rint(pixels).astype(np.int32), 1)
+    difference = np.abs(scene_image(twin, whole_frame=True) - whole)[inside > 0]
+    assert difference.max() < 1.0  # rounding
 
 
 @pytest.mark.long

@@ -93,39 +93,6 @@ class Correction(NamedTuple):
                           self.ratio[[way]], (self.labels[way],), self.square[[way]])
 
 
-@dataclass(frozen=True)
-class Cause:
-    """One cause.
-
-    Attributes
-    ----------
-    name, title
-        Its name in JSON, and in words.
-    prior
-        Prior weight, relative to the others.
-    ways
-        How it is undone in these observations.
-    columns
-        True positions (c, n, 3) and the ways' spreads (c,) -> what one standard deviation of each
-        unknown number adds to the positions, (c, n, 3, k).
-    applies
-        What observations lack for it to be looked for, empty if nothing.
-    test
-        What would decide without another distance.
-    unit
-        Prior standard deviation of the columns' numbers in this unit, and the unit.
-    """
-
-    name: str
-    title: str
-    prior: float
-    ways: Callable[[Observations], Correction]
-    columns: Callable[[Observations, Floats, Floats], Floats]
-    applies: Callable[[Observations], str]
-    test: str
-    unit: tuple[float, str] = (1.0, "")
-
-
 def unscaled(weight: ArrayLike, matrix: Floats, labels: Sequence[str]) -> Correction:
     """Return ways without a ratio."""
     nothing = np.zeros((len(labels), 1))
@@ -141,8 +108,37 @@ def _no_columns(_: Observations, points: Floats, _spread: Floats) -> Floats:
     return np.zeros((*points.shape, 0))
 
 
-def _always(_: Observations) -> str:
-    return ""
+@dataclass(frozen=True)
+class Cause:
+    """One cause.
+
+    Attributes
+    ----------
+    name, title
+        Its name in JSON, and in words.
+    prior
+        Prior weight, relative to the others.
+    test
+        What would decide without another distance.
+    ways
+        How it is undone in these observations.
+    columns
+        True positions (c, n, 3) and the ways' spreads (c,) -> what one standard deviation of each
+        unknown number adds to the positions, (c, n, 3, k).
+    lacks
+        What observations lack for it to be looked for, empty if nothing.
+    unit
+        Prior standard deviation of the columns' numbers in this unit, and the unit.
+    """
+
+    name: str
+    title: str
+    prior: float
+    test: str
+    ways: Callable[[Observations], Correction] = _as_it_is
+    columns: Callable[[Observations, Floats, Floats], Floats] = _no_columns
+    lacks: Callable[[Observations], str] = lambda _: ""
+    unit: tuple[float, str] = (1.0, "")
 
 
 def ratios(
@@ -306,38 +302,35 @@ AGREE = "agree"
 FLIPS = "flips"
 STRAIGHT = "z_for_range"
 CAUSES = (
-    Cause(AGREE, "the numbers agree with what is expected", 4.0, _as_it_is, _no_columns, _always,
-          "nothing to test"),
+    Cause(AGREE, "the numbers agree with what is expected", 4.0, "nothing to test"),
     Cause("size", "wrong size of the marker (another edge, or a scaled or bent print)", 3.0,
-          _size_ways, _scale_columns, _always,
-          "measure the square whose corners are detected with a caliper, flat on a table"),
+          "measure the square whose corners are detected with a caliper, flat on a table",
+          _size_ways, _scale_columns),
     Cause("focal_length", "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
-          _focal_ways, _depth_columns, _always,
           "photograph a ruler at a known distance: f is its pixels times distance / length; "
-          "compare the file's image size with the image's"),
-    Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0, _unit_ways,
-          _scale_columns, _always, "print size and tvec with their units"),
-    Cause(STRAIGHT, "z taken for the straight distance", 1.5, _as_it_is, _no_columns,
-          _straight, "compare the tape with sqrt(x² + y² + z²)"),
+          "compare the file's image size with the image's", _focal_ways, _depth_columns),
+    Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0,
+          "print size and tvec with their units", _unit_ways, _scale_columns),
+    Cause(STRAIGHT, "z taken for the straight distance", 1.5,
+          "compare the tape with sqrt(x² + y² + z²)", lacks=_straight),
     Cause("offset", "an offset (zero point of the tape, place of the lens, another frame)", 1.0,
-          _as_it_is, _offset_columns, _always,
           "measure one more distance: an offset stays, a factor grows",
-          (1e3 * OFFSET_SD_M, "mm")),
-    Cause("axes", "axes or frame turned", 1.0, _axis_ways, _turn_columns, _lateral,
+          columns=_offset_columns, unit=(1e3 * OFFSET_SD_M, "mm")),
+    Cause("axes", "axes or frame turned", 1.0,
           "move the marker to the right: x alone must grow; down: y; away: z",
-          (TURN_SD_DEG, "degrees")),
+          _axis_ways, _turn_columns, _lateral, (TURN_SD_DEG, "degrees")),
     Cause("half_pixel", "half a pixel (convention of corners or calibration)", 0.7,
-          _half_pixel_ways, _no_columns, lambda rows: _lateral(rows) or _known_square(rows),
-          "detect a rendered marker whose corners are known (`sweep export`)"),
-    Cause("refinement", "bias of the corner refinement", 1.0, _as_it_is, _bias_columns,
-          _known_square, "run the other refinement on the same images: its bias differs",
-          (BIAS_SD_PX, "px")),
+          "detect a rendered marker whose corners are known (`sweep export`)",
+          _half_pixel_ways, lacks=lambda rows: _lateral(rows) or _known_square(rows)),
+    Cause("refinement", "bias of the corner refinement", 1.0,
+          "run the other refinement on the same images: its bias differs",
+          columns=_bias_columns, lacks=_known_square, unit=(BIAS_SD_PX, "px")),
     Cause("motion", "motion during the exposure, a rolling shutter or a late time stamp", 1.0,
-          _as_it_is, _motion_columns,
-          lambda rows: "" if np.nan_to_num(rows.speed).any() else "speed_m_s",
-          "measure standing still", (1e3 * DELAY_SD_S, "ms")),
-    Cause(FLIPS, "flips (the mirrored solution of the plane)", 0.5, _as_it_is, _no_columns, _yaws,
-          "print both solutions of solvePnPGeneric with their reprojection errors"),
+          "measure standing still", columns=_motion_columns,
+          lacks=lambda rows: "" if np.nan_to_num(rows.speed).any() else "speed_m_s",
+          unit=(1e3 * DELAY_SD_S, "ms")),
+    Cause(FLIPS, "flips (the mirrored solution of the plane)", 0.5,
+          "print both solutions of solvePnPGeneric with their reprojection errors", lacks=_yaws),
 )
 """All causes; prior weights follow how often public questions turned out to be each."""
 

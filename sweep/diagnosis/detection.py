@@ -227,14 +227,13 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
                    if name not in scene and results.sizes[name] > 1]:
         raise DatasetError(f"several settings: {', '.join(map(str, several))}: choose one with "
                            "results.isel(...)")
-    others = [dim for dim in results["estimate"].dims if dim not in scene]
-    table = results[list(names)].isel(dict.fromkeys(others, 0), drop=True).load()
-    used = np.ravel(table["estimate"] == EstimateStatus.solved)
+    one = {dim: 0 for dim in results["estimate"].dims if dim not in scene}
+    poses = [dim for dim in scene if dim != "xyz"]
+    table = results[list(names)].isel(one, drop=True).load().stack(pose=poses, create_index=False)
+    used = (table["estimate"] == EstimateStatus.solved).values
     rvec, tvec, rotation, position = (
-        table[name].transpose(*(dim for dim in scene if dim != "xyz"), "xyz").values.reshape(
-            -1, 3)[used].astype(np.float64) for name in names[:4])
-    chosen, other, flipped = (table[name].transpose(
-        *(dim for dim in scene if dim != "xyz")).values.ravel()[used] for name in names[4:7])
+        table[name].transpose("pose", "xyz").values[used].astype(np.float64) for name in names[:4])
+    chosen, other, flipped = (table[name].values[used] for name in names[4:7])
     estimate = tvec + position
     turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
     errors = np.concatenate(

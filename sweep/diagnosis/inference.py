@@ -224,8 +224,8 @@ class Ranking:
 
 def rank(rows: Observations) -> Ranking:
     """Return all explanations of observations, by posterior probability."""
-    missing = {cause.title: lack for cause in CAUSES if (lack := cause.applies(rows))}
-    found = [cause for cause in CAUSES if not cause.applies(rows)]
+    missing = {cause.title: lack for cause in CAUSES if (lack := cause.lacks(rows))}
+    found = [cause for cause in CAUSES if cause.title not in missing]
     total = sum(cause.prior for cause in found)
     chosen: list[tuple[tuple[Cause, ...], float]] = [
         ((cause,), cause.prior / total) for cause in found]

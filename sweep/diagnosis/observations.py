@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sweep.errors import ArgumentError
+from sweep.measure.detectors import DetectorSetting, make_detector
 from sweep.measure.solver import both_planar_solutions
 from sweep.messages import nearest, plain
 from sweep.model.calibration import MAX_BYTES, Calibration
-from sweep.model.image_file import read_regular
+from sweep.model.image_file import decode_grey, read_regular
 from sweep.model.marker import dictionary_names
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
+from sweep.photographs.folder import detect_markers
 from sweep.photographs.truth import camera_of_file, cameras_of, lens_of
 from sweep.typing import Floats
 
@@ -26,8 +31,11 @@ SAID = ("tvec_x_m", "tvec_y_m", "tvec_z_m", "range_m", "rvec_x", "rvec_y", "rvec
 TAPE = ("tape_m", "tape_sd_m", "x_m", "y_m", "z_m", "position_sd_m", "yaw_deg", "yaw_sd_deg",
         "speed_m_s")
 CORNERS = tuple(f"corner{k}_{axis}_px" for k in range(4) for axis in "xy")
-COLUMNS = {*SAID, *TAPE, *CORNERS}
-"""Columns of a file of observations; further ones are refused, empty cells are unknown."""
+COLUMNS = {*SAID, *TAPE, *CORNERS, "marker_id"}
+"""Columns of numbers; further ones are refused, empty cells are unknown."""
+
+IMAGE = "image"
+"""Column of image files in which the corners are detected, from the CSV file's folder."""
 
 WHOLE = (SAID[:2], SAID[4:], CORNERS)
 """Columns of which a row has all or none."""
@@ -80,10 +88,10 @@ class Observations:
         Positions (n, 3) of the marker, m, camera frame; (0, 0, range) where only a range is known.
     lateral
         Whether the program's x and y are known.
-    tape, tape_sd
-        Straight distance from the lens to the marker's centre (n,), m, NaN where unknown.
     spatial
         Whether positions were measured, and not straight distances alone.
+    tape, tape_sd
+        Straight distance from the lens to the marker's centre (n,), m, NaN where unknown.
     position, position_sd
         Measured positions (n, 3), m, NaN where unknown, and their standard deviation (n,).
     yaw, yaw_said, yaw_mirrored, yaw_sd
@@ -151,35 +159,38 @@ def read_observations(
     """
     columns = dict(source) if isinstance(source, Mapping) else _read_csv(os.fspath(source))
     for name in columns:
-        if name not in COLUMNS:
-            raise ArgumentError("observations", "", f"column {plain(name)} is not known"
-                                f"{nearest(name, sorted(COLUMNS))}; expected {', '.join(SAID)} "
-                                f"and {', '.join(TAPE)}, or corners {CORNERS[0]} ...")
+        if name not in (*COLUMNS, IMAGE):
+            raise _fault(f"column {plain(name)} is not known{nearest(name, sorted(COLUMNS))}; "
+                         f"expected {', '.join(SAID)} and {', '.join(TAPE)}, or {IMAGE}, or "
+                         f"corners {CORNERS[0]} ...")
     count = max((len(values) for values in columns.values()), default=0)
     if not count:
-        raise ArgumentError("observations", "", "no rows: expected one or more below the header")
-    if dictionary and dictionary not in dictionary_names():
-        raise ArgumentError("dictionary", plain(dictionary), "is not known"
-                            + nearest(dictionary, dictionary_names()))
-    if refinement and refinement not in REFINEMENTS:
-        raise ArgumentError("refinement", plain(refinement),
-                            f"expected one of {', '.join(REFINEMENTS)}")
-    if compared not in ("z", "range"):
-        raise ArgumentError("compared", plain(compared), "expected z or range")
-    for name, value in (("size_m", size_m), ("zero_sd_m", zero_sd_m)):
-        if value is not None and not 0 < value < math.inf:
-            raise ArgumentError(name, value, "expected metres above 0")
-    known = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
+        raise _fault("no rows: expected one or more below the header")
+    for setting, value, known in (
+        ("dictionary", dictionary, dictionary_names()), ("refinement", refinement, [*REFINEMENTS]),
+        ("compared", compared, ["z", "range"]),
+    ):
+        if value and value not in known:
+            expected = nearest(value, known) or f"; expected one of {', '.join(known)}"
+            raise ArgumentError(setting, plain(value), f"is not known{expected}")
+    for name, number in (("size_m", size_m), ("zero_sd_m", zero_sd_m)):
+        if number is not None and not 0 < number < math.inf:
+            raise ArgumentError(name, number, "expected metres above 0")
+    believed = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
         os.fspath(camera))
     values = {name: _numbers(name, columns[name], count) if name in columns
               else np.full(count, np.nan) for name in COLUMNS}
+    notes: list[str] = []
+    if IMAGE in columns:
+        folder = Path() if isinstance(source, Mapping) else Path(source).parent
+        _detect(values, [folder / name for name in columns[IMAGE]], dictionary, refinement)
+        notes.append(f"corners were detected in the images, {refinement or 'none'} refined")
     _check_complete(values)
     said, rvec = (np.stack([values[name] for name in SAID[k : k + 3]], axis=-1) for k in (0, 4))
-    notes: list[str] = []
     if np.isfinite(values[CORNERS[0]]).all() and not np.isfinite(said[:, 2]).all():
-        if known is None or size_m is None:
-            raise ArgumentError("observations", "", "corners need --camera and --set size_m=...")
-        said, rvec = _solved(values, known, size_m)
+        if believed is None or size_m is None:
+            raise _fault("corners need --camera and --set size_m=...")
+        said, rvec = _solved(values, believed, size_m)
         notes.append("the poses were solved from the corners with this camera and size")
     lateral = bool(np.isfinite(said[:, :2]).all())
     if not lateral:
@@ -187,23 +198,17 @@ def read_observations(
         said = np.stack([np.zeros(count), np.zeros(count), distance], axis=-1)
         compared = "range"
     position = np.stack([values[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
-    if not np.isfinite(said).all() or not (said[:, 2] > 0).all():
-        row = int(np.argmin(np.isfinite(said).all(axis=1) & (said[:, 2] > 0))) + 1
-        raise ArgumentError("observations", "", f"row {row}: expected tvec_z_m or range_m above 0: "
-                            "the position that the program said")
-    measured = np.isfinite([values["tape_m"], *position.T, values["yaw_deg"]]).any(axis=0)
-    if not measured.all():
-        raise ArgumentError("observations", "", f"row {int(np.argmin(measured)) + 1}: expected "
-                            "tape_m, or one of x_m, y_m, z_m: what was measured by tape")
-    if not lateral and np.isfinite(position[:, :2]).any():
-        raise ArgumentError("observations", "", "x_m and y_m need tvec_x_m and tvec_y_m")
+    _each_row(np.isfinite(said).all(axis=1) & (said[:, 2] > 0),
+              "expected tvec_z_m or range_m above 0: the position that the program said")
+    _each_row(np.isfinite([values["tape_m"], *position.T, values["yaw_deg"]]).any(axis=0),
+              "expected tape_m, or one of x_m, y_m, z_m: what was measured by tape")
+    _each_row(lateral | ~np.isfinite(position[:, :2]).any(axis=1),
+              "x_m and y_m need tvec_x_m and tvec_y_m")
     for name in POSITIVE:
-        if (values[name] <= 0).any():
-            raise ArgumentError("observations", "", f"{name}: expected numbers above 0")
+        _each_row(~(values[name] <= 0), f"{name}: expected numbers above 0")
     lengths = np.nan_to_num(np.concatenate([said, position, values["tape_m"][:, None]], axis=1))
-    if not ((np.abs(lengths) < LENGTHS_M[1]).all() and (said[:, 2] > LENGTHS_M[0]).all()):
-        raise ArgumentError("observations", "", "positions and tapes: expected metres between "
-                            f"{LENGTHS_M[0]:g} and {LENGTHS_M[1]:g}")
+    _each_row((np.abs(lengths) < LENGTHS_M[1]).all(axis=1) & (said[:, 2] > LENGTHS_M[0]),
+              f"expected metres between {LENGTHS_M[0]:g} and {LENGTHS_M[1]:g}")
     if not np.isfinite([values["tape_sd_m"], values["position_sd_m"]]).any():
         notes.append("no uncertainty of the tape is given: 2 mm or 0.5 % are assumed")
 
@@ -218,9 +223,9 @@ def read_observations(
     rows = Observations(
         said, lateral, bool(np.isfinite(position).any()), values["tape_m"], tape_sd, position,
         position_sd, values["yaw_deg"], _yaw(rotation), _yaw(mirrored(rotation, said)),
-        filled("yaw_sd_deg", YAW_SD_DEG), values["speed_m_s"], known,
+        filled("yaw_sd_deg", YAW_SD_DEG), values["speed_m_s"], believed,
         math.nan if size_m is None else size_m, dictionary, refinement, zero_sd_m, compared, ())
-    if known is None or size_m is None:
+    if believed is None or size_m is None:
         notes.append("camera or size_m unknown: the expected bias and noise are a guess for a "
                      f"square of {UNKNOWN_SIDE_PX:g} px")
     elif (small := rows.side_px < READABLE_PX).any():
@@ -228,23 +233,30 @@ def read_observations(
         notes.append(
             f"row {row + 1}: {said[row, 2]:g} m for a square of {size_m:g} m is a side of "
             f"{rows.side_px[row]:.2g} px, which no detector reads: units of tvec or size_m differ")
-    return Observations(**{**vars(rows), "notes": tuple(notes)})
+    return dataclasses.replace(rows, notes=tuple(notes))
+
+
+def _fault(text: str) -> ArgumentError:
+    return ArgumentError("observations", "", text)
+
+
+def _each_row(right: ArrayLike, expected: str) -> None:
+    """Raise ArgumentError for the first row of a mask (n,) that is not right."""
+    if not np.all(right):
+        raise _fault(f"row {int(np.argmin(right)) + 1}: {expected}")
 
 
 def _check_complete(values: Mapping[str, Floats]) -> None:
     """Raise ArgumentError where a row has a part of a vector, or a number without its companion."""
     for names in WHOLE:
-        given = np.isfinite([values[name] for name in names])
-        for row in np.flatnonzero(given.any(axis=0) & ~given.all(axis=0)):
-            missing = next(name for name, there in zip(names, given[:, row], strict=True)
-                           if not there)
-            raise ArgumentError("observations", "", f"row {row + 1}: {missing} is missing: give "
-                                f"all of {names[0]} ... {names[-1]}, or none")
+        there = np.isfinite([values[name] for name in names])
+        for name, own in zip(names, there, strict=True):
+            _each_row(own | ~there.any(axis=0),
+                      f"{name} is missing: give all of {names[0]} ... {names[-1]}, or none")
     for name, others in NEEDED.items():
-        alone = np.isfinite(values[name]) & ~np.isfinite([values[o] for o in others]).any(axis=0)
-        if alone.any():
-            raise ArgumentError("observations", "", f"row {int(np.argmax(alone)) + 1}: {name} "
-                                f"needs {' or '.join(others)} beside it")
+        beside = np.isfinite([values[other] for other in others]).any(axis=0)
+        _each_row(beside | ~np.isfinite(values[name]),
+                  f"{name} needs {' or '.join(others)} beside it")
 
 
 SETTINGS: dict[str, type] = {
@@ -278,34 +290,56 @@ def _read_csv(path: str) -> dict[str, list[str]]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ArgumentError("observations", plain(path), reason) from None
-    rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
-    rows = [[cell.strip() for cell in row] for row in rows if any(row)]
-    if not rows:
-        raise ArgumentError("observations", plain(path), "is empty: expected a header and rows")
-    if twice := {name for name in rows[0] if rows[0].count(name) > 1}:
+    lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
+    header, *rows = [[cell.strip() for cell in row] for row in lines if any(row)] or [[]]
+    if twice := {name for name in header if header.count(name) > 1}:
         raise ArgumentError("observations", plain(path), f"column {plain(min(twice))} is there "
                             "twice")
-    for number, row in enumerate(rows[1:], 1):
-        if len(row) != len(rows[0]):
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(header):
             raise ArgumentError("observations", plain(path), f"row {number} has {len(row)} cells, "
-                                f"the header {len(rows[0])}")
-    return {name: [row[k] for row in rows[1:]] for k, name in enumerate(rows[0])}
+                                f"the header {len(header)}")
+    return {name: [row[k] for row in rows] for k, name in enumerate(header)}
 
 
 def _numbers(name: str, cells: Sequence[Any], count: int) -> Floats:
     """Return a column's numbers (count,); empty cells are NaN, written NaN is refused."""
     numbers = np.full(count, np.nan)
     if len(cells) != count:
-        raise ArgumentError("observations", "", f"column {name} has {len(cells)} rows of {count}")
+        raise _fault(f"column {name} has {len(cells)} rows of {count}")
     for row, cell in enumerate(cells):
         if cell is None or cell == "":
             continue
         with contextlib.suppress(TypeError, ValueError):
             numbers[row] = float(cell)
         if not math.isfinite(numbers[row]):
-            raise ArgumentError("observations", "", f"row {row + 1}, {name} = {plain(cell)}: "
-                                "expected a number; leave the cell empty if it is unknown")
+            raise _fault(f"row {row + 1}, {name} = {plain(cell)}: expected a number; leave the "
+                         "cell empty if it is unknown")
     return numbers
+
+
+def _detect(
+    values: dict[str, Floats], images: Sequence[Path], dictionary: str, refinement: str
+) -> None:
+    """Write the corners of a marker in each image (n,) into the columns of corners."""
+    if not dictionary:
+        raise _fault(f"{IMAGE} needs --set dictionary=...")
+    if np.isfinite(values[CORNERS[0]]).any():
+        raise _fault(f"{IMAGE} or corners: give one of them")
+    find = make_detector(DetectorSetting(cornerRefinementMethod=refinement or "none"))
+    for row, image in enumerate(images):
+        try:
+            ids, quads = detect_markers(find, decode_grey(str(image)), dictionary)
+        except (OSError, ValueError) as error:
+            raise ArgumentError("observations", plain(image), str(error)) from None
+        wanted = values["marker_id"][row]
+        chosen = quads if np.isnan(wanted) else quads[ids == wanted]
+        if len(chosen) != 1:
+            raise _fault(f"row {row + 1}: {plain(image)} shows {len(ids)} markers of {dictionary}"
+                         f" (IDs {', '.join(map(str, ids.tolist())) or 'none'}): expected one, or "
+                         "marker_id of one of them")
+        for name, number in zip(CORNERS, chosen.ravel(), strict=True):
+            values[name][row] = number
 
 
 def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) -> tuple[
@@ -314,15 +348,12 @@ def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) ->
     corners = np.stack([values[name] for name in CORNERS], axis=-1).reshape(-1, 4, 2)
     frame = (camera.width_px, camera.height_px)
     if all(frame) and (corners > np.array(frame, dtype=np.float64)).any():
-        raise ArgumentError("observations", "", "corners lie beyond the camera file's image of "
-                            f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
+        raise _fault("corners lie beyond the camera file's image of "
+                     f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
     cameras = cameras_of(lens_of(camera), len(corners))
     rotation, position = both_planar_solutions(corners, cameras, np.full(len(corners), size_m))
-    solved = np.isfinite(position[:, 0]).all(axis=-1)
-    if not solved.all():
-        row = int(np.argmin(solved)) + 1
-        raise ArgumentError("observations", "", f"row {row}: the corners have no "
-                            "pose; expected top left, top right, bottom right, bottom left")
+    _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "
+              "left, top right, bottom right, bottom left")
     return position[:, 0], vector_of_rotation(rotation[:, 0])
 
 

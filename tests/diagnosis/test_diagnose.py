@@ -1,9 +1,11 @@
 """What `sweep diagnose` says of rows, and of rows that cannot be."""
 
 import json
+import re
 
 import numpy as np
 import pytest
+import tomlkit
 
 import sweep
 from sweep.cli import main
@@ -114,6 +116,35 @@ def test_poses_are_solved_from_corners():
         corners[f"corner{k}_y_px"] = [359.5 - 900 * y / z for z in AWAY]
     rows = read_observations({**corners, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
     assert np.allclose(rows.said[:, 2], AWAY, atol=1e-6)
+
+
+def test_poses_are_solved_from_images(tmp_path):
+    pipeline = {
+        "camera": {"width_px": 640, "height_px": 480, "fx_px": 600},
+        "marker": {"dictionary": "DICT_APRILTAG_36h11", "size_m": 0.1},
+        "scene": {"background": 255}, "pose": {"tilt_deg": 20},
+        "axes": {"distance_m": [0.5, 0.75, 1.5]},
+    }
+    path = tmp_path / "p.toml"
+    path.write_text(tomlkit.dumps(pipeline))
+    main(["export", str(path), str(tmp_path / "shots")])
+    images = sorted((tmp_path / "shots").rglob("*.png"))
+    rows = tmp_path / "shots" / "rows.csv"
+    names = [str(image.relative_to(rows.parent)) for image in images]
+    rows.write_text("image,tape_m\n" + "".join(
+        f"{name},{tape}\n" for name, tape in zip(names, (0.5, 0.75, 1.5), strict=True)))
+    camera = Calibration(640, 480, 600.0, 600.0, 319.5, 239.5, (), (), ())
+    settings = {"camera": camera, "dictionary": "DICT_APRILTAG_36h11", "refinement": "subpix"}
+    assert first(sweep.diagnose(rows, size_m=0.1, **settings)) == ["agree"]
+    wrong = sweep.diagnose(rows, size_m=0.125, **settings)
+    assert "the white margin" in wrong.numbers["causes"][0]["size"]
+    for text, words in (
+        ("image,tape_m,marker_id\n" + f"{names[0]},1,7\n", "(IDs 0): expected one, or marker_id"),
+        ("image,tape_m\nnone.png,1\n", "none.png"),
+    ):
+        rows.write_text(text)
+        with pytest.raises(sweep.ArgumentError, match=re.escape(words)):
+            sweep.diagnose(rows, size_m=0.1, **settings)
 
 
 def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):

@@ -98,7 +98,7 @@ def observation(seed, pairs):
     rng = np.random.default_rng([39, seed])
     while True:
         rows = scene(rng)
-        looked_for = [cause.name for cause in CAUSES if not cause.applies(rows)]
+        looked_for = [cause.name for cause in CAUSES if not cause.lacks(rows)]
         if pairs:
             names = rng.choice([name for name in looked_for if name in PAIRED], 2, replace=False)
         else:

@@ -10,11 +10,14 @@ from __future__ import annotations
 from sweep.analysis.ambiguities import ambiguity
 from sweep.analysis.camera_calibration import calibration_summary, camera_calibrations
 from sweep.analysis.comparisons import compare, renderer_bias, store_differences
-from sweep.analysis.detection_limits import detection_limit
+from sweep.analysis.decisions import (
+    detection_limit,
+    farthest_met,
+    precision_reached,
+    requirement_limits,
+)
 from sweep.analysis.error_models import error_models, model_covariance, model_errors
-from sweep.analysis.limits import farthest_met, requirement_limits
 from sweep.analysis.poses import per_marker
-from sweep.analysis.precision import precision_reached
 from sweep.analysis.rates import detection_rate, failure_composition, flip_rate, marker_ranking
 from sweep.analysis.requirements import check_requirements
 from sweep.analysis.simulation_gaps import simulation_gap

@@ -15,9 +15,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Count, Rate, scaled_to_draws
 from sweep.analysis.dataset import (
     as_names,
     configuration_axes,
@@ -26,11 +23,19 @@ from sweep.analysis.dataset import (
     kept_dimensions,
     stacked,
 )
-from sweep.analysis.draws import TAIL_SHARE
+from sweep.analysis.estimator import (
+    INTERVAL,
+    TAIL_SHARE,
+    Bins,
+    Count,
+    Rate,
+    Statistic,
+    aggregate,
+    scaled_to_draws,
+)
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
-from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag

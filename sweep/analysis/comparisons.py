@@ -12,9 +12,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Count, CountOfDraws, Rate, newcombe_and_mcnemar
 from sweep.analysis.dataset import (
     DRAWS,
     as_names,
@@ -29,9 +26,21 @@ from sweep.analysis.dataset import (
     require_poses,
     stored_pipeline,
 )
-from sweep.analysis.draws import stopped_level
+from sweep.analysis.estimator import (
+    INTERVAL,
+    Arrays,
+    Bins,
+    Count,
+    Mean,
+    Rate,
+    RootMeanSquare,
+    RootMeanSquareRatio,
+    Statistic,
+    aggregate,
+    newcombe_and_mcnemar,
+    stopped_level,
+)
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.means import Mean, RootMeanSquare, RootMeanSquareRatio
 from sweep.analysis.poses import (
     DETECTION_INPUTS,
     ERROR_INPUTS,
@@ -43,7 +52,6 @@ from sweep.analysis.poses import (
     norm_squared,
     pose_arrays,
 )
-from sweep.analysis.statistic import INTERVAL, Arrays, Statistic
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -302,8 +310,8 @@ def paired_table(
         *_agreement("detected", lambda poses: poses.detected),
         *_agreement("solved", lambda poses: poses.solved),
         *_flipped_in_one(),
-        CountOfDraws("compared", "poses that were looked for in both",
-                     lambda pair: pair.compared),
+        Count("compared", "poses that were looked for in both",
+                     lambda pair: pair.compared, "draws", "drawn"),
         Count("run_in_one", "poses that one of the two alone ran, which are not compared",
               lambda pair: pair.first.run != pair.second.run),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",

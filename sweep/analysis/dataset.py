@@ -12,14 +12,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.poses import AXIS, DETECTION_INPUTS, REQUIRED_VARIABLES
+from sweep.analysis.poses import AXIS, DETECTION_INPUTS, NOT_LOOKED_FOR, REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.experiment.draws import REPLICATES
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
+from sweep.experiment.schema import FIXED, LABELS, SCHEMA, VARIABLES, with_descriptions
 from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.experiment.toml_text import read_document
+from sweep.measure.flags import DetectionStatus
 from sweep.messages import shown
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plugins.declared import recorded_plugins
 
 # --------------------------------------------------------------------------------------------------
@@ -236,6 +239,205 @@ def parameter_value(results: xr.Dataset, name: str) -> Any:
     if value is not None and not isinstance(value, (int, float, str)):
         raise DatasetError(f"{name}: is drawn, so that the side is not a number of the grid")
     return value
+
+
+# --------------------------------------------------------------------------------------------------
+# Replicates of Sobol' points.
+
+def is_replicated(results: xr.Dataset) -> bool:
+    """Return whether the draws of a dataset are Sobol' points."""
+    return fingerprint_of(results).get("sampling") == "sobol"
+
+
+def replicate_order(results: xr.Dataset, draws: Sequence[str]) -> NDArray[np.intp] | None:
+    """Return the indices of the trials, those of each replicate together; None if not replicated.
+
+    ``draws`` are the pooled dimensions of draws.
+
+    Raises
+    ------
+    DatasetError
+        If the dataset does not have equally many trials of each replicate.
+    """
+    if not is_replicated(results) or DRAWS not in draws:
+        return None
+    trials = results[DRAWS].to_numpy().astype(np.int64)
+    replicate = trials % REPLICATES
+    counts = np.bincount(replicate, minlength=REPLICATES)
+    if len(set(counts.tolist())) > 1:
+        raise DatasetError(
+            f"{DRAWS}: not equally many of each of the {REPLICATES} replicates of Sobol' points "
+            f"(sampling = sobol); keep a multiple of {REPLICATES} in a row, from a multiple of "
+            f"{REPLICATES} on"
+        )
+    return np.argsort(replicate, kind="stable")
+
+
+# --------------------------------------------------------------------------------------------------
+# Trials that all pooled cells have, where sampling was stopped, and scenes that were computed.
+#
+# Conditions that are hard to judge have more trials. A rate over conditions that counts all of
+# them would be one of mostly hard ones. So what is pooled is pooled over the trials that all
+# pooled cells have: each counts as it does in a store of equally many trials. Cells in which no
+# pose was looked for have nothing to count, and do not lessen these trials.
+
+NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
+"""Flags of the trials that a cell does not have."""
+
+
+def common_trials(
+    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]
+) -> xr.DataArray | None:
+    """Return which trials all pooled cells have, computed; None if no cells are pooled.
+
+    Parameters
+    ----------
+    results
+        The dataset that names the axes.
+    inputs
+        Arrays by name; those whose name ends with ``detection`` hold flags of detection, and a
+        trial must be in each.
+    kept
+        The dimensions that are not pooled.
+    """
+    scene = [name for name in axes_of(results, Stage.scene) if name != DRAWS]
+    pooled = [name for name in scene if name not in kept]
+    flags = [array for name, array in inputs.items() if name.split()[-1] == "detection"]
+    if not pooled or not flags or DRAWS not in flags[0].dims:
+        return None
+    common = None
+    for array in flags:
+        # All configurations of a scene that is needed are computed.
+        one = array.isel({dim: 0 for dim in array.dims if dim not in (*scene, DRAWS)}, drop=True)
+        one = one.fillna(0) if one.dtype.kind == "f" else one
+        counted = (~one.isin(NOT_LOOKED_FOR)).any(DRAWS)
+        available = (~one.isin(NOT_AVAILABLE) | ~counted).all(
+            [name for name in pooled if name in one.dims])
+        common = available if common is None else common & available
+    return None if common is None else common.reset_coords(drop=True).compute()
+
+
+def with_common_trials(results: xr.Dataset, kept: Sequence[str]) -> xr.Dataset:
+    """Return a dataset in which only trials that all pooled cells have are run.
+
+    The same dataset unless sampling was stopped in it.
+    """
+    if not is_sampling_stopped(results):
+        return results
+    common = common_trials(results, {"detection": results["detection"]}, kept)
+    if common is None:
+        return results
+    flags = {name: results[name] for name in ("detection", "estimate", "flipped")
+             if name in results}
+    return results.assign({
+        name: array.where(common, VARIABLES[name].not_needed).astype(np.uint8).assign_attrs(
+            array.attrs)
+        for name, array in flags.items()})
+
+
+def computed_scenes(results: xr.Dataset) -> xr.DataArray:
+    """Return which scenes are computed (bool, over the axes of the scene).
+
+    All configurations of a scene are computed, or none.
+    """
+    flags = results["detection"]
+    first = {name: 0 for name in configuration_axes(results) if name in flags.dims}
+    return ~flags.isel(first, drop=True).isin(NOT_AVAILABLE)
+
+
+# --------------------------------------------------------------------------------------------------
+# The side of the black square in pixels, over the axes that change it.
+
+SIZE_AXES = ("side_px", "distance_m")
+"""The usual axes along which the size in the image changes."""
+
+SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
+"""What the side depends on: itself, or distance, size and camera."""
+
+
+def image_sides(
+    results: xr.Dataset, bins: Mapping[str, Sequence[float]]
+) -> xr.DataArray:
+    """Return the sides as if the square were parallel to the image plane: fx · size / distance.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run.
+    bins
+        Edges of drawn parameters, whose bins' middles take the place of the draws.
+
+    Returns
+    -------
+    xr.DataArray
+        Sides in pixels over the dimensions that change them, bins' names among these.
+
+    Raises
+    ------
+    DatasetError
+        If they cannot be computed, or are drawn and not in bins.
+    """
+    middles = {name: (name, (np.asarray(edges)[:-1] + np.asarray(edges)[1:]) / 2.0)
+               for name, edges in bins.items()}
+    given = {name: array for name, array in results.coords.items() if name not in bins}
+    shell = xr.Dataset(coords=given, attrs=results.attrs).assign_coords(middles)
+    for name in SIZE_PARAMETERS:
+        derived = name == "distance_m" and "side_px" in shell.coords
+        if name in shell.coords and DRAWS in shell[name].dims and not derived:
+            raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid; "
+                               f'give bins, such as bins={{"{name}": [...edges...]}}')
+    if "side_px" in shell.coords:
+        return _checked(shell["side_px"])
+    return sides_of(functools.partial(parameter_value, shell))
+
+
+def sides_of(value: Callable[[str], Any]) -> xr.DataArray:
+    """Return the sides in pixels from distance, size and camera.
+
+    Parameters
+    ----------
+    value
+        Returns the value of a parameter, or its values over the dimensions that it has.
+
+    Raises
+    ------
+    DatasetError
+        If they cannot be computed.
+    """
+    distance = value("distance_m")
+    if distance is None:
+        raise DatasetError(
+            "distance_m: is no number of this store, whose poses are given in the world; a "
+            "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
+    fx = xr.DataArray(intrinsics(*map(value, VIEW_PARAMETERS))[0])
+    return _checked(fx * value("size_m") / distance)
+
+
+def _checked(sides: xr.DataArray) -> xr.DataArray:
+    """Return sides without coordinates of fixed parameters, if all can be."""
+    sides = sides.astype(np.float64)
+    if not (np.isfinite(sides) & (sides > 0)).all():
+        raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
+                           "the distance and the camera")
+    return without_fixed(sides)
+
+
+def require_size_axes(results: xr.Dataset, sides: xr.DataArray) -> None:
+    """Raise unless the sides differ along an axis."""
+    if not sides.dims:
+        raise DatasetError(
+            "side_px or distance_m: no axis changes the size in the image; there are "
+            f"{', '.join(axes_of(results)) or 'none'}")
+
+
+def parameters_along(
+    results: xr.Dataset, axis: str, bins: Mapping[str, Sequence[float]]
+) -> list[str]:
+    """Return the names of the numbers along an axis that the sides depend on."""
+    if axis in bins:
+        return [axis]
+    return [name for name in SIZE_PARAMETERS if name in results.coords
+            and results[name].dims == (axis,) and results[name].dtype.kind in "fiu"]
 
 
 # --------------------------------------------------------------------------------------------------

@@ -5,30 +5,18 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.aggregate import aggregate
 from sweep.analysis.dataset import DRAWS, parameter_value
-from sweep.analysis.draws import Design
 from sweep.analysis.poses import (
-    DEPTH,
-    SIGNED_INPUTS,
-    Poses,
     bearing_of,
-    in_sight_frame,
-    pose_arrays,
-    sight_rotation,
     viewing_angle_of,
 )
-from sweep.analysis.statistic import Blocks, Output, Statistic, Variables
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
@@ -85,10 +73,16 @@ class BinSums:
     at: Floats
     powers: Floats
 
-    def filled(self) -> BinSums:
-        """Return the sums of the bins that have poses."""
-        some = self.count > 0
-        return BinSums(self.count[some], self.at[some], self.powers[some])
+    @classmethod
+    def of(cls, moments: Floats, quantity: int) -> BinSums:
+        """Return the sums of an error, of the bins that have poses.
+
+        ``moments`` (bins, columns) are the numbers of poses, sums of their three coordinates, and
+        of the powers of each error.
+        """
+        some = moments[moments[:, 0] > 0]
+        start = 4 + POWERS * quantity
+        return cls(some[:, 0], some[:, 1:4] / some[:, :1], some[:, start : start + POWERS])
 
     def power_mean(self, centre: Floats, power: int) -> Floats:
         """Return the mean 2nd or 4th power of the errors minus ``centre`` (bins,)."""
@@ -338,294 +332,6 @@ def grid_points(knots: Sequence[Floats]) -> Floats:
 
 
 # --------------------------------------------------------------------------------------------------
-# Sums for error models: moments of errors in bins, and how many lie within two sigma.
-
-QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
-"""Errors in the sight frame: of the position (m), and the rotation vector (rad)."""
-
-HALVES = 2
-"""The even trials and the odd ones."""
-
-MODEL, HALF, FOCAL_SIZE = "model", "half", "focal_size"
-"""Names of a block's arrays: the number of the model, the half, fx times the marker's side."""
-
-COUNTS = ("looked_for", "solved", "flipped", "judged")
-"""Columns of `Coverage` before the shares."""
-
-
-@dataclass(frozen=True)
-class Bins:
-    """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
-
-    A value at the last edge belongs to the last bin.
-    """
-
-    edges: tuple[Floats, ...]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Numbers of bins."""
-        return tuple(len(each) - 1 for each in self.edges)
-
-    def numbers(self, *values: Floats) -> tuple[Integers, NDArray[np.bool_]]:
-        """Return the flat numbers of the bins of points, and which points are in a bin."""
-        inside = np.ones(values[0].shape, dtype=bool)
-        flat = np.zeros(values[0].shape, dtype=np.int64)
-        for each, edges in zip(values, self.edges, strict=True):
-            number = np.searchsorted(edges, each, side="right") - 1
-            number = np.where(each == edges[-1], len(edges) - 2, number)
-            inside &= (number >= 0) & (number < len(edges) - 1)
-            flat = flat * (len(edges) - 1) + np.clip(number, 0, len(edges) - 2)
-        return flat, inside
-
-
-class SightErrors(Poses):
-    """Poses with their errors in the sight frame."""
-
-    @cached_property
-    def distance_m(self) -> Floats:
-        """True z of the marker's centre (...)."""
-        return np.asarray(self[DEPTH], dtype=np.float64)
-
-    @cached_property
-    def side_px(self) -> Floats:
-        """The black square's side (...), were it parallel to the image: fx · size / distance."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
-
-    @cached_property
-    def viewing_angle_deg(self) -> Floats:
-        """Angle (...) between the marker's normal and the line of sight."""
-        return viewing_angle_of(self["true_rvec"], self["true_tvec_m"])
-
-    @cached_property
-    def bearing_deg(self) -> Floats:
-        """Angle (...) between the line of sight and the optical axis."""
-        return bearing_of(self["true_tvec_m"])
-
-    @property
-    def conditions(self) -> tuple[Floats, ...]:
-        """Distance, side, viewing angle and bearing, each (...)."""
-        return self.distance_m, self.side_px, self.viewing_angle_deg, self.bearing_deg
-
-    @cached_property
-    def in_camera(self) -> Floats:
-        """Errors (..., 6) along and about the camera's axes; positions over the distance."""
-        position = self["translation_error_m"].astype(np.float64) / self.distance_m[..., None]
-        return np.concatenate(
-            [position, self["rotation_error_rad"].astype(np.float64)], axis=-1)
-
-    @cached_property
-    def in_sight(self) -> Floats:
-        """The same in the sight frame."""
-        parts = (self.in_camera[..., :3], self.in_camera[..., 3:])
-        return np.concatenate(
-            [in_sight_frame(part, self["true_tvec_m"]) for part in parts], axis=-1)
-
-    def at(self, used: NDArray[np.bool_]) -> Floats:
-        """Return ln(distance), ln(side), viewing angle and bearing of the used poses, (n, 4)."""
-        distance, side, *angles = (
-            np.broadcast_to(each, used.shape)[used] for each in self.conditions)
-        return np.stack([np.log(distance), np.log(side), *angles], axis=-1)
-
-
-@dataclass(frozen=True)
-class _OfBins(Statistic[SightErrors]):
-    """A statistic of a single variable, whose value is the array (halves, bins, columns)."""
-
-    bins: Bins
-
-    def outputs(self) -> Sequence[Output]:
-        """Return the variable."""
-        return [Output("sums", "sums over bins", "1", "O")]
-
-    def variables(self, blocks: Blocks[SightErrors], design: Design) -> Variables:  # noqa: ARG002
-        """Return an array a group."""
-        return {"sums": _objects(np.sum(blocks.map(self.of_block), axis=0))}
-
-    @abstractmethod
-    def of_block(self, poses: SightErrors) -> Floats:
-        """Return the sums (groups, halves, bins, columns) of a block."""
-
-
-@dataclass(frozen=True)
-class SeenRegion(Statistic[SightErrors]):
-    """Cells of distance, side, viewing angle and bearing with poses, and how far poses reach.
-
-    ``directions`` (directions, 4) are in ln(distance), ln(side), viewing angle and bearing.
-    """
-
-    bins: Bins
-    directions: Floats = field(repr=False)
-
-    def outputs(self) -> Sequence[Output]:
-        """Return both variables."""
-        return [Output("counts", "poses looked for in cells", "1", "O"),
-                Output("reach", "largest projections on directions and their opposites", "1", "O")]
-
-    def variables(self, blocks: Blocks[SightErrors], design: Design) -> Variables:  # noqa: ARG002
-        """Return two arrays a group."""
-        counts, reach = zip(*blocks.map(self.of_block), strict=True)
-        return {"counts": _objects(np.sum(counts, axis=0).sum(axis=1)[..., 0]),
-                "reach": _objects(np.max(reach, axis=0))}
-
-    def of_block(self, poses: SightErrors) -> tuple[Floats, Floats]:
-        """Return the poses in cells (groups, halves, cells, 1), and how far they reach.
-
-        The columns of the second (groups, 2 x directions) are the largest projection on each
-        direction, then on its opposite.
-        """
-        numbers, inside = _numbers(self.bins, poses)
-        groups = len(poses.detection)
-        shape = numbers.shape
-        counted = np.broadcast_to(poses.looked_for & (poses.distance_m > 0), shape)
-        of_group = np.broadcast_to(np.arange(groups).reshape(-1, 1, 1, 1), shape)[counted]
-        projected = poses.at(counted) @ self.directions.T
-        reach = np.full((groups, 2 * len(self.directions)), -np.inf)
-        np.maximum.at(reach, of_group, np.concatenate([projected, -projected], axis=-1))
-        used = numbers[inside]
-        return _add(self.bins, used, groups, [np.ones(len(used))]), reach
-
-
-def _objects(values: Sequence[Any] | Floats) -> NDArray[Any]:
-    """Return an array (groups,) whose elements are arrays."""
-    found = np.empty(len(values), dtype=object)
-    for group, each in enumerate(values):
-        found[group] = each
-    return found
-
-
-def _add(bins: Bins, at: Integers, groups: int, columns: Sequence[Any]) -> Floats:
-    """Return the sums (groups, halves, bins, columns) of values at flat numbers."""
-    size = groups * HALVES * math.prod(bins.shape)
-    sums = [np.bincount(at, weights=each, minlength=size) for each in columns]
-    return np.stack(sums, axis=-1).reshape(groups, HALVES, -1, len(columns)).astype(float)
-
-
-def _numbers(bins: Bins, poses: SightErrors) -> tuple[Integers, NDArray[np.bool_]]:
-    """Return the flat number of each pose's group, half and bin, and which poses have one."""
-    number, inside = bins.numbers(*poses.conditions[: len(bins.edges)])
-    groups = np.arange(len(poses.detection)).reshape(-1, 1, 1, 1)
-    flat = (groups * HALVES + poses[HALF]) * math.prod(bins.shape) + number
-    numbers, counted = np.broadcast_arrays(flat, inside & poses.looked_for)
-    return numbers, counted
-
-
-@dataclass(frozen=True)
-class BinMoments(_OfBins):
-    """Number of poses, sums of their coordinates and of the powers of each error."""
-
-    def of_block(self, poses: SightErrors) -> Floats:
-        """Return the sums of a block."""
-        numbers, inside = _numbers(self.bins, poses)
-        groups, used = len(poses.detection), inside & poses.unflipped
-        errors = np.broadcast_to(poses.in_sight, (*numbers.shape, len(QUANTITIES)))[used]
-        columns = [np.ones(len(errors)), *poses.at(used)[:, :3].T]
-        for k in range(len(QUANTITIES)):
-            power = np.ones(len(errors))
-            for _ in range(POWERS):
-                power = power * errors[:, k]
-                columns.append(power)
-        return _add(self.bins, numbers[used], groups, columns)
-
-
-@dataclass(frozen=True)
-class Moments:
-    """What `BinMoments` gives of one model: arrays (halves, bins, columns)."""
-
-    values: Floats
-
-    def of(self, quantity: int, half: int | None = None) -> BinSums:
-        """Return the sums of an error, of one half of the trials or of all."""
-        values = self.values.sum(axis=0) if half is None else self.values[half]
-        count = values[:, 0]
-        at = values[:, 1:4] / np.maximum(count, 1.0)[:, None]
-        start = 4 + POWERS * quantity
-        return BinSums(count, at, values[:, start : start + POWERS]).filled()
-
-
-    def along(self, axis: int, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """Return, of the bins along an axis, the poses and the sum of that coordinate."""
-        columns = self.values.sum(axis=0)[:, [0, 1 + axis]].reshape(*shape, 2)
-        count, total = np.moveaxis(
-            columns.sum(axis=tuple(k for k in range(len(shape)) if k != axis)), -1, 0)
-        return count, total
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """The model of each half, by which the other is judged.
-
-    ``bias`` and ``log_variance`` are (models, halves, knots, quantities), in the unit of
-    `SightErrors.in_sight`.
-    """
-
-    knots: Sequence[Floats]
-    bias: Floats
-    log_variance: Floats
-
-
-@dataclass(frozen=True)
-class Coverage(_OfBins):
-    """How many errors lie within two standard deviations of the bias, by a model of other draws.
-
-    Columns: `COUNTS`; those within, for each error in the sight frame; the same along and about the
-    camera's axes.
-    """
-
-    fitted: Fitted = field(repr=False)
-
-    def of_block(self, poses: SightErrors) -> Floats:
-        """Return the counts of a block."""
-        numbers, inside = _numbers(self.bins, poses)
-        shape = numbers.shape
-        used = inside & poses.unflipped
-        model, half = (np.broadcast_to(poses[name], shape)[used] for name in (MODEL, HALF))
-        basis = hat_basis(poses.at(used)[:, :3], self.fitted.knots)
-        other = 1 - half  # judged by the model of the other half
-        bias, log_variance = (
-            np.einsum("nk,nkq->nq", basis, each[model, other])
-            for each in (self.fitted.bias, self.fitted.log_variance))
-        sigma = np.exp(0.5 * log_variance)
-        size = (*shape, len(QUANTITIES))
-        sight = np.broadcast_to(poses.in_sight, size)[used]
-        camera = np.broadcast_to(poses.in_camera, size)[used]
-        turn = sight_rotation(np.broadcast_to(poses["true_tvec_m"], (*shape, 3))[used])
-        columns = list((np.abs(sight - bias) <= 2.0 * sigma).T.astype(float))
-        for part in (slice(0, 3), slice(3, 6)):
-            mean = np.einsum("nij,nj->ni", turn, bias[:, part])
-            spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
-            columns += list(
-                (np.abs(camera[:, part] - mean) <= 2.0 * spread).T.astype(float))
-        groups = len(poses.detection)
-        counts = _add(self.bins, np.ravel(numbers), groups, [
-            np.ravel(np.broadcast_to(each, shape) & inside).astype(float)
-            for each in (poses.looked_for, poses.solved, poses.flipped, poses.unflipped)])
-        within = _add(self.bins, numbers[used], groups, columns)
-        return np.concatenate([counts, within], axis=-1)
-
-
-def sums_of(
-    results: xr.Dataset, kept: Sequence[str], focal_size: xr.DataArray,
-    *statistics: _OfBins | SeenRegion,
-) -> dict[str, list[Any]]:
-    """Return the arrays of each model by the statistics' variables, in the kept axes' order.
-
-    ``sums`` are (halves, bins, columns), ``counts`` (cells,) and ``reach`` (2 x directions,).
-    """
-    sizes = [results.sizes[name] for name in kept]
-    half = np.asarray(results[DRAWS].values) % HALVES
-    inputs: Mapping[str, xr.DataArray] = pose_arrays(results, SIGNED_INPUTS) | {
-        MODEL: xr.DataArray(np.arange(int(np.prod(sizes))).reshape(sizes), dims=tuple(kept)),
-        HALF: xr.DataArray(half.astype(np.int64), dims=DRAWS),
-        FOCAL_SIZE: focal_size,
-    }
-    table = aggregate(results, inputs, kept, statistics, SightErrors)
-    return {str(name): list(values.transpose(*kept).values.ravel())
-            for name, values in table.data_vars.items()}
-
-
-# --------------------------------------------------------------------------------------------------
 # Conditions of error models: their bins in a dataset, and the joint region that was seen.
 
 PREDICTORS = {"distance_m": True, "side_px": True, "viewing_angle_deg": False}
@@ -669,6 +375,32 @@ comes that of `CORNER`."""
 CORNER = 3.0
 """Of n draws uniform in a square none lies in a corner of area 3 / n with a probability of 5 %:
 by the root of it sums and differences may leave the seen ones, too."""
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
+
+    A value at the last edge belongs to the last bin.
+    """
+
+    edges: tuple[Floats, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of bins."""
+        return tuple(len(each) - 1 for each in self.edges)
+
+    def numbers(self, *values: Floats) -> tuple[Integers, NDArray[np.bool_]]:
+        """Return the flat numbers of the bins of points, and which points are in a bin."""
+        inside = np.ones(values[0].shape, dtype=bool)
+        flat = np.zeros(values[0].shape, dtype=np.int64)
+        for each, edges in zip(values, self.edges, strict=True):
+            number = np.searchsorted(edges, each, side="right") - 1
+            number = np.where(each == edges[-1], len(edges) - 2, number)
+            inside &= (number >= 0) & (number < len(edges) - 1)
+            flat = flat * (len(edges) - 1) + np.clip(number, 0, len(edges) - 2)
+        return flat, inside
 
 
 def focal_size_of(results: xr.Dataset) -> xr.DataArray:
@@ -786,7 +518,7 @@ def region_directions(found: Mapping[str, Floats]) -> Floats:
 
 
 def region_ends(directions: Floats, reach: Floats, draws: Floats) -> tuple[Floats, Floats]:
-    """Return the ends (models, directions) of the region along directions, from `SeenRegion`.
+    """Return the ends (models, directions) of the region along directions, from `error_models`.
 
     An end has a margin for rounding; where there is hardly an extent, as wide as what counts as
     the same; of sums and differences `SLACK` and what so many ``draws`` (models,) in each cell of
@@ -890,15 +622,18 @@ def _edges(name: str, values: Floats, count: int) -> Floats:
     return np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
 
 
-def knot_values(bins: Bins, moments: Sequence[Moments]) -> list[Floats]:
+def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
     """Return the values that may be knots: of each axis the means of its bins, and both ends.
 
-    Where a bin is a single value that is the value itself.
+    Where a bin is a single value that is the value itself. ``moments`` (bins, 4) are the numbers of
+    poses and the sums of their coordinates.
     """
     knots = []
+    columns = moments.reshape(*bins.shape, 4)
     for axis, (logarithmic, edges) in enumerate(
             zip(PREDICTORS.values(), bins.edges, strict=True)):
-        count, total = np.sum([each.along(axis, bins.shape) for each in moments], axis=0)
+        others = tuple(k for k in range(len(bins.shape)) if k != axis)
+        count, total = np.moveaxis(columns[..., [0, 1 + axis]].sum(axis=others), -1, 0)
         middle = total[count > 0] / count[count > 0]
         ends = np.log(edges[[0, -1]]) if logarithmic else edges[[0, -1]]
         if len(middle) > 1:

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+import math
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sweep.analysis.dataset import DRAWS, axes_of, is_grid_axis, kept_dimensions, with_sampling
 from sweep.analysis.error_model_fit import (
     CONDITIONS,
-    COUNTS,
-    HALVES,
     PREDICTORS,
-    QUANTITIES,
-    BinMoments,
     Bins,
     BinSums,
-    Coverage,
     Fit,
-    Fitted,
-    Moments,
-    SeenRegion,
     bins_and_cells,
     choose_knots,
     differences,
@@ -37,16 +32,24 @@ from sweep.analysis.error_model_fit import (
     region_directions,
     region_ends,
     select_knots,
-    sums_of,
     union,
 )
+from sweep.analysis.estimator import INTERVAL, Columns, arranged
 from sweep.analysis.intervals import DEVIATIONS
-from sweep.analysis.poses import SIGNED_INPUTS, bearing_of, pose_arrays, sight_rotation
-from sweep.analysis.statistic import INTERVAL
+from sweep.analysis.poses import (
+    DEPTH,
+    SIGNED_INPUTS,
+    Poses,
+    bearing_of,
+    in_sight_frame,
+    pose_arrays,
+    sight_rotation,
+    viewing_angle_of,
+)
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.typing import Floats, Integers, Masks
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Error models: bias and standard deviation of a pose over distance, side and viewing angle.
@@ -88,6 +91,18 @@ class Use(Flag):
     few_draws = flag(4, "Fewer than 100 held-out poses: not judged, must not be used.")
     flips = flag(5, "More than 2 % of the poses are flipped: must not be used.")
     rarely_solved = flag(6, "Less than 90 % of the poses are solved: must not be used.")
+
+
+
+
+UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree",
+         "bearing_deg": "degree"}
+WORDS = {
+    "distance_m": "the distance along the optical axis",
+    "side_px": "the side of the black square, were it parallel to the image",
+    "viewing_angle_deg": "the angle between the marker's normal and the line of sight",
+    "bearing_deg": "the angle between the line of sight and the optical axis",
+}
 
 
 def error_models(results: xr.Dataset) -> xr.Dataset:
@@ -157,43 +172,51 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     found = distinct_values(results, focal_size)
     bins, cells = bins_and_cells(results, focal_size, found)
     (region, drawn), directions = region_cells(results, found), region_directions(found)
-    sums = sums_of(results, kept, focal_size, BinMoments(bins), SeenRegion(region, directions))
-    moments = [Moments(each) for each in sums["sums"]]
+    inputs = pose_arrays(results, SIGNED_INPUTS) | {
+        HALF: (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS),
+        FOCAL_SIZE: focal_size}
+    columns = Columns(arranged(results, inputs, kept)[1], SightErrors)
+    moments = columns.sums(functools.partial(_moments, bins))
     _check_solved(moments, results, kept)
-    values = knot_values(bins, moments)
-    selected = [[select_knots(each.of(k, 0), each.of(k, 1), values) for k in range(len(QUANTITIES))]
-                for each in moments]
+    values = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
+    selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), values)
+                 for k in range(len(QUANTITIES))] for model in moments]
     shown = [choose_knots(values[0], SHOWN_DISTANCES), *(each[:1] for each in values[1:])]
     knots = union([each for model in selected for each in [*model, shown]])
-    points = grid_points(knots)
-
-    def fits(half: int | None) -> list[list[Fit]]:
-        return [[_fit(each.of(k, half), own[k], points) for k in range(len(QUANTITIES))]
-                for each, own in zip(moments, selected, strict=True)]
-
-    halves = [fits(half) for half in range(HALVES)]
-    fitted = Fitted(knots, *(
-        np.array([[[getattr(fit, name) for fit in half[model]] for half in halves]
-                  for model in range(len(moments))]).transpose(0, 1, 3, 2)
-        for name in ("bias", "log_variance")))
-    judged = sums_of(results, kept, focal_size, Coverage(cells, fitted))["sums"]
+    # The model of each half, by which the other is judged:
+    # (models, halves, knots, quantities, 2).
+    fitted = np.array([
+        [[(fit.bias, fit.log_variance) for fit in _fits(half, own, knots)] for half in model]
+        for model, own in zip(moments, selected, strict=True)]).transpose(0, 1, 4, 2, 3)
+    judged = columns.sums(functools.partial(_within, cells, knots, fitted))
+    seen = columns.sums(lambda poses, _: _counted(region, poses))
+    reach = columns.sums(lambda poses, _: _reach(directions, poses), np.maximum)
+    tables = []
+    for number, (whole, own) in enumerate(zip(moments.sum(axis=1), selected, strict=True)):
+        tables.append({
+            **_knot_variables(_fits(whole, own, knots), knots), **_exponents(whole),
+            **_cell_variables(judged[number], cells),
+            **_region_variables(region, drawn, directions, seen[number], reach[number]),
+            "knots": (("quantity", "predictor"), np.array([[*map(len, each)] for each in own]),
+                      cf_attributes("knots that the error needs", "1"))})
     shape = tuple(results.sizes[name] for name in kept)
-    table = _knot_variables(fits(None), knots, kept, shape)
-    table |= _cell_variables(judged, cells, kept, shape)
-    table |= _exponents(moments, kept, shape)
-    table |= _region_variables(sums, region, drawn, directions, kept, shape)
-    table["knots"] = ((*kept, "quantity", "predictor"), np.array(
-        [[[len(each) for each in own] for own in model] for model in selected],
-    ).reshape(*shape, len(QUANTITIES), -1), cf_attributes("knots that the error needs", "1"))
+    variables: dict[str, Any] = {
+        name: ((*kept, *dims), np.stack([table[name][1] for table in tables]).reshape(
+            (*shape, *first.shape)), attributes)
+        for name, (dims, first, attributes) in tables[0].items()}
+    variables["direction_weight"] = (("direction", "condition"), directions, cf_attributes(
+        "weights of ln(distance), ln(side), viewing angle and bearing", ""))
     coordinates: dict[str, Any] = {
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
-    for (name, logarithmic), own, edges in zip(
+    for (name, logarithmic), at_knots, edges in zip(
             PREDICTORS.items(), knots, cells.edges, strict=True):
         attributes = {"units": UNITS[name], "long_name": f"knots of {WORDS[name]}"}
         # A knot at an end must not leave the domain by the rounding of its logarithm.
-        plain = np.clip(np.exp(own), edges[0], edges[-1]) if logarithmic else own
+        plain = at_knots
+        if logarithmic:
+            plain = np.clip(np.exp(at_knots), edges[0], edges[-1])
         coordinates[name] = (name, plain, attributes)
         for ending, ends in (("low", edges[:-1]), ("high", edges[1:])):
             coordinates[f"cell_{name}_{ending}"] = (f"cell_{name}", ends, {
@@ -202,26 +225,22 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         coordinates[f"region_{name}"] = (f"region_{name}", edges[:-1], {
             "units": UNITS[name], "long_name": f"low end of cells of the region of {WORDS[name]}"})
     focal = focal_size.astype(np.float64)
-    return with_sampling(xr.Dataset(table, coordinates, attrs={
+    return with_sampling(xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal.mean()),
         "focal_size_varies": int(float(focal.max()) > float(focal.min()) * (1 + 1e-9)),
     }), results)
 
 
-UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree",
-         "bearing_deg": "degree"}
-WORDS = {
-    "distance_m": "the distance along the optical axis",
-    "side_px": "the side of the black square, were it parallel to the image",
-    "viewing_angle_deg": "the angle between the marker's normal and the line of sight",
-    "bearing_deg": "the angle between the line of sight and the optical axis",
-}
-
-
-def _fit(sums: BinSums, knots: Sequence[Floats], points: Floats) -> Fit:
-    """Return the fit with some knots, at points (n, 3)."""
-    fit = fit_error(sums, hat_basis(sums.at, knots), differences(knots))
-    return fit.at(hat_basis(points, knots))
+def _fits(
+    moments: Floats, own: Sequence[Sequence[Floats]], knots: Sequence[Floats]
+) -> list[Fit]:
+    """Return the fits of the errors with their own knots, at those of all."""
+    points, fits = grid_points(knots), []
+    for quantity, of_error in enumerate(own):
+        sums = BinSums.of(moments, quantity)
+        fit = fit_error(sums, hat_basis(sums.at, of_error), differences(of_error))
+        fits.append(fit.at(hat_basis(points, of_error)))
+    return fits
 
 
 def is_kept(name: str, results: xr.Dataset) -> bool:
@@ -243,152 +262,268 @@ def _check_drawn(results: xr.Dataset, kept: Sequence[str]) -> None:
             "more, and with something drawn, such as azimuth_deg = { uniform = [0, 360] }")
 
 
-def _check_solved(
-    moments: Sequence[Moments], results: xr.Dataset, kept: Sequence[str]
-) -> None:
+Table = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
+"""Variables of one model: dimensions, values, attributes."""
+
+
+def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:
     """Raise DatasetError if a configuration has too few solved poses."""
-    for number, each in enumerate(moments):
-        solved = min(int(each.of(0, half).count.sum()) for half in range(HALVES)) * HALVES
-        if solved < MIN_POSES:
+    solved = moments[..., 0].sum(axis=2).min(axis=1).astype(int) * HALVES
+    for number, count in enumerate(solved.tolist()):
+        if count < MIN_POSES:
             index = np.unravel_index(number, [results.sizes[name] for name in kept])
             which = ", ".join(f"{name} = {results[name].values[k]}"
                               for name, k in zip(kept, index, strict=True))
             raise DatasetError(
-                f"{which + ': ' if which else ''}{solved:,} solved poses that are not flipped; an "
+                f"{which + ': ' if which else ''}{count:,} solved poses that are not flipped; an "
                 f"error model needs {MIN_POSES} or more: more trials, or larger sides")
 
 
 def _region_variables(
-    sums: Mapping[str, Any], region: Bins, drawn: Sequence[int], directions: Floats,
-    kept: Sequence[str], shape: tuple[int, ...],
-) -> dict[str, Any]:
-    """Return the joint region of the conditions that was seen, of each model."""
-    counts = np.stack(sums["counts"]).reshape(-1, *region.shape)
-    of_grid = counts.sum(axis=tuple(1 + k for k in drawn)).reshape(len(counts), -1)
-    draws = np.where(of_grid > 0, of_grid, np.inf).min(axis=1)
-    low, high = region_ends(directions, np.stack(sums["reach"]), draws)
-    seen = (counts > 0).reshape(*shape, *region.shape)
-    dims = (*kept, "direction")
+    region: Bins, drawn: Sequence[int], directions: Floats, counts: Floats, reach: Floats
+) -> Table:
+    """Return the joint region of the conditions that was seen.
+
+    ``counts`` (halves, cells, 1) are the poses looked for, ``reach`` their projections.
+    """
+    cells = counts.sum(axis=(0, 2)).reshape(region.shape)
+    of_grid = cells.sum(axis=tuple(drawn))
+    draws = np.where(of_grid > 0, of_grid, np.inf).min()
+    low, high = region_ends(directions, reach[None], np.array([draws]))
     return {
-        "direction_weight": (("direction", "condition"), directions, cf_attributes(
-            "weights of ln(distance), ln(side), viewing angle and bearing", "")),
-        "region_low": (dims, low.reshape(*shape, -1), cf_attributes(
+        "region_low": (("direction",), low[0], cf_attributes(
             "smallest weighted sum of a direction in the region", "")),
-        "region_high": (dims, high.reshape(*shape, -1), cf_attributes(
+        "region_high": (("direction",), high[0], cf_attributes(
             "largest weighted sum of a direction in the region", "")),
-        "region_seen": ((*kept, *(f"region_{name}" for name in CONDITIONS)), seen, cf_attributes(
+        "region_seen": (tuple(f"region_{name}" for name in CONDITIONS), cells > 0, cf_attributes(
             "whether a cell of the conditions has poses", "1")),
     }
 
 
-def _unscaled(values: Floats, distance_m: Floats) -> Floats:
-    """Return values (quantities, distances, sides, angles) of positions in metres."""
+def _metres(distance_m: Floats) -> Floats:
+    """Return what errors (quantities, distances) are multiplied with: positions with distances."""
     scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
-    factors = scale * distance_m + (1.0 - scale)
-    return np.asarray(values * factors[:, :, None, None])
+    return np.asarray(scale * distance_m + (1.0 - scale))
 
 
-def _knot_variables(
-    fits: Sequence[Sequence[Fit]], knots: Sequence[Floats], kept: Sequence[str],
-    shape: tuple[int, ...],
-) -> dict[str, Any]:
-    grid, z = [len(each) for each in knots], DEVIATIONS
-    distance = np.exp(knots[0])
-    dims = (*kept, "quantity", *PREDICTORS)
-
-    def stacked(value: Any) -> Floats:
-        return np.stack([
-            _unscaled(np.stack([value(fit).reshape(grid) for fit in each]), distance)
-            for each in fits]).reshape(*shape, len(QUANTITIES), *grid)
-
-    variables = {}
-    for (ending, words), side in zip(INTERVAL.items(), (0.0, -z, z), strict=True):
-        variables[f"sigma{ending}"] = (dims, stacked(
-            lambda fit, side=side: np.exp(
-                0.5 * (fit.log_variance + side * fit.log_variance_error))),
-            cf_attributes(f"{words}standard deviation of the error", "m, radian"))
-        variables[f"bias{ending}"] = (dims, stacked(
-            lambda fit, side=side: fit.bias + side * fit.bias_error),
-            cf_attributes(f"{words}mean error, estimated minus true", "m, radian"))
-    return variables
+def _knot_variables(fits: Sequence[Fit], knots: Sequence[Floats]) -> Table:
+    """Return sigma and bias of each error at the knots, with their intervals."""
+    shape = (len(QUANTITIES), *map(len, knots))
+    metres = _metres(np.exp(knots[0]))[:, :, None, None]
+    table: Table = {}
+    for (ending, words), side in zip(INTERVAL.items(), (0.0, -1.0, 1.0), strict=True):
+        by_name = {
+            "sigma": ("standard deviation of the error", [np.exp(0.5 * (
+                fit.log_variance + side * DEVIATIONS * fit.log_variance_error)) for fit in fits]),
+            "bias": ("mean error, estimated minus true", [
+                fit.bias + side * DEVIATIONS * fit.bias_error for fit in fits])}
+        table |= {f"{name}{ending}": (
+            ("quantity", *PREDICTORS), np.stack(values).reshape(shape) * metres,
+            cf_attributes(f"{words}{meaning}", "m, radian"))
+            for name, (meaning, values) in by_name.items()}
+    return table
 
 
-def _cell_variables(
-    judged: Sequence[Floats], bins: Bins, kept: Sequence[str], shape: tuple[int, ...],
-) -> dict[str, Any]:
-    cells = tuple(f"cell_{name}" for name in PREDICTORS)
-    halves = np.stack(judged)  # (models, halves, cells, columns)
-    sums = halves.sum(axis=1)
-    counts = {name: np.rint(sums[..., k]).astype(np.int64) for k, name in enumerate(COUNTS)}
-    n = counts["judged"]
+def _cell_variables(halves: Floats, bins: Bins) -> Table:
+    """Return whether the model may be used in cells; ``halves`` (halves, cells, columns)."""
+    sums = halves.sum(axis=0)
+    looked_for, solved, flipped, n = np.rint(sums[:, : len(COUNTS)]).astype(np.int64).T
+    shown = slice(len(COUNTS), len(COUNTS) + len(QUANTITIES))
     with np.errstate(invalid="ignore", divide="ignore"):
-        shares = sums[..., len(COUNTS):] / n[..., None]
-        flip_rate = counts["flipped"] / counts["solved"]
-        solved_rate = counts["solved"] / counts["looked_for"]
-        low, high = _limits(n)
-        half_low, half_high = _limits(halves[..., COUNTS.index("judged")], 2.0)
-        of_half = halves[..., len(COUNTS) : len(COUNTS) + len(QUANTITIES)] / (
-            halves[..., [COUNTS.index("judged")]])
-    coverage, camera = shares[..., : len(QUANTITIES)], shares[..., len(QUANTITIES):]
+        coverage, camera = np.split(sums[:, len(COUNTS):] / n[:, None], 2, axis=1)
+        flip_rate, solved_rate = flipped / solved, solved / looked_for
+        of_half = halves[..., shown] / halves[..., [COUNTS.index("judged")]]
+        spread, spread_of_half = (np.sqrt(NOMINAL * (1.0 - NOMINAL) / count)[..., None]
+                                  for count in (n, halves[..., COUNTS.index("judged")]))
+    # Limits are wider by a standard error, of each half by two.
+    low, high = (
+        (sign * (coverage - limit) > spread) | (
+            sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=0)
+        for sign, limit in zip((-1.0, 1.0), COVERAGE, strict=True))
     use = np.select(
-        [(counts["looked_for"] == 0)[..., None], (solved_rate < MIN_DETECTION)[..., None],
-         (flip_rate > MAX_FLIPS)[..., None], (n < MIN_JUDGED)[..., None],
-         (coverage < low) | (of_half < half_low).any(axis=1),
-         (coverage > high) | (of_half > half_high).any(axis=1)],
+        [(looked_for == 0)[:, None], (solved_rate < MIN_DETECTION)[:, None],
+         (flip_rate > MAX_FLIPS)[:, None], (n < MIN_JUDGED)[:, None], low, high],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
-        Use.holds)
-
-    def by_cell(values: Any, meaning: str, units: str = "1", **options: Any) -> Any:
-        attributes = cf_attributes(meaning, units, **options)
-        if values.ndim == 2:
-            return (*kept, *cells), values.reshape(*shape, *bins.shape), attributes
-        values = np.moveaxis(values, -1, 1).reshape(*shape, len(QUANTITIES), *bins.shape)
-        return (*kept, "quantity", *cells), values, attributes
-
-    return {
-        "coverage": by_cell(coverage, "share of held-out errors within two sigma of the bias"),
-        "camera_coverage": by_cell(
-            camera, "the same along and about the camera's own axes"),
-        "use": by_cell(use.astype(np.uint8), "whether the model may be used", "", flags=Use),
-        "judged": by_cell(n, "held-out poses that were judged"),
-        "looked_for": by_cell(counts["looked_for"], "poses looked for"),
-        "solved_rate": by_cell(solved_rate, "solved of the poses looked for"),
-        "flip_rate": by_cell(flip_rate, "nearer to the mirror of the truth, of the solved"),
-    }
+        Use.holds).astype(np.uint8)
+    cells = tuple(f"cell_{name}" for name in PREDICTORS)
+    by_quantity = {
+        "coverage": (coverage, cf_attributes("share of held-out errors within two sigma of the "
+                                             "bias", "1")),
+        "camera_coverage": (camera, cf_attributes(
+            "the same along and about the camera's own axes", "1")),
+        "use": (use, cf_attributes("whether the model may be used", "", flags=Use))}
+    by_cell = {
+        "judged": (n, "held-out poses that were judged"),
+        "looked_for": (looked_for, "poses looked for"),
+        "solved_rate": (solved_rate, "solved of the poses looked for"),
+        "flip_rate": (flip_rate, "nearer to the mirror of the truth, of the solved")}
+    return {name: (("quantity", *cells), values.T.reshape(-1, *bins.shape), attributes)
+            for name, (values, attributes) in by_quantity.items()} | {
+        name: (cells, values.reshape(bins.shape), cf_attributes(meaning, "1"))
+        for name, (values, meaning) in by_cell.items()}
 
 
-def _limits(n: Integers | Floats, errors: float = 1.0) -> tuple[Floats, Floats]:
-    """Return the limits of the coverage of n errors (..., 1): wider by some standard errors."""
-    with np.errstate(divide="ignore"):
-        spread = errors * np.sqrt(NOMINAL * (1.0 - NOMINAL) / n)[..., None]
-    return COVERAGE[0] - spread, COVERAGE[1] + spread
-
-
-def _exponents(
-    moments: Sequence[Moments], kept: Sequence[str], shape: tuple[int, ...]
-) -> dict[str, Any]:
+def _exponents(moments: Floats) -> Table:
     """Return the power of the distance, or of the side, with which sigma goes."""
-    z, values = DEVIATIONS, np.full((3, len(moments), len(QUANTITIES)), np.nan)
-    for model, each in enumerate(moments):
-        for k in range(len(QUANTITIES)):
-            sums = each.of(k)
-            some = sums.at[sums.count > 0]
-            axis = 0 if np.ptp(some[:, 0]) > 0.05 or np.ptp(some[:, 1]) < 0.05 else 1
-            if np.ptp(some[:, axis]) < 0.05:
-                continue
-            angles = np.unique(np.quantile(some[:, 2], [0, 0.25, 0.5, 0.75, 1]).round(3))
-            design = np.concatenate(
-                [sums.at[:, [axis]], hat_basis(sums.at[:, [2]], [angles])], axis=1)
-            fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
-            metres = 1.0 if axis == 0 and k < 3 else 0.0
-            slope, error = 0.5 * fit.log_variance[0] + metres, 0.5 * fit.log_variance_error[0]
-            values[:, model, k] = slope, slope - z * error, slope + z * error
+    values = np.full((3, len(QUANTITIES)), np.nan)
+    for k in range(len(QUANTITIES)):
+        sums = BinSums.of(moments, k)
+        axis = 0 if np.ptp(sums.at[:, 0]) > 0.05 or np.ptp(sums.at[:, 1]) < 0.05 else 1
+        if np.ptp(sums.at[:, axis]) < 0.05:
+            continue
+        angles = np.unique(np.quantile(sums.at[:, 2], [0, 0.25, 0.5, 0.75, 1]).round(3))
+        design = np.concatenate([sums.at[:, [axis]], hat_basis(sums.at[:, [2]], [angles])], axis=1)
+        fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
+        metres = 1.0 if axis == 0 and k < 3 else 0.0
+        half = DEVIATIONS * 0.5 * fit.log_variance_error[0]
+        values[:, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
     words = "power of the distance (of the side, if only that varies) with which sigma goes"
-    return {
-        f"exponent{ending}": ((*kept, "quantity"), each.reshape(*shape, -1),
-                              cf_attributes(text + words, "1"))
-        for (ending, text), each in zip(INTERVAL.items(), values, strict=True)
-    }
+    return {f"exponent{ending}": (("quantity",), each, cf_attributes(text + words, "1"))
+            for (ending, text), each in zip(INTERVAL.items(), values, strict=True)}
+
+
+# --------------------------------------------------------------------------------------------------
+# Sums of a block's poses, in bins: moments of errors, and how many lie within two sigma.
+
+QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+"""Errors in the sight frame: of the position (m), and the rotation vector (rad)."""
+
+HALVES = 2
+"""The even trials and the odd ones."""
+
+HALF, FOCAL_SIZE = "half", "focal_size"
+"""Names of a block's arrays: the half, fx times the marker's side."""
+
+COUNTS = ("looked_for", "solved", "flipped", "judged")
+"""Columns of what is judged before the shares."""
+
+
+class SightErrors(Poses):
+    """Poses with their errors in the sight frame."""
+
+    @cached_property
+    def distance_m(self) -> Floats:
+        """True z of the marker's centre (...)."""
+        return np.asarray(self[DEPTH], dtype=np.float64)
+
+    @cached_property
+    def side_px(self) -> Floats:
+        """The black square's side (...), were it parallel to the image: fx · size / distance."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
+
+    @cached_property
+    def viewing_angle_deg(self) -> Floats:
+        """Angle (...) between the marker's normal and the line of sight."""
+        return viewing_angle_of(self["true_rvec"], self["true_tvec_m"])
+
+    @cached_property
+    def bearing_deg(self) -> Floats:
+        """Angle (...) between the line of sight and the optical axis."""
+        return bearing_of(self["true_tvec_m"])
+
+    @property
+    def conditions(self) -> tuple[Floats, ...]:
+        """Distance, side, viewing angle and bearing, each (...)."""
+        return self.distance_m, self.side_px, self.viewing_angle_deg, self.bearing_deg
+
+    @cached_property
+    def in_camera(self) -> Floats:
+        """Errors (..., 6) along and about the camera's axes; positions over the distance."""
+        position = self["translation_error_m"].astype(np.float64) / self.distance_m[..., None]
+        return np.concatenate(
+            [position, self["rotation_error_rad"].astype(np.float64)], axis=-1)
+
+    @cached_property
+    def in_sight(self) -> Floats:
+        """The same in the sight frame."""
+        parts = (self.in_camera[..., :3], self.in_camera[..., 3:])
+        return np.concatenate(
+            [in_sight_frame(part, self["true_tvec_m"]) for part in parts], axis=-1)
+
+    def at(self, used: Masks) -> Floats:
+        """Return ln(distance), ln(side), viewing angle and bearing of the used poses, (n, 4)."""
+        distance, side, *angles = (self.used(each, used) for each in self.conditions)
+        return np.stack([np.log(distance), np.log(side), *angles], axis=-1)
+
+    @staticmethod
+    def used(values: NDArray[Any], used: Masks) -> NDArray[Any]:
+        """Return the values (n, ...) of the used poses."""
+        return np.broadcast_to(values, (*used.shape, *values.shape[used.ndim:]))[used]
+
+
+def _add(bins: Bins, poses: SightErrors, used: Masks, columns: Sequence[Any]) -> Floats:
+    """Return sums (groups, halves, bins, columns) over the used poses that lie in a bin.
+
+    ``used`` has the shape of the poses' flags; columns are (n,) of all used ones, or 1 each.
+    """
+    number, inside = bins.numbers(*poses.conditions[: len(bins.edges)])
+    groups, size = len(poses.detection), math.prod(bins.shape)
+    flat = (np.arange(groups).reshape(-1, 1, 1, 1) * HALVES + poses[HALF]) * size + number
+    at = np.broadcast_to(flat, used.shape)[used]
+    within = np.broadcast_to(inside, used.shape)[used]
+    sums = [np.bincount(at, np.where(within, each, 0.0), groups * HALVES * size)
+            for each in columns]
+    return np.stack(sums, axis=-1).reshape(groups, HALVES, size, len(columns)).astype(float)
+
+
+def _counted(bins: Bins, poses: SightErrors) -> Floats:
+    """Return the numbers of poses looked for, (groups, halves, bins, 1)."""
+    return _add(bins, poses, poses.looked_for, [1.0])
+
+
+def _reach(directions: Floats, poses: SightErrors) -> Floats:
+    """Return how far the poses looked for reach, (groups, 2 x directions).
+
+    That is the largest projection on each direction (directions, 4) in ln(distance), ln(side),
+    viewing angle and bearing, then on its opposite.
+    """
+    shape = poses.looked_for.shape
+    counted = poses.looked_for & (poses.distance_m > 0)
+    of_group = np.broadcast_to(np.arange(shape[0]).reshape(-1, 1, 1, 1), shape)[counted]
+    projected = poses.at(counted) @ directions.T
+    reach = np.full((shape[0], 2 * len(directions)), -np.inf)
+    np.maximum.at(reach, of_group, np.concatenate([projected, -projected], axis=-1))
+    return reach
+
+
+def _moments(bins: Bins, poses: SightErrors, _: slice) -> Floats:
+    """Return numbers of poses, sums of their coordinates and of the powers of each error."""
+    used = poses.unflipped & poses.looked_for
+    errors = poses.used(poses.in_sight, used)
+    columns = [1.0, *poses.at(used)[:, :3].T]
+    for error in errors.T:
+        columns += [error, error**2, error**2 * error, (error**2) ** 2]
+    return _add(bins, poses, used, columns)
+
+
+def _within(
+    bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: SightErrors, groups: slice
+) -> Floats:
+    """Return how many errors lie within two standard deviations of the bias.
+
+    The columns are `COUNTS`; those within, for each error in the sight frame; the same along and
+    about the camera's axes. Each half of the trials is judged by the model of the other: ``fitted``
+    (models, halves, knots, quantities, 2) are bias and ln(variance).
+    """
+    used = poses.unflipped & poses.looked_for
+    half = poses.used(poses[HALF], used)
+    model = poses.used(
+        groups.start + np.arange(len(poses.detection)).reshape(-1, 1, 1, 1), used)
+    basis = hat_basis(poses.at(used)[:, :3], knots)
+    bias, log_variance = np.moveaxis(
+        np.einsum("nk,nkqv->nqv", basis, fitted[model, 1 - half]), -1, 0)
+    sigma = np.exp(0.5 * log_variance)
+    sight, camera = (poses.used(each, used) for each in (poses.in_sight, poses.in_camera))
+    turn = sight_rotation(poses.used(poses["true_tvec_m"], used))
+    columns = [*(np.abs(sight - bias) <= 2.0 * sigma).T]
+    for part in (slice(0, 3), slice(3, 6)):
+        mean = np.einsum("nij,nj->ni", turn, bias[:, part])
+        spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
+        columns += [*(np.abs(camera[:, part] - mean) <= 2.0 * spread).T]
+    counts = [_add(bins, poses, mask & poses.looked_for, [1.0])
+              for mask in (poses.looked_for, poses.solved, poses.flipped, poses.unflipped)]
+    return np.concatenate([*counts, _add(bins, poses, used, columns)], axis=-1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -465,13 +600,11 @@ def model_errors(
     knots = [np.log(model[name].values) if logarithmic else model[name].values
              for name, logarithmic in PREDICTORS.items()]
     basis = hat_basis(at[:, : len(knots)], knots)
-    scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
-    metres = scale * model["distance_m"].values + (1.0 - scale)
-    bias = model["bias"].values / metres[:, :, None, None]
+    bias = model["bias"].values / _metres(model["distance_m"].values)[:, :, None, None]
     flat = (len(QUANTITIES), -1)
     values = {
         "sigma": np.exp(basis @ np.log(model["sigma"].values).reshape(flat).T),
-        "bias": basis @ bias.reshape(flat).T * (scale[:, 0] * distance[:, None] + 1 - scale[:, 0]),
+        "bias": basis @ bias.reshape(flat).T * _metres(distance).T,
     }
     use = model["use"].values.reshape(flat)[:, cell].T
     inside &= (use != Use.no_poses).all(axis=1)

@@ -63,7 +63,7 @@ def per_marker(results: xr.Dataset) -> xr.Dataset:
     Notes
     -----
     Markers of one image see the same draws. Where they are pooled they count as one draw, as
-    settings do (`sweep.analysis.binning`), so that intervals of rates over all markers are right
+    settings do (`sweep.analysis.estimator`), so that intervals of rates over all markers are right
     however much neighbours fail together.
 
     Examples

@@ -10,22 +10,20 @@ import numpy as np
 import xarray as xr
 from scipy import special, stats
 
-from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Rate
 from sweep.analysis.dataset import (
     DRAWS,
     as_names,
     axes_of,
     describes,
     is_grid_axis,
+    is_replicated,
     kept_dimensions,
     require_dimension,
     stacked,
+    with_common_trials,
 )
-from sweep.analysis.draws import is_replicated, with_common_trials
+from sweep.analysis.estimator import INTERVAL, Bins, Rate, aggregate
 from sweep.analysis.poses import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
-from sweep.analysis.statistic import INTERVAL
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
 from sweep.typing import Floats, Masks
@@ -105,7 +103,7 @@ def detection_rate(
         - ``looked_for``: poses whose detection is none of not_run, not_visible, not_modelled, and
           ``detected`` of these.
         - ``draws``: the random draws that they are worth, since pooled settings see the same ones
-          (`sweep.analysis.statistic.Sample.draws`).
+          (`sweep.analysis.estimator.Sample.draws`).
         - ``detection_rate`` with Wilson's interval in ``detection_rate_low`` and
           ``detection_rate_high``, and Jeffreys' in ``detection_rate_jeffreys_low`` and
           ``detection_rate_jeffreys_high``.

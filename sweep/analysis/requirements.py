@@ -17,22 +17,32 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Count, CountOfDraws, Rate
 from sweep.analysis.dataset import (
     DRAWS,
+    SIZE_AXES,
     as_names,
     axes_of,
     configuration_axes,
     describes,
+    is_replicated,
     kept_dimensions,
     stacked,
 )
-from sweep.analysis.detection_limits import SIZE_AXES
-from sweep.analysis.draws import is_replicated
+from sweep.analysis.estimator import (
+    PERCENTS,
+    Bins,
+    Count,
+    FlipMixture,
+    Mean,
+    Output,
+    Quantiles,
+    Rate,
+    Statistic,
+    aggregate,
+    draws_of_quantile,
+    guarded,
+)
 from sweep.analysis.intervals import clopper_pearson
-from sweep.analysis.means import FlipMixture, Mean, guarded
 from sweep.analysis.poses import (
     DEPTH,
     ERROR_INPUTS,
@@ -43,8 +53,6 @@ from sweep.analysis.poses import (
     Quantity,
     pose_arrays,
 )
-from sweep.analysis.quantiles import PERCENTS, Quantiles, draws_of_quantile
-from sweep.analysis.statistic import Output, Statistic
 from sweep.analysis.summaries import (
     NEES_MEAN,
     RATIOS,
@@ -167,7 +175,7 @@ class Requirable:
 
     def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
         """Return the statistics, their variables' names beginning with a prefix."""
-        return [self.renamed(prefix, level), CountOfDraws(
+        return [self.renamed(prefix, level), Count(
             f"{prefix}used", "poses that count", self.used, f"{prefix}draws", f"{prefix}drawn")]
 
     def interval(
@@ -603,7 +611,7 @@ def check_requirements(
     the distribution. Means (bias, standard deviation, root mean square, efficiency, nees) have the
     intervals of `sweep.analysis.error_statistics` with 99 %, and are undecided below 50 draws. The
     upper ends of those of squares (all but the bias) also hold rare errors that no draw showed, up
-    to twice the largest that one did (`sweep.analysis.means.with_unseen_tail`): 100 draws
+    to twice the largest that one did (`sweep.analysis.estimator.with_unseen_tail`): 100 draws
     of normal errors decide a root mean square that is below 0.6 of its limit, 400 one below 0.75.
     By simulation at the limit a false "met" has a probability below 0.025 for rates and quantiles,
     below 0.05 for means (`pytest -m long tests/analysis/test_requirements_at_the_limit.py`), of

@@ -10,19 +10,30 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.binning import PREFIX, Binning, Bins, image_sides, read_bins
-from sweep.analysis.counts import Rate
 from sweep.analysis.dataset import (
     DRAWS,
     axes_of,
     configuration_axes,
     describes,
+    image_sides,
     is_fixed,
     of_photographs,
     parameter_value,
     require_poses,
 )
-from sweep.analysis.draws import Design, Unit
+from sweep.analysis.estimator import (
+    OVER_ALL,
+    PREFIX,
+    Arrays,
+    Binning,
+    Bins,
+    Columns,
+    Design,
+    Rate,
+    Unit,
+    quantile_intervals,
+    read_bins,
+)
 from sweep.analysis.intervals import (
     MIN_UNITS,
     percentile_interval,
@@ -30,9 +41,7 @@ from sweep.analysis.intervals import (
     unit_counts,
 )
 from sweep.analysis.poses import ERROR_INPUTS, INSIDE, QUANTITIES, Poses, pose_arrays
-from sweep.analysis.quantiles import quantile_intervals
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE
-from sweep.analysis.statistic import OVER_ALL, Arrays, Blocks
 from sweep.errors import DatasetError
 from sweep.experiment.parameters import PARAMETERS, SIMULATED, Stage
 from sweep.experiment.schema import LABELS, cf_attributes
@@ -494,7 +503,7 @@ def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> dict[str, Any]:
 
 def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> dict[str, Any]:
     """Return a rate of both, its difference, and their intervals."""
-    found = [rate.variables(Blocks(each, Poses), BY_PHOTOGRAPH) for each in arrays]
+    found = [rate.variables(Columns(each, Poses), BY_PHOTOGRAPH) for each in arrays]
     names = rate.name, f"{rate.name}_low", f"{rate.name}_high"
     value, low, high = (np.stack([each[name] for each in found]) for name in names)
     table = dict(zip(names, (value, low, high), strict=True))

@@ -9,21 +9,30 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
-from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Count, Rate
 from sweep.analysis.dataset import axes_of, describes, kept_dimensions, stacked
-from sweep.analysis.draws import Design
-from sweep.analysis.intervals import LEVEL
-from sweep.analysis.means import (
+from sweep.analysis.estimator import (
+    INTERVAL,
+    Bins,
+    Columns,
+    Count,
+    Design,
     FlipMixture,
     Mean,
     MeanLength,
+    Output,
     PositiveMean,
+    Quantiles,
+    Rate,
     RootMeanSquare,
     StandardDeviation,
+    Statistic,
+    Variables,
+    aggregate,
     guarded,
+    interval_variables,
+    with_interval,
 )
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import (
     DEPTH,
     DETECTION_INPUTS,
@@ -37,17 +46,7 @@ from sweep.analysis.poses import (
     pose_arrays,
     relative,
 )
-from sweep.analysis.quantiles import Quantiles
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, LOOKED_FOR, SOLVED, SOLVED_RATE
-from sweep.analysis.statistic import (
-    INTERVAL,
-    Blocks,
-    Output,
-    Statistic,
-    Variables,
-    interval_variables,
-    with_interval,
-)
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, XYZ
 from sweep.typing import Floats, Masks
@@ -227,7 +226,7 @@ def error_statistics(
           looked for. A pose that is not solved counts as infinite, so an infinite quantile says
           that more than 50, 5 or 1 % were not solved. ``median_interval``, ``p95_interval`` and
           ``p99_interval`` say why an end of the interval is missing
-          (`sweep.analysis.quantiles.IntervalOf`).
+          (`sweep.analysis.estimator.IntervalOf`).
         - ``*_rmse_*``: over the solved poses; ``*_rmse_unflipped_*`` without flipped ones.
         - ``*_bias_*``: of rotation and position the length of the mean vector, of the others the
           signed mean; solved and not flipped. A length is never negative, so it is above 0 by
@@ -244,11 +243,11 @@ def error_statistics(
     95 % intervals over the random draws, conditional on the grid; NaN if no cell has two draws
     that count. Those of rates are Wilson's, a little wide if the cells' rates differ. That of a
     mean is Student's, that of an RMSE or a standard deviation Student's of the logarithm of the
-    mean square (`sweep.analysis.means`, `sweep.analysis.means`): they need some 50 draws
+    mean square (`sweep.analysis.estimator`, `sweep.analysis.estimator`): they need some 50 draws
     and tails not much heavier than normal, for no sample tells of what it has not seen; if a few
     cells have nearly all of the error, only their draws count. That of ``rotation_rmse_deg``
     counts the flips that the sample may have missed, with 180 degrees each
-    (`sweep.analysis.means`): it holds if flips are rare, and is wide (0.5 of 0.4 to 48
+    (`sweep.analysis.estimator`): it holds if flips are rare, and is wide (0.5 of 0.4 to 48
     without a flip in 50 draws). ``rotation_rmse_unflipped_deg`` with ``flip_rate``, and the
     quantiles, say more; Wilson's interval of 1 % in 50 covers 0.91.
 
@@ -278,7 +277,7 @@ def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr
     """Return `error_statistics` with the intervals by which configurations are preferred.
 
     Upper ends of root mean squares and standard deviations hold rare errors that no draw showed, as
-    those of requirements do (`sweep.analysis.means.with_unseen_tail`).
+    those of requirements do (`sweep.analysis.estimator.with_unseen_tail`).
     """
     records = registered()
     return _table(results, per, None, records, [guarded(record.statistic) for record in records])
@@ -538,12 +537,12 @@ class BoundRatio(Statistic[Poses]):
         words = f"RMS bound over RMS {self.quantity.words}, solved and not flipped"
         return with_interval(self.name, words, "1")
 
-    def variables(self, blocks: Blocks[Poses], design: Design) -> Variables:
+    def variables(self, columns: Columns[Poses], design: Design) -> Variables:
         """Return the ratio; its interval is that of the error."""
         bound, error = (
             RootMeanSquare(
                 "", "", self.quantity.units, squares, self.used, self.level, self.guarded,
-            ).variables(blocks, design)
+            ).variables(columns, design)
             for squares in (lambda poses: self.bound_squared(poses)[..., None],
                             self.quantity.squares))
         with np.errstate(divide="ignore", invalid="ignore"):

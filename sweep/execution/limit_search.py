@@ -9,7 +9,7 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.limits import requirement_limits
+from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute

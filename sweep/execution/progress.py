@@ -583,7 +583,7 @@ def _reached(store: RunStore, index: Mapping[str, int]) -> str:
     rule = store.pipeline.stopping
     if rule is None or not rule.precision:
         return ""
-    from sweep.analysis.precision import (  # noqa: PLC0415  (SciPy: only where conditions are told)
+    from sweep.analysis.decisions import (  # noqa: PLC0415  (SciPy: only where conditions are told)
         Reached,
         precision_reached,
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.limits import requirement_limits
+from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.requirements import (
     Decision,
     Verdict,

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.binning import Bins
+from sweep.analysis.estimator import Bins
 from sweep.analysis.poses import QUANTITIES, Poses
 from sweep.analysis.simulation_gaps import (
     QUANTILES,

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.choices import CONFIDENCE
-from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes
-from sweep.analysis.draws import is_replicated
+from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes, is_replicated
+from sweep.analysis.decisions import CONFIDENCE
 from sweep.analysis.requirements import Decision, Verdict, described
 from sweep.errors import ArgumentError
 from sweep.experiment.cell_selection import parse_selection
@@ -28,8 +27,8 @@ from sweep.report.table import (
 )
 
 if TYPE_CHECKING:
-    from sweep.analysis.choices import Answer, Cause
     from sweep.analysis.comparisons import Regression
+    from sweep.analysis.decisions import Answer, Cause
     from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 

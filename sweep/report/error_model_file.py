@@ -11,8 +11,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, QUANTITIES, VARIES
-from sweep.analysis.error_models import UNITS, WORDS, Use, cell_edges, error_models, model_errors
+from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, VARIES
+from sweep.analysis.error_models import (
+    QUANTITIES,
+    UNITS,
+    WORDS,
+    Use,
+    cell_edges,
+    error_models,
+    model_errors,
+)
 from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file

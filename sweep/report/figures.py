@@ -22,9 +22,9 @@ from sweep.analysis import (
     precision_reached,
 )
 from sweep.analysis.ambiguities import ThresholdChoice
-from sweep.analysis.binning import Bins
 from sweep.analysis.dataset import of_photographs
-from sweep.analysis.precision import Reached
+from sweep.analysis.decisions import Reached
+from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
 from sweep.experiment.experiment import target_word

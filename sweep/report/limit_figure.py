@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.limits import Reach
+from sweep.analysis.decisions import Reach
 from sweep.messages import quoted
 from sweep.report.figure import Figure
 from sweep.report.table import (

@@ -15,8 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
-from sweep.analysis.dataset import is_grid_axis, of_photographs
-from sweep.analysis.detection_limits import SIZE_AXES
+from sweep.analysis.dataset import SIZE_AXES, is_grid_axis, of_photographs
 from sweep.analysis.requirements import (
     SIZES_BESIDE,
     conditions,

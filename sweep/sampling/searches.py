@@ -12,11 +12,21 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.binning import sides_of
-from sweep.analysis.choices import ChoiceCells, choice_cells, choice_faults, choice_shares
-from sweep.analysis.limits import easier_first, error_shares, met_run, smaller_upwards
+from sweep.analysis.dataset import sides_of
+from sweep.analysis.decisions import (
+    ChoiceCells,
+    WantedPrecision,
+    choice_cells,
+    choice_faults,
+    choice_shares,
+    easier_first,
+    error_shares,
+    met_run,
+    precision_table,
+    smaller_upwards,
+    wanted_precisions,
+)
 from sweep.analysis.poses import ESTIMATE_INPUTS, REQUIRED_VARIABLES
-from sweep.analysis.precision import WantedPrecision, precision_table, wanted_precisions
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
     Decision,
@@ -316,7 +326,7 @@ class ChoiceSampling:
     coupled: tuple[str, ...]
 
     def needed(self, results: GroupResults) -> Masks:
-        """Return the scenes of the cells that `sweep.analysis.choices.needed` names."""
+        """Return the scenes of the cells that `sweep.analysis.decisions.needed` names."""
         dataset = group_dataset(results)
         cells = choice_cells(dataset, self.rule, self.shares).needed()
         pipeline = results.pipeline
@@ -359,7 +369,7 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> 
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
 # quantity of every configuration has an interval as narrow as is wanted, or cannot have one: no
 # pose was looked for, or so few have the number that all trials would not give enough
-# (`sweep.analysis.precision.Reached`).
+# (`sweep.analysis.decisions.Reached`).
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSampling:

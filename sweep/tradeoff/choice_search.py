@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.choices import Answer, answers
-from sweep.analysis.dataset import DRAWS
-from sweep.analysis.draws import computed_scenes
+from sweep.analysis.dataset import DRAWS, computed_scenes
+from sweep.analysis.decisions import Answer, answers
 from sweep.analysis.requirements import Decision
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, renderer_bias
 from sweep.analysis.comparisons import corners_of
-from sweep.analysis.draws import computed_scenes
+from sweep.analysis.dataset import computed_scenes
 from sweep.analysis.summaries import guarded_error_statistics
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport

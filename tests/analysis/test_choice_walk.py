@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.analysis.choices import error_shares, needed, walk
+from sweep.analysis.decisions import needed, shares_of_choice, walk
 from sweep.analysis.requirements import Decision, combined_decision
 
 ENDS = (50, 100, 150, 200, 250, 300, 350, 450, 550, 700, 850, 1050, 1300, 1650, 2050, 2550, 3200,
@@ -25,7 +25,7 @@ def decided(hits, n, limit, shares):
 def search(rates, limit, confidence, generator):
     """Return decisions, whether estimates keep the limit, and trials of a search (A, V, C)."""
     alternatives, values, conditions = rates.shape
-    shares = error_shares(confidence, waves=len(ENDS), alternatives=alternatives, values=values,
+    shares = shares_of_choice(confidence, waves=len(ENDS), alternatives=alternatives, values=values,
                           conditions=conditions, requirements=1)
     n = np.zeros(rates.shape, int)
     hits = np.zeros(rates.shape, int)

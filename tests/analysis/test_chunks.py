@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import sweep.analysis.aggregate as engine
-import sweep.analysis.statistic as blocks
 from support.small_datasets import ALL, mixed
 from sweep.analysis import (
     compare,
@@ -17,6 +15,7 @@ from sweep.analysis import (
     efficiency,
     error_models,
     error_statistics,
+    estimator,
     failure_composition,
     flip_rate,
     marker_ranking,
@@ -92,8 +91,7 @@ def test_a_lazy_dataset_without_values_gives_the_same_without_a_warning(analysis
 @EVERY_CALL
 def test_blocks_of_any_size_give_the_same(call, most, monkeypatch):
     assert expected(call) is not None
-    monkeypatch.setattr(blocks, "MAX_BLOCK", most)
-    monkeypatch.setattr(engine, "MAX_BLOCK", most)
+    monkeypatch.setattr(estimator, "MAX_BLOCK", most)
     assert_same(CALLS[call](RESULTS), call)
 
 

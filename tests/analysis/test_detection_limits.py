@@ -10,7 +10,7 @@ import xarray as xr
 from support.comparisons import with_detected
 from support.small_datasets import perfect
 from sweep.analysis import detection_limit
-from sweep.analysis.detection_limits import Limit
+from sweep.analysis.decisions import SideLimit
 from sweep.errors import ArgumentError, DatasetError
 
 TEXT = """
@@ -73,7 +73,7 @@ def test_the_limit_is_found_along_any_axis_that_changes_the_size(name):
     answer = detection_limit(dataset({name: values}, rates, **texts), rate=0.9)
     expected = limit_by_hand(sides, rates, 0.9)
     assert answer["side_px"].item() == pytest.approx(expected, rel=1e-9)
-    assert Limit(answer["limit"].item()) is Limit.found
+    assert SideLimit(answer["limit"].item()) is SideLimit.found
     value = values[sides.index(expected)]
     assert answer[name].item() == value
     assert answer[f"{name}_low"].item() <= value <= answer[f"{name}_high"].item()

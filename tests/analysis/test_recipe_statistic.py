@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from support.small_datasets import mixed
-from sweep.analysis import error_statistics, quantiles
+from sweep.analysis import error_statistics, estimator
 from sweep.analysis import summaries as registry
-from sweep.analysis.means import PositiveMean
-from sweep.analysis.quantiles import Quantiles
-from sweep.analysis.statistic import Output
+from sweep.analysis.estimator import Output, PositiveMean, Quantiles
 from sweep.analysis.summaries import ErrorStatistic
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus
@@ -35,8 +33,8 @@ class TrimmedMean(Quantiles):
     def outputs(self):
         return [Output(self.name, self.meaning, self.units)]
 
-    def variables(self, blocks, _design):
-        errors, used = self.column(blocks)
+    def variables(self, columns, _design):
+        errors, used = self.column(columns)
         halves = -(-used.sum(axis=(1, 2)) // 2)
         ascending = np.sort(errors.reshape(len(errors), -1), axis=1)  # those not used are last
         return {self.name: np.array([
@@ -91,6 +89,6 @@ def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
 
 
 def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(monkeypatch):
-    monkeypatch.setattr(quantiles, "MAX_VALUES", 100)
+    monkeypatch.setattr(estimator, "MAX_VALUES", 100)
     with pytest.raises(DatasetError, match="expected at most 100; divide them: keep an axis apart"):
         error_statistics(RESULTS)

@@ -18,7 +18,7 @@ from support.small_datasets import (
     perfect,
     poses,
 )
-from sweep.analysis.limits import Reach, farthest_met
+from sweep.analysis.decisions import Reach, farthest_met
 from sweep.analysis.requirements import (
     Decision,
     check_requirements,

@@ -7,9 +7,8 @@ from scipy import stats
 
 from support.photograph_results import PHOTOGRAPHS, REFINEMENTS, results_of, twins
 from sweep.analysis import detection_rate, error_statistics, flip_rate, simulation_gap
-from sweep.analysis.draws import Design, Unit
+from sweep.analysis.estimator import Design, Unit, quantile_intervals
 from sweep.analysis.intervals import percentile_interval, resampled_quantiles, unit_counts
-from sweep.analysis.quantiles import quantile_intervals
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 

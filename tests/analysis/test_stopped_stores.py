@@ -15,8 +15,8 @@ from sweep.analysis import (
     marker_ranking,
     precision_reached,
 )
-from sweep.analysis.draws import computed_scenes
-from sweep.analysis.precision import Reached
+from sweep.analysis.dataset import computed_scenes
+from sweep.analysis.decisions import Reached
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 

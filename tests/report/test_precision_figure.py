@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis.precision import Reached
+from sweep.analysis.decisions import Reached
 from sweep.report.figures import precision_table
 
 

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import sweep
-from sweep.analysis.choices import answers
+from sweep.analysis.decisions import answers
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute

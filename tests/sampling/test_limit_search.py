@@ -10,8 +10,8 @@ import pytest
 from scipy import special, stats
 
 from support.searches import flags_of, is_covered, pipeline_of, searched, true_limits
+from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.intervals import looks_factor
-from sweep.analysis.limits import requirement_limits
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline

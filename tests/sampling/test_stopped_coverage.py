@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from sweep.analysis.draws import Design
+from sweep.analysis.estimator import Columns, Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import Poses
-from sweep.analysis.statistic import Blocks
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.sampling.rules import GroupResults, make_rule
@@ -57,9 +56,9 @@ def simulated(name, truth, width, most, draw, repetitions=REPETITIONS):
 
 def evaluate(statistics, arrays):
     """Return the variables (groups,) of poses, as they are where sampling was stopped."""
-    blocks = Blocks(arrays, Poses)
+    columns = Columns(arrays, Poses)
     return {name: values for statistic in statistics
-            for name, values in statistic.variables(blocks, Design(stopped=True)).items()}
+            for name, values in statistic.variables(columns, Design(stopped=True)).items()}
 
 
 def of_stopped(wanted, values, truth, width):

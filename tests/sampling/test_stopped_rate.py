@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from support.stopped_rate import StoppedRate
-from sweep.analysis.draws import TAIL_SHARE
+from sweep.analysis.estimator import TAIL_SHARE
 from sweep.experiment.stopping import wave_ends
 
 ALPHA = 0.05 * TAIL_SHARE

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import signal, stats
 
-from sweep.analysis.draws import stopped_level
+from sweep.analysis.estimator import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.typing import Floats, Integers, Masks
 

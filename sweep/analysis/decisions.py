@@ -1,0 +1,1442 @@
+"""Decisions: how far along an axis, which choice, how precisely; each met, not met or open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.analysis.dataset import (
+    DRAWS,
+    as_names,
+    axes_of,
+    computed_scenes,
+    configuration_axes,
+    describes,
+    image_sides,
+    is_sampling_stopped,
+    kept_dimensions,
+    parameter_value,
+    parameters_along,
+    require_poses,
+    require_size_axes,
+    stacked,
+    stopping_rule,
+    with_common_trials,
+)
+from sweep.analysis.estimator import (
+    INTERVAL,
+    Bins,
+    Count,
+    Statistic,
+    aggregate,
+    draws_of_quantile,
+    scaled_to_draws,
+    stopped_level,
+)
+from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor, wilson
+from sweep.analysis.poses import Poses
+from sweep.analysis.rates import LOOKED_FOR, detection_rate
+from sweep.analysis.requirements import (
+    ERROR_PROBABILITY,
+    MIN_DRAWS,
+    Decision,
+    ErrorShares,
+    Requirable,
+    Requirement,
+    combined_decision,
+    decide,
+    excess_of,
+    kept_by,
+    named,
+    parse_requirements,
+    read_requirements,
+    requirable_arrays,
+    requirables,
+)
+from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.axes import TRIAL
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import cf_attributes
+from sweep.experiment.stopping import SEARCH, StoppingRule
+from sweep.measure.flags import Flag, flag
+from sweep.messages import shown
+from sweep.model.marker import module_count
+from sweep.typing import Floats, Integers, Masks
+
+SAME_SIDE = 1e-9
+"""Sides that differ by less, relatively, are equal."""
+
+
+class SideLimit(Flag):
+    """Whether the rate is reached within the grid."""
+
+    not_run = flag(0, "No pose was looked for.", counted=False)
+    found = flag(1, "The rate is reached from a side of the grid on.", present=True)
+    never = flag(2, "The rate is not reached at the largest side.")
+    always = flag(
+        3, "The rate is reached at the smallest side: the limit may lie below it.", present=True)
+
+
+@describes
+def detection_limit(
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None,
+    bins: Bins | None = None,
+) -> xr.Dataset:
+    """Return the smallest side of the black square from which on the marker is detected.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run with a dimension that changes the size in the image: ``side_px``,
+        ``distance_m``, ``size_m``, a focal length or field of view, the resolution, parameters
+        that go together, or several of these. What is no dimension or coordinate is read from the
+        pipeline in its attributes.
+    rate
+        The detection rate that is asked for, above 0 and at most 1.
+    per
+        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A
+        dimension ``dictionary`` is always kept; all dimensions of the sides and the trials cannot
+        be. Others are pooled: of the dimensions that change the side, what has the same side.
+    bins
+        Edges of bins of drawn parameters that change the side, such as ``distance_m``: a bin has
+        the side of its middle.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per).
+
+        - ``side_px``: side in pixels, if the square were parallel to the image, from which on, at
+          all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a
+          larger side counts. Infinite for never. Its interval is in ``side_px_low`` and
+          ``side_px_high``; ``side_px_below`` is the grid's next smaller side, at which the rate is
+          not reached.
+        - ``side_px_per_module``: the same per module of the marker, with its interval.
+        - ``distance_m``, ``size_m`` and whatever else changes the side along the axis, if it is
+          one axis: its value of that side, with its interval in ``distance_m_low`` and
+          ``distance_m_high``. 0 or infinite: beyond the grid.
+        - ``limit``: whether the rate is reached within the grid (`SideLimit`).
+
+    Raises
+    ------
+    ArgumentError
+        For a rate outside (0, 1], for ``per`` that names a dimension that cannot be kept, and for
+        bins that cannot be.
+    DatasetError
+        If no axis changes the side, or it is drawn and not in bins; if the dataset lacks variables
+        of results, or has no poses.
+
+    Notes
+    -----
+    The interval is that of the limit on the grid, at 95 %: from ``side_px_high`` on Wilson's lower
+    ends are at least ``rate``, and from ``side_px_low`` on all upper ends are. Only the one side
+    below the limit can make the high end too small, any above it the low end too large: the upper
+    ends are those of all sides together (Bonferroni). A low end of 0 says that the limit may lie
+    below the grid, an infinite high end that it may lie above; both are NaN if no cell has two
+    draws.
+
+    Examples
+    --------
+    >>> limit = detection_limit(results, rate=0.6)
+    >>> limit["side_px"].item(), limit["side_px_below"].item(), SideLimit(limit["limit"]).name
+    (20.0, 10.0, 'found')
+    """
+    if not 0.0 < rate <= 1.0:
+        raise ArgumentError("rate", rate, "expected a number above 0 and at most 1, such as 0.9")
+    axes = axes_of(results)
+    require_poses(results)
+    dictionaries = ["dictionary"] if "dictionary" in axes else []
+    if per is None:
+        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
+    kept = kept_dimensions(results, (*as_names(per), *dictionaries))
+    bins = bins or {}
+    sides = image_sides(results, bins)
+    require_size_axes(results, sides)
+    along = [str(dim) for dim in sides.dims if dim not in kept]
+    if DRAWS in kept or not along:
+        name = DRAWS if DRAWS in kept else ", ".join(map(str, sides.dims))
+        raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
+    distinct = _distinct(sides, along)
+    stopped = is_sampling_stopped(results)
+    if stopped and distinct < math.prod(sides.sizes[name] for name in along):
+        results = with_common_trials(results, kept)  # those of the same side are pooled
+    table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
+    n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
+    drawn = table["detection_rate_low"].notnull()
+    *values, limit = xr.apply_ufunc(
+        _side_limit, sides, hits, n, draws, drawn,
+        kwargs={"rate": rate, "dims": len(along), "count": distinct, "stopped": stopped},
+        input_core_dims=[along] * 5, output_core_dims=[[]] * 5,
+    )
+    limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
+                      strict=True))
+    words = {
+        "side_px": f"smallest side from which on the detection rate is at least {rate:g}",
+        "side_px_low": "lower end of the 95 % interval: smallest side",
+        "side_px_high": "upper end of the 95 % interval: smallest side",
+        "side_px_below": "the grid's next smaller side",
+    }
+    out = {name: array.assign_attrs(long_name=words[name], units="px")
+           for name, array in limits.items()}
+    count = _modules(results)
+    out |= {
+        name.replace("px", "px_per_module"): (limits[name] / count).assign_attrs(
+            long_name=f"{words[name]}, per module", units="px")
+        for name in ("side_px", "side_px_low", "side_px_high")
+    }
+    if len(along) == 1:
+        out |= _in_units_of_the_axis(results, sides, along[0], bins, limits)
+    out["limit"] = limit.astype(np.uint8).assign_attrs(
+        cf_attributes("whether the rate is reached within the grid", flags=SideLimit))
+    return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
+
+
+def _distinct(sides: xr.DataArray, along: Sequence[str]) -> int:
+    """Return the largest number of distinct sides of a condition."""
+    rows = sides.transpose(..., *along).values.reshape(
+        -1, math.prod(sides.sizes[name] for name in along))
+    return max(int(_is_next(np.sort(row)[::-1]).sum()) for row in rows)
+
+
+def _is_next(sides: Floats) -> Masks:
+    """Return which of some sides, from large to small, are not those before them."""
+    return np.concatenate([[True], sides[1:] < sides[:-1] * (1.0 - SAME_SIDE)])
+
+
+def _side_limit(
+    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, *, rate: float,
+    dims: int, count: int, stopped: bool,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
+
+    Poses of the same side are pooled; ``count`` is the largest number of distinct sides.
+    ``stopped`` says whether sampling was stopped (`sweep.analysis.estimator`).
+    """
+    shape = (*n.shape[: n.ndim - dims], math.prod(n.shape[n.ndim - dims :]))
+    sides = np.broadcast_to(sides, n.shape).reshape(shape)
+    order = np.argsort(-sides, axis=-1, kind="stable")  # the largest first
+    sides, hits, n, draws, drawn = (
+        np.take_along_axis(each.reshape(shape), order, axis=-1)
+        for each in (sides, hits, n, draws, drawn))
+    pooled = _pooled(sides, hits, n, draws, drawn.astype(np.int64))
+    hits, n, draws, drawn = (*pooled[:3], pooled[3] > 0)
+    exists = n > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reached = hits / n >= rate
+    # Of draws, rounded outwards, as in `Rate`.
+    fewest, most = scaled_to_draws(hits, n, draws)
+    joint = 1.0 - (1.0 - LEVEL) / count
+    interval: Callable[..., tuple[Floats, Floats]] = clopper_pearson if stopped else wilson
+    levels = [stopped_level(level) if stopped else level for level in (LEVEL, joint)]
+    surely = interval(fewest, draws, levels[0])[0] >= rate
+    possibly = interval(most, draws, levels[1])[1] >= rate
+
+    def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
+        """Return the smallest side down to which it holds, and whether it holds for all."""
+        steady = np.logical_and.accumulate(holds | ~exists, axis=-1) & exists
+        side = np.where(steady, sides, np.inf).min(axis=-1, initial=np.inf)
+        return np.where(steady.any(axis=-1), side, none), (steady == exists).all(axis=-1)
+
+    side, always = smallest(reached, np.inf)
+    high, _ = smallest(surely, np.inf)
+    low, everywhere = smallest(possibly, np.inf)
+    low = np.where(everywhere, 0.0, low)
+    smaller = np.where(exists & (sides < side[..., None]), sides, -np.inf).max(
+        axis=-1, initial=-np.inf)
+    empty = ~exists.any(axis=-1)
+    flag = np.select(
+        [empty, always, np.isinf(side)], [SideLimit.not_run, SideLimit.always, SideLimit.never],
+        SideLimit.found)
+    unknown = ~(drawn | ~exists).all(axis=-1) | empty
+    return (np.where(empty, np.nan, side), np.where(unknown, np.nan, low),
+            np.where(unknown, np.nan, high), np.where(np.isinf(smaller), np.nan, smaller),
+            flag.astype(np.float64))
+
+
+def _pooled(sides: Floats, *counts: Integers) -> list[Integers]:
+    """Return the counts with those of equal sides at the first of these, 0 at the others."""
+    pooled = [np.zeros_like(each) for each in counts]
+    for row in np.ndindex(*sides.shape[:-1]):
+        first = np.nonzero(_is_next(sides[row]))[0]
+        for sums, each in zip(pooled, counts, strict=True):
+            sums[(*row, first)] = np.add.reduceat(each[row], first)
+    return pooled
+
+
+def _in_units_of_the_axis(
+    results: xr.Dataset, sides: xr.DataArray, axis: str, bins: Bins,
+    limits: Mapping[str, xr.DataArray],
+) -> dict[str, xr.DataArray]:
+    """Return the limit and its interval as values of the parameters along the axis."""
+    out = {}
+    for name in parameters_along(results, axis, bins):
+        if name == "side_px":
+            continue
+        values = sides[axis].values if axis in bins else results[name].values
+        order = np.argsort(values)
+        ends = sides.isel({axis: order[[0, -1]]})
+        smaller = bool((ends.isel({axis: 1}) < ends.isel({axis: 0})).all())
+        low, high = ("high", "low") if smaller else ("low", "high")
+        for ending, source, words in (
+            ("", "side_px", "value of that side"),
+            ("_low", f"side_px_{low}", "lower end of the 95 % interval: value of that side"),
+            ("_high", f"side_px_{high}", "upper end of the 95 % interval: value of that side"),
+        ):
+            out[f"{name}{ending}"] = xr.apply_ufunc(
+                _value_of_side, limits[source], sides.drop_vars(axis, errors="ignore"),
+                kwargs={"values": values.astype(np.float64), "smaller": smaller},
+                input_core_dims=[[], [axis]],
+            ).assign_attrs(long_name=f"{name}: {words}",
+                           units=str(results[name].attrs.get("units", "1")))
+    return out
+
+
+def _value_of_side(
+    side: Floats, sides: Floats, values: Floats, *, smaller: bool
+) -> Floats:
+    """Return the values (...) at which sides (..., n) are those of (...); 0 or inf beyond all."""
+    nearest = np.argmin(np.abs(sides - np.where(np.isfinite(side), side, 0.0)[..., None]), axis=-1)
+    found = np.where(np.isnan(side), np.nan, values[nearest])
+    found = np.where(side == 0.0, np.inf if smaller else 0.0, found)
+    return np.where(np.isinf(side), 0.0 if smaller else np.inf, found)
+
+
+def _modules(results: xr.Dataset) -> Any:
+    """Return the modules along the black square's side, by dictionary."""
+    names = parameter_value(results, "dictionary")
+    if isinstance(names, xr.DataArray):
+        counts = [module_count(str(name)) for name in np.atleast_1d(names.values)]
+        return xr.DataArray(np.reshape(counts, names.shape), names.coords, names.dims)
+    return module_count(names)
+
+
+# --------------------------------------------------------------------------------------------------
+# How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".
+
+class Reach(Flag):
+    """How far the requirements are met along the axis."""
+
+    not_run = flag(0, "Nothing could be judged.", counted=False)
+    found = flag(1, "They are met up to a value within the grid.", present=True)
+    never = flag(2, "They are not met at the easiest value.")
+    always = flag(3, "They are met at all values: the limit may lie beyond.", present=True)
+    within = flag(4, "They are met between two values, but not at the easiest.", present=True)
+
+
+@describes
+def farthest_met(
+    results: xr.Dataset, requirements: Iterable[Requirement | str], along: str,
+    per: Sequence[str] = (), at_all: Sequence[str] = (), shares: ErrorShares | None = None,
+) -> xr.Dataset:
+    """Return how far along an axis all requirements are met.
+
+    Parameters
+    ----------
+    results, requirements
+        As in `sweep.analysis.check_requirements`.
+    along
+        An axis of the scene with numbers, such as ``distance_m``. It is read from easy to hard:
+        one that changes the size in the image towards smaller markers; another from the end at
+        which the requirements are met at more of the conditions, upwards if that is undecided.
+    per
+        Dimensions that are kept: a limit for each of their values.
+    at_all
+        Dimensions at all of whose values the requirements must hold for a value of ``along`` to
+        count, such as ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
+    shares
+        Shares of the error probability that single decisions may spend, if not those of
+        `sweep.analysis.check_requirements`.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*configuration, *per), computed.
+
+        - ``value``: the last value of the axis up to which, without a gap, the values of all
+          requirements keep their limits; NaN for never. ``start``: the value from which they do,
+          which is the easiest, or the first of the longest run of values if they do not there:
+          near 0 tilt poses flip, near the camera a marker is cut off.
+        - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
+          easy values they are decided to be met, beyond the other end a requirement is decided not
+          to be met. -inf or inf: the limit may lie beyond the grid's end.
+        - ``reach`` (`Reach`).
+        - ``limited_by``: the requirement that first fails beyond ``value``, "" for none;
+          ``fails_at`` the value of the axis there; ``fails_where``: the values of ``at_all`` at
+          which it fails worst, as text "tilt_deg = 45"; ``failing_value``: the quantity's value
+          there.
+        - ``met_beyond``: at how many values beyond ``fails_at`` all requirements keep their limits
+          again; ``farthest_beyond`` the farthest of them, NaN for none. Detection is not
+          monotonic: above 0 there is a dip, which ends ``value``.
+
+        With the dimension ``along``, for each of its values: ``decision`` (`Decision`) of all
+        requirements together, and ``keeps``: whether all values keep their limits.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.check_requirements`; also for an axis without an order.
+
+    Notes
+    -----
+    ``low`` (of a limit upwards) is too large with the error probability of one decision: only the
+    first value at which a requirement fails could make it so. ``high`` is too small if any value
+    up to the limit is falsely decided as not met: these decisions are at the error probability of
+    all of them together.
+
+    Examples
+    --------
+    >>> reach = farthest_met(results.sel(solver=["ippe"]), ["detection >= 0.6"], along="side_px")
+    >>> reach["value"].item(), reach["limited_by"].item(), reach["fails_at"].item()
+    (20.0, 'detection_rate >= 0.6', 10.0)
+    """
+    required = tuple(parse_requirements([
+        each.text if isinstance(each, Requirement) else each
+        for each in ([requirements] if isinstance(requirements, str | Requirement)
+                     else requirements)]))
+    values = axis_values(results, along)
+    together = [name for name in as_names(at_all) if name != along]
+    names = [name for name in as_names(per) if name != along]
+    overlap = [name for name in together if name in names]
+    if overlap:
+        raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
+    table = decide(results, required, [*names, *together, along], shares=shares)
+    keeps = kept_by(table, required)
+    upwards = is_harder_upwards(results, along, keeps)
+    order = np.argsort(values if upwards else -values, kind="stable")
+    table, keeps = table.isel({along: order}), keeps.isel({along: order})
+    values = values[order]
+    inner = [*together, "requirement"]
+    applicable = table["decision"] != Decision.not_applicable
+    judged = applicable.any(inner)
+    all_keep = (keeps | ~applicable).all(inner) & judged
+    decision = xr.apply_ufunc(
+        combined_decision, table["decision"], input_core_dims=[inner],
+        kwargs={"axis": tuple(range(-len(inner), 0))}).assign_attrs(
+        cf_attributes("whether all requirements are met", flags=Decision))
+    kept = [dim for dim in decision.dims if dim != along]
+    shape = decision.transpose(*kept, along)
+    rows = []
+    for index in np.ndindex(*shape.shape[:-1]):
+        at = dict(zip(kept, index, strict=True))
+        numbers, failing = _reach(
+            values, upwards, keeps=all_keep.isel(at).values, judged=judged.isel(at).values,
+            decision=decision.isel(at).values)
+        if failing is not None:
+            cell = {**at, along: failing}
+            numbers |= _cause(table.isel(cell), keeps.isel(cell), together)
+        rows.append(numbers)
+
+    def column(name: str, missing: Any) -> NDArray[Any]:
+        return np.array([row.get(name, missing) for row in rows]).reshape(shape.shape[:-1])
+
+    units = str(results[along].attrs.get("units", ""))
+    meanings = {
+        "value": f"{along} up to which all requirements are met",
+        "low": f"lower end of the interval: {along} up to which all are met",
+        "high": f"upper end of the interval: {along} up to which all are met",
+        "start": f"{along} from which all requirements are met",
+        "fails_at": f"first {along} at which one is not",
+        "farthest_beyond": f"farthest {along} beyond it at which all are met again",
+        "failing_value": "value of the requirement that fails there",
+        "met_beyond": "values beyond it at which all are met again",
+    }
+    variables: dict[str, Any] = {
+        name: (kept, column(name, np.nan), {"long_name": meaning, "units": {
+            "failing_value": "", "met_beyond": "1"}.get(name, units)})
+        for name, meaning in meanings.items()}
+    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8), cf_attributes(
+        "how far the requirements are met", flags=Reach))
+    for name, meaning in (("limited_by", "requirement that fails"),
+                          ("fails_where", "where it fails")):
+        variables[name] = kept, column(name, ""), {"long_name": meaning}
+    variables["decision"] = decision.transpose(*kept, along)
+    variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
+        long_name="whether all values keep their limits", units="1")
+    coordinates = {name: value for name, value in table.coords.items()
+                   if set(value.dims) <= {*kept, along}}
+    found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
+    return found.assign_attrs(
+        along=along, harder="upwards" if upwards else "downwards",
+        configuration_dims=[name for name in configuration_axes(results) if name in kept])
+
+
+def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the values of an axis of the scene that has an order.
+
+    Raises
+    ------
+    ArgumentError
+        If there is no such axis, or its values are no numbers, or it is one of configurations.
+    """
+    axes = [name for name in axes_of(results)
+            if name != DRAWS and name not in configuration_axes(results)
+            and name in results.coords and results[name].dtype.kind in "fiu"]
+    if along not in axes:
+        raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
+                            f"are {', '.join(axes) or 'none'}")
+    values = results[along].to_numpy().astype(np.float64)
+    if len(set(values.tolist())) < len(values) or not np.isfinite(values).all():
+        raise DatasetError(f"{along}: has values that repeat or are not finite")
+    return values
+
+
+def is_harder_upwards(results: xr.Dataset, along: str, keeps: xr.DataArray) -> bool:
+    """Return whether large values of an axis are the hard ones.
+
+    ``keeps`` is large, or true, where the requirements are fulfilled: it decides for an axis that
+    does not change the size in the image.
+    """
+    values = results[along].to_numpy()
+    smaller = smaller_upwards(lambda: image_sides(results, {}), values, along)
+    return easier_first(keeps.transpose(along, ...).to_numpy(), values) \
+        if smaller is None else smaller
+
+
+def smaller_upwards(
+    sides: Callable[[], xr.DataArray], values: NDArray[Any], along: str
+) -> bool | None:
+    """Return whether markers are smaller at large values of an axis; None if nothing says it.
+
+    ``sides`` returns the sides in pixels, or raises DatasetError, such as for a size that is drawn.
+    """
+    try:
+        computed = sides()
+    except DatasetError:
+        return {"side_px": False, "distance_m": True, "size_m": False}.get(along)
+    if along not in computed.dims:
+        return None
+    least, most = (computed.isel({along: int(k(values))}) for k in (np.argmin, np.argmax))
+    return None if bool((least == most).all()) else bool((most <= least).all())
+
+
+def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
+    """Return whether requirements are kept at least as often at the least value as at the largest.
+
+    ``keeps`` is (values, ...): true, or large, where they are kept.
+    """
+    least, most = int(np.argmin(values)), int(np.argmax(values))
+    return float(np.sum(keeps[least])) >= float(np.sum(keeps[most]))
+
+
+def _reach(
+    values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
+    judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
+) -> tuple[dict[str, Any], int | None]:
+    """Return the limit along the axis, from easy to hard, and the index of the failure beyond."""
+    if not judged.any():
+        return {"reach": Reach.not_run}, None
+    none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+    run = met_run(keeps, judged)
+    before_run = np.nonzero(~keeps & judged)[0]
+    before_run = before_run[before_run < run[0]] if run else before_run[:0]
+    if before_run.size:
+        judged = judged & (np.arange(len(values)) > before_run[-1])
+    failing = np.nonzero(~keeps & judged)[0]
+    unsure = np.nonzero((decision != Decision.met) & judged)[0]
+    failed = np.nonzero((decision == Decision.not_met) & judged)[0]
+
+    def before(indices: np.ndarray[Any, Any], all_of_them: float) -> float:
+        """Return the last judged value before the first of some indices."""
+        if not len(indices):
+            return all_of_them
+        earlier = np.nonzero(judged[: indices[0]])[0]
+        return float(values[earlier[-1]]) if len(earlier) else none
+
+    last = float(values[np.nonzero(judged)[0][-1]])
+    value = before(failing, last)
+    ends = sorted((before(unsure, last), before(failed, beyond)))
+    numbers = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
+               "met_beyond": 0.0}
+    if run:
+        numbers["start"] = float(values[run[0]])
+    if not len(failing):
+        return {**numbers, "reach": Reach.within if before_run.size else Reach.always}, None
+    first = int(failing[0])
+    again = np.nonzero(keeps & judged)[0]
+    again = again[again > first]
+    numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
+                "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
+                "reach": Reach.never if run is None else
+                Reach.within if before_run.size else Reach.found}
+    return numbers, first
+
+
+def met_run(
+    keeps: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]
+) -> tuple[int, int] | None:
+    """Return the first and the last index of the run of values that are kept, without a gap.
+
+    It is that from the first judged value on, or, if that is not kept, the longest; of several the
+    first. Values that are not judged (n,) neither count nor make a gap. None without any.
+
+    >>> met_run(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
+    (3, 4)
+    """
+    runs: list[list[int]] = []
+    inside = False
+    for index in np.nonzero(judged)[0]:
+        if keeps[index]:
+            runs = [*runs[:-1], [*runs[-1], int(index)]] if inside else [*runs, [int(index)]]
+        inside = bool(keeps[index])
+    if not runs:
+        return None
+    first = int(np.nonzero(judged)[0][0])
+    run = runs[0] if runs[0][0] == first else max(runs, key=len)
+    return run[0], run[-1]
+
+
+def _cause(
+    cell: xr.Dataset, keeps: xr.DataArray, together: Sequence[str]
+) -> dict[str, Any]:
+    """Return which requirement fails worst, where among ``together``, and its value there."""
+    failing = ~keeps & (cell["decision"] != Decision.not_applicable)
+    excess = excess_of(cell).where(failing)
+    flat = excess.stack(all_dims=excess.dims)
+    worst = flat.isel(all_dims=int(flat.argmax("all_dims")))
+    at = {name: worst[name].item() for name in excess.dims}
+    where = ", ".join(f"{name} = {at[name]:g}" if isinstance(at[name], float) else
+                      f"{name} = {at[name]}" for name in together)
+    return {"limited_by": str(at["requirement"]), "fails_where": where,
+            "failing_value": float(cell["value"].sel(at))}
+
+
+# --------------------------------------------------------------------------------------------------
+# Limits that a search decided: how far along an axis requirements are met, per condition.
+
+def error_shares(decisions: int, times: int) -> ErrorShares:
+    """Return the shares of the error probability of each decision of a search.
+
+    Parameters
+    ----------
+    decisions
+        How many are made for one limit: a false "not met" of any shortens it.
+    times
+        How often each is made.
+    """
+    factor = looks_factor(times)
+    return ErrorShares(met=1.0 / factor, not_met=1.0 / (factor * decisions))
+
+
+@describes
+def requirement_limits(
+    results: xr.Dataset, require: Sequence[str] = (), along: str = "",
+    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+) -> xr.Dataset:
+    """Return how far along an axis requirements are met, for each condition by itself.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run, of `sweep.limit` or with equally many trials everywhere.
+    require, along, per, at_all
+        As `sweep.limit` takes them; by default those that the run was made for.
+
+    Returns
+    -------
+    xr.Dataset
+        As `sweep.analysis.farthest_met`, dimensions (*configuration, *per), whose interval
+        ``low`` to ``high`` covers the limit of each condition with 95 %, however often it was
+        decided anew. Also
+
+        - ``settled``: whether the interval is a single value of the grid.
+        - ``trials`` (*per, along): the most that a cell has there; ``poses`` (*per): how many
+          scenes were computed for the condition, with those of all values.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.farthest_met`; also if nothing says what is searched.
+
+    Notes
+    -----
+    Requirements must hold at all values of ``at_all`` and are judged at each value along the axis
+    after each wave: an end of the interval is wrong with 0.025 at most, of all these decisions
+    together (Bonferroni over values and requirements; `looks_factor` over waves).
+
+    Examples
+    --------
+    >>> limit = requirement_limits(results, ["detection >= 0.6"], "side_px").sel(solver="ippe")
+    >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
+    (20.0, 20.0, 40.0)
+    """
+    rule = stopping_rule(results)
+    rule = rule if rule is not None and rule.kind == "along" else None
+    require = [require] if isinstance(require, str) and require else require
+    if not require or not along:
+        if rule is None:
+            raise ArgumentError("require" if not require else "along", along,
+                                "this store was not made by sweep limit, so that nothing says it")
+        require, along = require or rule.requirements, along or rule.along
+    if rule is not None and along == rule.along:
+        per = rule.per if per is None else per
+        at_all = rule.at_all if at_all is None else at_all
+    scene = [name for name in axes_of(results) if name not in configuration_axes(results)]
+    at_all = [name for name in as_names(at_all or ()) if name != along]
+    if per is None:
+        per = [name for name in scene if name not in (DRAWS, along, *at_all)]
+    per = as_names(per)
+    count = len([*require]) * math.prod(results.sizes.get(name, 1) for name in (along, *at_all))
+    found = farthest_met(
+        results, require, along, per, at_all, error_shares(count, len(rule.ends) if rule else 1))
+    found["settled"] = (found["low"] == found["high"]).assign_attrs(
+        long_name="whether the interval is a single value of the grid", units="1")
+    computed = computed_scenes(results)
+    cells = [name for name in computed.dims if name not in (*per, along)]
+    found["trials"] = computed.sum(DRAWS).max(
+        [name for name in cells if name != DRAWS]).compute().assign_attrs(
+        long_name="trials of a cell, the most at this value", units="1")
+    found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
+        long_name="scenes that were computed, of all values", units="1")
+    return found.assign_attrs(per=[*per], at_all=at_all, require=[*require])
+
+
+# --------------------------------------------------------------------------------------------------
+# What is wrong with a choice before anything is computed, a line each.
+
+def choice_faults(pipeline: Pipeline, rule: StoppingRule, shares: ErrorShares) -> list[str]:
+    """Return what makes a choice impossible.
+
+    Those are requirements that cannot be, and those that ``max_trials`` cannot show to be met even
+    if no trial fails.
+    """
+    required, faults = read_requirements(rule.requirements)
+    lines = [f"require.all = {shown(text)}: {problem}" for text, problem in faults]
+    kept = {TRIAL, rule.along, *rule.among, *rule.at_all}
+    pooled = math.prod(len(axis) for axis in pipeline.axes if axis.name not in kept)
+    for each in required:
+        least = math.ceil(least_draws(each, shares.met) / pooled)
+        if least > rule.max_trials:
+            lines.append(
+                f"{SEARCH}.max_trials = {rule.max_trials}: expected at least {least:,}: fewer "
+                f"cannot show {each.text} with {100 * CONFIDENCE:g} % confidence, even if all "
+                "meet it")
+    return lines
+
+
+def least_draws(requirement: Requirement, share: float) -> int:
+    """Return the draws below which a requirement cannot be decided as met.
+
+    Of a rate, with no failure Clopper and Pearson's end is the tail's n-th root; a quantile needs
+    an order statistic beyond; means are not decided below `MIN_DRAWS`.
+
+    Examples
+    --------
+    >>> from sweep.analysis.requirements import parse_requirement
+    >>> least_draws(parse_requirement("detection >= 0.99"), 1.0)
+    368
+    """
+    what = requirement.requirable
+    tail = (1.0 - what.level) * share / 2.0
+    if what.is_rate:
+        good = requirement.limit if requirement.at_least else 1.0 - requirement.limit
+        return math.ceil(math.log(tail) / math.log(good)) if 0.0 < good < 1.0 else 1
+    if what.percent is not None:
+        share_below = what.percent / 100.0
+        return math.ceil(math.log(tail) / math.log(
+            1.0 - share_below if requirement.at_least else share_below))
+    return MIN_DRAWS
+
+
+# --------------------------------------------------------------------------------------------------
+# The walk from the safe end of an axis to the wanted one: what is answered, what is needed still.
+#
+# The values of the axis stand in the order of the walk: for the smallest size that will do, from
+# the largest down. Each value's conditions are decided one by one. The answer is the last value
+# of the walk that meets the requirements, as all values before it do that can be judged: so a
+# value beyond one that fails, on the other side of a dip, is no answer. Values at which nothing
+# can be judged, such as sizes that do not fit into the image, are left out.
+#
+# That makes the error of the answer that of a single decision: it is wrong only if, at the first
+# value of the walk that truly fails, the condition at which it fails is decided as met. Neither
+# the number of values nor that of conditions counts (Berger, "Multiparameter hypothesis testing
+# and acceptance sampling", Technometrics 24, 1982: an intersection-union test; Marcus, Peritz and
+# Gabriel, Biometrika 63, 1976: tests in a fixed order); the numbers of waves, after each of which
+# a decision is made, and of alternatives do (Bonferroni).
+
+Decisions = NDArray[np.uint8]
+
+CONFIDENCE = 0.95
+"""Probability with which an answer meets the requirements."""
+
+
+def shares_of_choice(
+    confidence: float, *, waves: int, alternatives: int, values: int, conditions: int,
+    requirements: int,
+) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a search may spend.
+
+    Parameters
+    ----------
+    confidence
+        Probability with which no answer fails, and, again, with which no value that is told to
+        fail meets all.
+    waves
+        How often a decision is made at most: once after each wave.
+    alternatives, values, conditions, requirements
+        How many there are. "Met" is corrected for waves and alternatives, "not met" for all.
+
+    Examples
+    --------
+    >>> shares_of_choice(0.9, waves=10, alternatives=2, values=5, conditions=2, requirements=1)
+    ErrorShares(met=0.1, not_met=0.01)
+    """
+    met = (1.0 - confidence) / ERROR_PROBABILITY / waves / alternatives
+    not_met = met / (values * conditions * requirements)
+    return ErrorShares(float(f"{met:.12g}"), float(f"{not_met:.12g}"))
+
+
+def needed(decision: Decisions, keeps: Masks) -> Masks:
+    """Return which cells need more trials, (..., values, conditions).
+
+    Those are the undecided conditions of the values up to the first that fails, or seems to: of
+    that one, only the conditions at which it seems to fail. What lies beyond it waits until it is
+    decided, and is never needed if it does fail.
+
+    Parameters
+    ----------
+    decision
+        (..., values, conditions) of `sweep.analysis.requirements.Decision`, in the order of the
+        walk.
+    keeps
+        Of the same shape: where the estimates keep all limits.
+    """
+    undecided = decision == Decision.undecided
+    seems = undecided & ~keeps
+    value = combined_decision(decision, -1)
+    stops = (value == Decision.not_met) | seems.any(axis=-1)
+    before = np.cumsum(stops, axis=-1) == 0
+    first = stops & (np.cumsum(stops, axis=-1) == 1) & (value == Decision.undecided)
+    return np.asarray((undecided & before[..., None]) | (seems & first[..., None]))
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """How far a walk came; indices along the walk.
+
+    Attributes
+    ----------
+    answer
+        The last value before which, and at which, all is met; -1 for none.
+    next
+        The first value that is not met or undecided; the number of values if there is none.
+    isolated
+        Values from ``next`` on that fail, or seem to, and beyond which another seems to meet all:
+        failures that a search by halving would have stepped over.
+    passing
+        The values beyond that seem to meet all, or do.
+    """
+
+    answer: int
+    next: int
+    isolated: tuple[int, ...]
+    passing: tuple[int, ...]
+
+
+def walk(decision: Decisions, keeps: Masks) -> Walk:
+    """Return how far a walk comes, of one alternative.
+
+    Parameters
+    ----------
+    decision, keeps
+        (values, conditions), as in `needed`.
+
+    Examples
+    --------
+    >>> met, failed = Decision.met, Decision.not_met
+    >>> decision = np.array([[met], [met], [failed], [met], [failed]], np.uint8)
+    >>> walk(decision, decision == met)
+    Walk(answer=1, next=2, isolated=(2,), passing=(3,))
+    """
+    value = combined_decision(decision, -1)
+    judged = value != Decision.not_applicable
+    stops = np.flatnonzero(judged & (value != Decision.met))
+    after = int(stops[0]) if stops.size else len(value)
+    met = np.flatnonzero(value[:after] == Decision.met)
+    applicable = decision != Decision.not_applicable
+    seems = (keeps | ~applicable).all(axis=-1) & judged & (value != Decision.not_met)
+    passing = [k for k in range(after + 1, len(value)) if seems[k]]
+    isolated = [k for k in range(after, passing[-1])
+                if judged[k] and (not seems[k] or k == after)] if passing else []
+    return Walk(int(met[-1]) if met.size else -1, after, tuple(isolated), tuple(passing))
+
+
+# --------------------------------------------------------------------------------------------------
+# The choice that meets requirements at all conditions: of a size, and among other settings.
+#
+# What a choice is stands in `sweep.experiment.stopping`, when one is answered in
+# `sweep.analysis.decisions`. Every alternative, a combination of the values of the axes ``among``,
+# has its own answer.
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A requirement at a condition: by which a choice fails, or only just does not.
+
+    Attributes
+    ----------
+    requirement, units
+        Its text, and the units of its numbers.
+    condition
+        Values by axis.
+    decision, value, low, high, draws
+        As `sweep.analysis.check_requirements` has them, at the levels of the search.
+    draws_needed
+        About how many draws would decide it, if the value stays; NaN if it is decided, infinite if
+        no number would.
+    """
+
+    requirement: str
+    units: str
+    condition: Mapping[str, Any]
+    decision: Decision
+    value: float
+    low: float
+    high: float
+    draws: int
+    draws_needed: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Nearest:
+    """The value that is nearest to meeting all, where none does.
+
+    Attributes
+    ----------
+    value
+        The value, None without an axis.
+    excess
+        How far it is beyond the limit of a requirement, relative to it.
+    cause
+        That requirement and its condition.
+    """
+
+    value: float | None
+    excess: float
+    cause: Cause
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer of one alternative.
+
+    Attributes
+    ----------
+    alternative
+        Values by axis, of the axes ``among``.
+    met
+        Whether any choice meets the requirements.
+    value
+        The smallest (largest) value of the axis from which on all larger (smaller) ones of the
+        grid meet them; None if there is no such axis, or no such value.
+    tightest
+        The requirement and condition at which the answer is nearest to failing.
+    next, next_cause
+        The next value, which fails or is undecided, and by what; None if all values meet them.
+        Without an axis ``next`` is None, and ``next_cause`` that of the alternative itself.
+    isolated
+        Values that fail, or seem to, with others beyond that seem to meet all: (value, cause).
+    passing
+        Those values beyond.
+    nearest
+        If none is met: what is nearest to it.
+    is_open
+        Whether it is undecided what the answer is: the next value may meet them, too.
+    possible
+        The last value that may do so: none before it is decided to fail.
+    """
+
+    alternative: Mapping[str, Any]
+    met: bool
+    value: float | None
+    tightest: Cause | None = None
+    next: float | None = None
+    next_cause: Cause | None = None
+    isolated: tuple[tuple[float, Cause], ...] = ()
+    passing: tuple[float, ...] = ()
+    nearest: Nearest | None = None
+    is_open: bool = False
+    possible: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ChoiceCells:
+    """Decisions at each value and condition of each alternative.
+
+    Attributes
+    ----------
+    table
+        Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *per, requirement), the
+        values in the order of the walk; without the axis ``along`` if there is none.
+    decision, keeps
+        (alternatives, values, conditions): of all requirements together, and whether the estimates
+        keep all limits.
+    each, excess
+        (alternatives, values, conditions, requirements): the decision, and how far the value is
+        beyond the limit, relative to it; negative on the right side of it, infinite for no number.
+    hopeless
+        (alternatives, values, conditions): undecided, and no number of trials will tell.
+    """
+
+    table: xr.Dataset
+    decision: Decisions
+    keeps: Masks
+    each: Decisions
+    excess: Floats
+    hopeless: Masks
+    among: tuple[str, ...]
+    per: tuple[str, ...]
+
+    def needed(self) -> xr.DataArray:
+        """Return which cells need more trials, dimensions (*among, along, *per)."""
+        template = self.table["decision"].isel(requirement=0, drop=True)
+        decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
+        return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
+
+
+def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a search may spend."""
+    def size(names: Sequence[str]) -> int:
+        axes = [axis for name in names if (axis := pipeline.axis(name)) is not None]
+        return math.prod(map(len, axes))
+
+    return shares_of_choice(
+        CONFIDENCE, waves=len(rule.ends), alternatives=size(rule.among),
+        values=size([rule.along] if rule.along else []), conditions=size(rule.at_all),
+        requirements=len(rule.requirements))
+
+
+def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> ChoiceCells:
+    """Return the decisions of a dataset, of a whole store or of some of its alternatives.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As `sweep.analysis.check_requirements`.
+    """
+    required = parse_requirements(rule.requirements)
+    kept = [*rule.among, *([rule.along] if rule.along else []), *rule.at_all]
+    table = decide(results, required, kept, shares=shares)
+    table = table.transpose(*kept, "requirement", missing_dims="ignore")
+    if rule.along:
+        values = table[rule.along].to_numpy()
+        order = np.argsort(values, kind="stable")
+        table = table.isel({rule.along: order if rule.largest else order[::-1]})
+    conditions = math.prod(table.sizes[name] for name in rule.at_all)
+    shape = (-1, table.sizes[rule.along] if rule.along else 1, conditions, len(required))
+
+    def cells(name: str) -> NDArray[Any]:
+        values = table[name].to_numpy().reshape((*table[name].shape[:len(kept)], -1))
+        return np.broadcast_to(values, table["value"].shape).reshape(shape)
+
+    # Where so few poses count that max_trials will not have enough, there is nothing to learn.
+    poses = cells("looked_for").astype(np.float64)
+    pooled = math.prod(results.sizes[str(name)] for name in results["true_tvec_m"].dims if
+                       name not in (*kept, "trial", "xyz"))
+    with np.errstate(invalid="ignore"):
+        coming = cells("draws") / poses * rule.max_trials * pooled
+    each = cells("decision").astype(np.uint8)
+    hopeless = (poses >= MIN_DRAWS) & (coming < MIN_DRAWS) & (each == Decision.undecided)
+    decision = combined_decision(each, -1)
+    table = table.assign(excess=excess_of(table), keeps=kept_by(table, required))
+    excess = np.where(each == Decision.not_applicable, -np.inf, cells("excess"))
+    keeps = cells("keeps") | (each == Decision.not_applicable)
+    return ChoiceCells(
+        table, decision, np.asarray(keeps.all(-1)), each, excess,
+        hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.at_all)
+
+
+def answers(cells: ChoiceCells, along: str) -> list[Answer]:
+    """Return the answer of each alternative, in the order of the table's dimensions.
+
+    Parameters
+    ----------
+    cells
+        Of `choice_cells`.
+    along
+        The axis that is sought along; empty for none.
+    """
+    names = [name for name in cells.among if name in cells.table.dims]
+    lengths = [cells.table.sizes[name] for name in names]
+    values = cells.table[along].to_numpy().tolist() if along else [None]
+    found = []
+    for k, index in enumerate(np.ndindex(*lengths)):
+        alternative = {name: cells.table[name].isel({name: at}).item()
+                       for name, at in zip(names, index, strict=True)}
+        found.append(_answer(cells, k, values, alternative))
+    return found
+
+
+def _answer(
+    cells: ChoiceCells, k: int, values: Sequence[float | None], alternative: Mapping[str, Any]
+) -> Answer:
+    """Return the answer of alternative number ``k``."""
+    came = walk(cells.decision[k], cells.keeps[k])
+    tightest = None if came.answer < 0 else _cause_of_choice(cells, k, came.answer)
+    after, cause = None, None
+    if came.next < len(values):
+        after, cause = values[came.next], _cause_of_choice(cells, k, came.next)
+    nearest = None
+    if came.answer < 0:
+        worst = cells.excess[k].max(axis=(1, 2))
+        judged = (cells.decision[k] != Decision.not_applicable).any(axis=1)
+        best = int(np.argmin(np.where(judged, worst, np.inf)))
+        nearest = Nearest(values[best], float(worst[best]), _cause_of_choice(cells, k, best))
+    value = combined_decision(cells.decision[k], -1)
+    failing = np.flatnonzero(value == Decision.not_met)
+    before = value[: failing[0] if failing.size else len(value)]
+    possible = np.flatnonzero(before != Decision.not_applicable)
+    is_open = bool((before == Decision.undecided).any())
+    return Answer(
+        alternative, came.answer >= 0, values[came.answer] if came.answer >= 0 else None, tightest,
+        after, cause,
+        tuple((_number(values[at]), _cause_of_choice(cells, k, at)) for at in came.isolated),
+        tuple(_number(values[at]) for at in came.passing), nearest, is_open,
+        values[possible[-1]] if possible.size else None)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _cause_of_choice(cells: ChoiceCells, k: int, at: int) -> Cause:
+    """Return the requirement and condition by which a value fails worst, or is nearest to it."""
+    each, excess = cells.each[k, at], cells.excess[k, at]
+    among = next((mask for decision in (Decision.not_met, Decision.undecided, Decision.met)
+                  if (mask := each == decision).any()), np.ones(each.shape, bool))
+    flat = int(np.argmax(np.where(among, excess, -np.inf)))
+    condition, requirement = np.unravel_index(flat, each.shape)
+    table, names = cells.table, [str(name) for name in cells.table["decision"].dims][:-1]
+    position = np.ravel_multi_index((k, at, int(condition)), cells.decision.shape)
+    index = np.unravel_index(position, [table.sizes[name] for name in names]) if names else ()
+    one = table.isel(dict(zip(names, map(int, index), strict=True))).isel(
+        requirement=int(requirement))
+    cause = Cause(
+        str(one["requirement"].item()), str(one["units"].item()),
+        {name: one[name].item() for name in cells.per},
+        Decision(int(each.reshape(-1)[flat])), float(one["value"]), float(one["low"]),
+        float(one["high"]), int(one["draws"]))
+    if cause.decision is not Decision.undecided:
+        return cause
+    return replace(cause, draws_needed=_draws_needed(cause))
+
+
+def _draws_needed(cause: Cause) -> float:
+    """Return about how many draws would decide: intervals narrow with the root of their number."""
+    required = parse_requirements([cause.requirement])[0]
+    gap = abs(cause.value - required.limit)
+    good = (cause.value >= required.limit) == required.at_least
+    end = cause.low if good == required.at_least else cause.high
+    if gap == 0.0:
+        return math.inf
+    if not math.isfinite(end) or not math.isfinite(cause.value):
+        return 2.0 * cause.draws
+    return float(f"{cause.draws * max(1.1, abs(end - cause.value) / gap) ** 2:.2g}")
+
+
+# --------------------------------------------------------------------------------------------------
+# Half-widths of intervals, by which sampling stops, and whether they are as small as is wanted.
+#
+# Of rates they are as they are, of a bias relative to the root mean square error, of all else
+# relative to the value. The intervals are those that the analysis shows of a store whose sampling
+# was stopped (`sweep.analysis.estimator`).
+
+PoseStatistic = Statistic[Poses]
+
+MIN_MEAN_DRAWS = 450
+"""Draws below which no interval of a mean or a root mean square is narrow enough.
+
+Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.
+"""
+
+MIN_OF_RATE = 50
+"""Poses that count below which a rate is not worth waiting for."""
+
+NEVER_LEVEL = 0.999
+"""Level of the interval that says that too few numbers will come."""
+
+
+class Reached(Flag):
+    """Whether a quantity is known as well as was wanted."""
+
+    not_run = flag(0, "Nothing was computed.", counted=False)
+    reached = flag(1, "The interval is as narrow as was wanted.", present=True)
+    not_reached = flag(2, "The interval is wider than was wanted.", present=True)
+    too_rare = flag(
+        3, "Poses that have such a number are too rare for an interval as narrow as was wanted.")
+    not_applicable = flag(4, "No pose was looked for.", counted=False)
+
+
+@dataclass(frozen=True)
+class WantedPrecision:
+    """The half-width that is wanted of the interval of a quantity.
+
+    Attributes
+    ----------
+    requirable
+        The quantity.
+    half_width
+        As the module says; above 0, below 1.
+    """
+
+    requirable: Requirable
+    half_width: float
+
+    @property
+    def name(self) -> str:
+        """Name of the quantity."""
+        return self.requirable.name
+
+    @property
+    def relative_to(self) -> str:
+        """What the half-width is a share of; empty for a rate."""
+        if self.requirable.is_rate:
+            return ""
+        return "RMSE" if self._spread else "value"
+
+    @property
+    def _spread(self) -> str:
+        """Of a bias the name of the standard deviation; else empty."""
+        name = self.name.replace("_bias_", "_sd_")
+        return name if name != self.name and name in requirables() else ""
+
+    def statistics(self, prefix: str) -> list[PoseStatistic]:
+        """Return what must be computed, the names of their variables beginning with a prefix.
+
+        Their intervals are to be those of `sweep.analysis.estimator.as_stopped`.
+        """
+        parts = list(self.requirable.computed(prefix, LEVEL))
+        if self._spread:
+            parts.append(requirables()[self._spread].renamed(f"{prefix}of ", LEVEL))
+        return parts
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The dataset's variables that it is computed of."""
+        return tuple(dict.fromkeys(self.requirable.variables))
+
+    @property
+    def least_draws(self) -> int:
+        """Draws with a number below which it is useless to go on.
+
+        It does not depend on the half-width, so that a smaller one never needs fewer trials.
+        """
+        if self.requirable.is_rate:
+            return MIN_OF_RATE
+        if (percent := self.requirable.percent) is None:
+            return MIN_MEAN_DRAWS
+        return draws_of_quantile(percent, stopped_level(LEVEL))
+
+    @property
+    def fewest_draws(self) -> int:
+        """Draws below which no interval is narrow enough, whatever the results are."""
+        if not self.requirable.is_rate:
+            return self.least_draws
+        if self.half_width >= 0.5:
+            return 1
+        # Without a success, Clopper and Pearson's end is 1 - tail^(1/n).
+        tail = (1.0 - stopped_level(LEVEL)) / 2.0
+        return math.ceil(math.log(tail) / math.log(1.0 - 2.0 * self.half_width))
+
+    def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
+        """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.
+
+        Parameters
+        ----------
+        table
+            The variables of `statistics`; ``looked_for`` and ``run``: poses that were.
+        prefix
+            As there.
+        total
+            Poses that all trials would be.
+        """
+        what = self.requirable
+        ends = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL]
+        # Of a bias with its sign.
+        value, low, high = ends if what.signed else what.interval(table, prefix)
+        used, draws = table[f"{prefix}used"], table[f"{prefix}draws"]
+        with np.errstate(all="ignore"):
+            half = (high - low) / 2.0
+            if not what.is_rate:
+                scale = abs(value)
+                if self._spread:
+                    scale = xr.apply_ufunc(
+                        np.hypot, value, table[f"{prefix}of {self._spread}"])
+                half = (half / scale).where(half != 0.0, 0.0)
+        # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
+        half = half.where(low != np.inf, 0.0)
+        narrow = (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS))
+        reached = xr.full_like(used, Reached.not_reached)
+        for where, flag_ in (
+            (self._too_rare(used, draws, table["run"], total), Reached.too_rare),
+            (narrow, Reached.reached), (table["looked_for"] == 0, Reached.not_applicable),
+            (table["run"] == 0, Reached.not_run),
+        ):
+            reached = reached.where(~where, flag_)
+        return xr.Dataset({"value": value, "half_width": half, "reached": reached.astype(np.uint8),
+                           "used": used, "draws": draws})
+
+    def _too_rare(
+        self, used: xr.DataArray, draws: xr.DataArray, run: xr.DataArray, total: xr.DataArray
+    ) -> xr.DataArray:
+        """Return where even all trials give fewer draws with a number than `least_draws`.
+
+        By the upper end of the share of poses that have one; ``used`` poses are worth ``draws``.
+        """
+        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
+        worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
+        return (share * total * worth < self.least_draws) & (total >= self.least_draws)
+
+
+def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
+    """Return what some names and half-widths want.
+
+    Names are those of requirements (`sweep.analysis.requirements.parse_requirements`).
+
+    Raises
+    ------
+    ValueError
+        One line for each name that does not exist, each half-width that cannot be, and each
+        quantity that is named twice.
+
+    Examples
+    --------
+    >>> [(each.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
+    [('detection_rate', 0.02)]
+    """
+    precisions: dict[str, WantedPrecision] = {}
+    faults = []
+    for name, half_width in wanted.items():
+        try:
+            what = named(name)
+        except ValueError as error:
+            text = str(error)
+            faults.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
+            continue
+        if not 0.0 < half_width < 1.0:
+            faults.append(f"{name}: expected the half-width of an interval, above 0 and below 1")
+        elif what.name in precisions:
+            faults.append(f"{name}: {what.name} has another half-width; delete one")
+        else:
+            precisions[what.name] = WantedPrecision(what, float(half_width))
+    if faults:
+        raise ValueError("\n".join(faults))
+    return tuple(precisions.values())
+
+
+# --------------------------------------------------------------------------------------------------
+# How well each condition of a store is known, against the precision that was wanted.
+
+@describes
+def precision_reached(
+    results: xr.Dataset, wanted: Mapping[str, float] | None = None,
+    per: Sequence[str] | None = None,
+) -> xr.Dataset:
+    """Return how well each condition is known, against the precision that was wanted.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run.
+    wanted
+        Half-widths of intervals by the name of the quantity, such as ``{"detection_rate": 0.02}``:
+        of rates as they are, of a bias relative to the root mean square error, of all else
+        relative to the value. By default those of the pipeline's [search].
+    per
+        Dimensions whose values are conditions; by default those of the pipeline's [search].
+        Detector and estimator are always kept.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*configuration, *per, quantity), computed.
+
+        - ``value`` and ``half_width`` of its interval, in the terms of ``wanted``.
+        - ``reached``: whether it is as narrow as was wanted (`Reached`).
+        - ``used``: poses that the value is of; ``draws``: the random draws that these are worth.
+        - ``run`` (*configuration, *per): poses that were run, of ``poses`` that all trials are.
+        - ``settled`` (*per): whether no configuration and quantity of the condition needs more.
+        - ``wanted`` (quantity).
+
+    Raises
+    ------
+    ArgumentError
+        For names and half-widths that cannot be, and a dimension that does not exist.
+    DatasetError
+        If the dataset lacks a variable, or has no poses.
+
+    Notes
+    -----
+    The intervals are those by which sampling stops: at 97 % for 95 %, and 98 % for root mean
+    squares and standard deviations (`sweep.analysis.estimator`), also of a store whose
+    sampling was not stopped.
+
+    Examples
+    --------
+    >>> table = precision_reached(results, {"detection_rate": 0.3}, per=["side_px"])
+    >>> [Reached(flag).name for flag in table["reached"].isel(solver=0, quantity=0).values]
+    ['reached', 'not_reached', 'reached']
+    """
+    rule = stopping_rule(results)
+    if wanted is None:
+        if rule is None or not rule.precision:
+            raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
+                                'give half-widths, such as {"detection_rate": 0.02}')
+        wanted = dict(rule.precision)
+    if per is None:
+        per = rule.per if rule is not None and rule.precision else ()
+    try:
+        precisions = wanted_precisions(wanted)
+    except ValueError as error:
+        raise ArgumentError("wanted", wanted, str(error)) from None
+    return precision_table(results, precisions, as_names(per))
+
+
+def precision_table(
+    results: xr.Dataset, precisions: Sequence[WantedPrecision], per: Sequence[str],
+    trials: int | None = None,
+) -> xr.Dataset:
+    """Return the table of `precision_reached`.
+
+    ``trials`` are the most that there may be; by default as many as there are.
+    """
+    configuration = configuration_axes(results)
+    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *per))))
+    configuration = [name for name in configuration if name in kept]
+    statistics = [
+        Count(*LOOKED_FOR, lambda poses: poses.looked_for),
+        Count("run", "poses that were run", lambda poses: poses.run),
+        Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
+        *(each for number, precision in enumerate(precisions)
+          for each in precision.statistics(f"{number} ")),
+    ]
+    inputs = requirable_arrays(results, [each.requirable for each in precisions])
+    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True)
+    total = table["poses"]
+    if trials is not None:
+        total = total // results.sizes[DRAWS] * trials
+    judged = [each.judged(table, f"{number} ", total) for number, each in enumerate(precisions)]
+    out = {str(name): stacked([each[name] for each in judged], "quantity").reset_coords(drop=True)
+           for name in judged[0]}
+    for name, meaning, units in (
+        ("value", "value", ""), ("half_width", "half-width of the interval, as was wanted", ""),
+        ("used", "poses that the value is of", "1"),
+        ("draws", "random draws that these are worth", "1"),
+    ):
+        out[name].attrs = cf_attributes(meaning, units)
+    out["reached"].attrs = cf_attributes(
+        "whether the interval is as narrow as was wanted", flags=Reached)
+    needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
+    out["settled"] = (~needs.any([*configuration, "quantity"])).assign_attrs(
+        cf_attributes("whether no configuration and quantity needs more trials", "1"))
+    out |= {"run": table["run"], "poses": table["poses"]}
+    coordinates = {name: each for name, each in table.coords.items() if set(each.dims) <= {*kept}}
+    return xr.Dataset(out, coordinates).assign_coords(
+        quantity=("quantity", [each.name for each in precisions]),
+        wanted=("quantity", [each.half_width for each in precisions]),
+        relative_to=("quantity", [each.relative_to for each in precisions]),
+    ).assign_attrs(configuration_dims=list(configuration))

@@ -1,0 +1,1374 @@
+"""One estimator: statistics of poses by group, each with an interval that holds for its draws.
+
+`aggregate` arranges a dataset's columns as (groups, cells, draws, settings, ...). A group is one
+row of the table; its cells are a fixed grid, the draws of a cell are random, and the settings of a
+draw see the same images, so that together they count as one draw. A statistic is a record: it
+sums what it needs of each draw, and makes of these sums a value and its interval.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from enum import Enum, IntEnum
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import special
+
+from sweep.analysis.dataset import (
+    DRAWS,
+    common_trials,
+    is_fixed,
+    is_grid_axis,
+    is_sampling_stopped,
+    of_photographs,
+    replicate_order,
+)
+from sweep.analysis.intervals import LEVEL, clopper_pearson, jeffreys, wilson
+from sweep.analysis.poses import COMMON, INSIDE, Poses, component_sum
+from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.draws import REPLICATES
+from sweep.experiment.schema import LABELS, cf_attributes
+from sweep.measure.flags import Flag, flag
+from sweep.typing import Floats, Integers, Masks
+
+Arrays = dict[str, NDArray[Any]]
+"""Arrays of poses, (groups, cells, draws, settings, ...), by name."""
+
+Variables = dict[str, NDArray[Any]]
+"""Values of variables (groups,), by name."""
+
+
+class DrawnPoses(Protocol):
+    """A view of a block's poses: what statistics read."""
+
+    @property
+    def draws(self) -> Masks:
+        """Which draws were run: (groups, cells, draws)."""
+        ...
+
+
+ViewT = TypeVar("ViewT", bound=DrawnPoses)
+ResultT = TypeVar("ResultT")
+
+
+# --------------------------------------------------------------------------------------------------
+# Columns in memory; what is computed of them pose by pose is so for a block at a time.
+
+MAX_BLOCK = 1 << 17
+"""Poses in a block: a thread needs 25 MB for so many."""
+
+MAX_SHARED = 1 << 20
+"""Poses of which views are kept for all statistics: what they compute takes some 200 MB."""
+
+MAX_THREADS = 4
+"""Blocks that are computed side by side; with more, reading memory is what takes time."""
+
+MAX_SLICES = 8
+"""Settings up to which they are summed one by one, for NumPy's loop along a short axis is slow."""
+
+OVER_ALL = (1, 2, 3)
+"""Axes of cells, draws and settings."""
+
+
+class Columns(Generic[ViewT]):
+    """The poses of some groups, read in blocks along groups, cells and draws.
+
+    Parameters
+    ----------
+    arrays
+        The columns, (groups, cells, draws, settings, ...).
+    view
+        Makes of a block's arrays the view that statistics read.
+    """
+
+    def __init__(self, arrays: Arrays, view: Callable[[Arrays], ViewT]) -> None:
+        self._arrays, self._view = arrays, view
+        self.shape = next(iter(arrays.values())).shape[:4]
+        self.poses = math.prod(self.shape)
+        # Groups are cut first: cells are where they are small, draws where a cell is large.
+        cuts = []
+        for axis, length in enumerate(self.shape[:3]):
+            step = max(MAX_BLOCK // max(math.prod(self.shape[axis + 1 :]), 1), 1)
+            cuts.append([slice(start, start + step) for start in range(0, max(length, 1), step)])
+        self._blocks = list(itertools.product(*cuts))
+        self._views: dict[int, ViewT] = {}
+
+    def map(self, function: Callable[[ViewT, tuple[slice, ...]], ResultT]) -> list[ResultT]:
+        """Return what a function gives of the view of each block, and of where the block lies."""
+        def of_block(number: int) -> ResultT:
+            return function(self._view_of(number), self._blocks[number])
+
+        if len(self._blocks) == 1:
+            return [of_block(0)]
+        with ThreadPoolExecutor(min(MAX_THREADS, len(os.sched_getaffinity(0)))) as threads:
+            return list(threads.map(of_block, range(len(self._blocks))))
+
+    def sums(
+        self, function: Callable[[ViewT, slice], Floats], total: Callable[..., Any] = np.add
+    ) -> Floats:
+        """Return the sums (groups, ...) of arrays (groups of a block, ...) over all blocks.
+
+        ``function`` gives the array of a block's view and its groups. ``total`` may be another
+        ufunc, such as `numpy.maximum`.
+        """
+        found = self.map(lambda view, cut: (cut[0], function(view, cut[0])))
+        shape = self.shape[0], *found[0][1].shape[1:]
+        out = np.zeros(shape) if total is np.add else np.full(shape, -np.inf)
+        for groups, part in found:
+            out[groups] = total(out[groups], part)
+        return out
+
+    def _view_of(self, number: int) -> ViewT:
+        """Return the view of a block; of few poses all statistics share it, and what it keeps."""
+        if number not in self._views:
+            cut = self._blocks[number]
+            view = self._view({name: array[cut] for name, array in self._arrays.items()})
+            if self.poses > MAX_SHARED:
+                return view
+            self._views[number] = view
+        return self._views[number]
+
+    def by_draw(
+        self, function: Callable[[ViewT, slice], tuple[NDArray[Any], ...]]
+    ) -> tuple[NDArray[Any], ...]:
+        """Return the sums over settings (groups, cells, draws, ...) of arrays of poses.
+
+        ``function`` gives arrays (groups, cells, draws, settings, ...) of a block's view and its
+        groups. Sums of masks are counts, int32; all others are float64.
+        """
+        out: list[NDArray[Any]] = []
+
+        def fill(view: ViewT, cut: tuple[slice, ...]) -> None:
+            for array, values in zip(out, function(view, cut[0]), strict=True):
+                array[cut] = sum_of_settings(values)
+
+        for values in function(self._view_of(0), self._blocks[0][0]):
+            kind = np.int32 if values.dtype.kind == "b" else np.float64
+            out.append(np.empty((*self.shape[:3], *values.shape[4:]), kind))
+        self.map(fill)
+        return tuple(out)
+
+    def column(self, function: Callable[[ViewT], NDArray[Any]]) -> NDArray[np.float32]:
+        """Return a number of each pose in single precision, as errors are stored."""
+        out = np.empty(self.shape, np.float32)
+
+        def fill(view: ViewT, cut: tuple[slice, ...]) -> None:
+            with np.errstate(over="ignore"):  # above 3.4e38: infinite
+                out[cut] = function(view)
+
+        self.map(fill)
+        return out
+
+
+def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the sums over the settings of (groups, cells, draws, settings, ...), bit for bit.
+
+    Examples
+    --------
+    >>> sum_of_settings(np.array([[[[True, True], [False, True]]]])).tolist()
+    [[[2, 1]]]
+    """
+    dtype = np.dtype(np.int32 if array.dtype.kind == "b" else np.float64)
+    if not 0 < array.shape[3] < MAX_SLICES:
+        return np.asarray(array.sum(axis=3, dtype=dtype))
+    total = array[:, :, :, 0].astype(dtype)
+    for k in range(1, array.shape[3]):
+        total += array[:, :, :, k]
+    return total
+
+
+# --------------------------------------------------------------------------------------------------
+# How draws are sampled: trials, photographs or Sobol' replicates, all of them or till a stop.
+#
+# A unit is independent of all else, and counts as one draw whatever it holds: the pooled settings
+# of a trial see the same images, the errors of the markers of a photograph are correlated, and the
+# points of a replicate (`sweep.experiment.draws`) fill their space evenly; the replicates have
+# scrambles of their own. Means follow from the sums of units, with Student's t of the spread
+# between them; rates and quantiles have the intervals of a number of draws that they are worth.
+#
+# Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; L'Ecuyer and Lemieux, "Recent
+# advances in randomized quasi-Monte Carlo methods", 2002, section 2 (replicates).
+#
+# Who looks at an interval again and again and stops when it is narrow finds it narrow by chance,
+# too: it then covers less than its level. So all intervals of a store whose sampling was stopped
+# have smaller tails, by `TAIL_SHARE` (root mean squares and standard deviations, whose intervals
+# are approximations: `SPREAD_TAIL_SHARE`), and those of rates are Clopper and Pearson's. By exact
+# enumeration (`tests/support/stopped_rate.py`) those of rates then cover 95 % at least, whatever
+# the rate; the others by simulation (`tests/sampling/test_stopped_coverage.py`).
+
+TAIL_SHARE = 0.6
+"""Tails of intervals of stores whose sampling was stopped, of those that they would have.
+
+The interval of 95 % is one of 97 %. The least coverage of a rate, over all rates, half-widths from
+0.005 to 0.25, waves of 5 to 99 draws at first and any largest number of trials, is then 0.954.
+"""
+
+SPREAD_TAIL_SHARE = 0.4
+"""The same of root mean squares and standard deviations: the interval of 95 % is one of 98 %."""
+
+MIN_SPREAD = 5
+"""Photographs with the rarer outcome from which the spread between photographs is estimated."""
+
+MAX_DRAWS = 1e9
+"""The most draws that a rate is said to be worth."""
+
+
+def stopped_level(level: float, share: float = TAIL_SHARE) -> float:
+    """Return the level of the interval that has another level where sampling was not stopped.
+
+    >>> round(stopped_level(0.95), 3)
+    0.97
+    """
+    return 1.0 - (1.0 - level) * share
+
+
+class Unit(Enum):
+    """What is drawn independently of all else."""
+
+    trial = "trial"
+    photograph = "photograph"
+    replicate = "replicate"
+
+
+@dataclass(frozen=True)
+class Design:
+    """How the draws of a table were sampled.
+
+    Attributes
+    ----------
+    unit
+        What is independent: its axis is that of the draws.
+    points
+        Pooled settings that see the same Sobol' point.
+    stopped
+        Whether sampling stopped when intervals were narrow, or a decision was sure.
+    """
+
+    unit: Unit = Unit.trial
+    points: int = 1
+    stopped: bool = False
+
+    def level(self, level: float, tail_share: float = TAIL_SHARE) -> float:
+        """Return the level of the interval that is to hold its value with that probability."""
+        return stopped_level(level, tail_share) if self.stopped else level
+
+    def worth(self, hits: Integers, used: Integers, level: float) -> Floats:
+        """Return the number of independent draws (groups,) that a rate is worth.
+
+        Of trials it is `Sample.draws`. Of photographs and replicates it is p (1 - p) over the
+        variance of the ratio of sums (`ratio_terms`), times (z / t)² for the units' degrees of
+        freedom: Korn and Graubard, "Confidence intervals for proportions with small expected number
+        of positive counts estimated from survey data", Survey Methodology 24, 1998. If successes or
+        failures are too few to tell how they spread, it is no more than the number of draws.
+
+        Parameters
+        ----------
+        hits, used
+            Numbers of successes and of poses that count (groups, cells, draws).
+        level
+            Of the interval.
+        """
+        sample = Sample(used)
+        if self.unit is Unit.trial:
+            return sample.draws.astype(np.float64)
+        n, successes = sample.n.astype(np.float64), hits.sum(axis=(1, 2), dtype=np.float64)
+        of_points = self.unit is Unit.replicate
+        tail = (1.0 - level) / 2.0
+        with np.errstate(all="ignore"):
+            rate = successes / n
+            counted = np.ones_like(used, dtype=bool) if of_points else used > 0
+            units, m2 = ratio_terms(hits - rate[:, None, None] * used, counted)
+            variance = (m2 * units / (units - 1.0)).sum(axis=1) / n**2
+            freedom = np.maximum(units.max(axis=1, initial=0.0) - 1.0, 1.0)
+            shrink = (special.ndtri(tail) / special.stdtrit(freedom, tail)) ** 2
+            binomial = rate * (1.0 - rate)
+            draws: Floats | Integers = n / self.points if of_points else sample.draws
+            if of_points:
+                # The spread between replicates of p points is no finer than a point.
+                variance = np.maximum(
+                    variance, binomial / (draws * np.maximum(draws / REPLICATES, 1.0)))
+                few = np.minimum(successes, n - successes) < 2 * REPLICATES * self.points
+            else:
+                few = np.minimum(*((each > 0).sum(axis=(1, 2)) for each in (hits, used - hits))
+                                 ) < MIN_SPREAD
+            worth = np.fmin(shrink * binomial / variance, MAX_DRAWS if of_points else n)
+            worth = np.where(few, np.fmin(worth, draws), worth)
+        return np.where(n > 0, np.maximum(np.nan_to_num(worth, nan=1.0), 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The poses that count, and the draws that they are of.
+
+    ``used`` (groups, cells, draws) is the number of settings of each draw that count.
+    """
+
+    used: Integers
+
+    @property
+    def n(self) -> Integers:
+        """Poses (groups,), times pooled settings."""
+        return np.asarray(self.used.sum(axis=(1, 2), dtype=np.int64))
+
+    @property
+    def draws(self) -> Integers:
+        """Number of draws (groups,) that the poses are worth.
+
+        That is the number of draws with a pose that counts if each has equally many of them; else
+        it is less, for those with more of them count more: the effective sample size,
+        (Σ m)² / Σ m² of m poses a draw, rounded down (Kish, "Survey Sampling", 1965, section 11.7).
+        """
+        squares = np.square(self.used, dtype=np.float64).sum(axis=(1, 2))
+        return whole(self.n.astype(np.float64) ** 2 / np.maximum(squares, 1.0))
+
+    @property
+    def freedom(self) -> Integers:
+        """Degrees of freedom (groups,): the draws beyond the first of each cell."""
+        return np.asarray(np.maximum((self.used > 0).sum(axis=2) - 1, 0).sum(axis=1))
+
+    @property
+    def drawn(self) -> Masks:
+        """Whether any cell has two draws, so that intervals exist; (groups,)."""
+        return np.asarray(self.freedom > 0)
+
+
+def whole(draws: Floats) -> Integers:
+    """Return numbers of draws rounded down, but for what rounding took from them."""
+    return np.asarray(np.floor(draws * (1.0 + 1e-12)), dtype=np.int64)
+
+
+def scaled_to_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integers, Integers]:
+    """Return ``hits`` of ``n`` poses as hits of draws, rounded down and up.
+
+    Examples
+    --------
+    >>> [int(each) for each in scaled_to_draws(np.int64(5), np.int64(8), np.int64(4))]
+    [2, 3]
+    """
+    n = np.maximum(n, 1)
+    return hits * draws // n, -(-hits * draws // n)
+
+
+# --------------------------------------------------------------------------------------------------
+# The estimator: a mean is a ratio of two sums over a stratified sample of clusters.
+#
+# The cells are the strata and the draws the clusters: R = Σ v / Σ n, v and n being a draw's sums of
+# values and of what counts. Its error is that of the sum of e = v - R n over Σ n, each cell's
+# variance from its own draws: Cochran, "Sampling Techniques", 3rd ed. 1977, sections 3.12, 6.11 and
+# 5A.14. If all draws count it is the sum of n_c s_c² over n²; if some do not, it includes that
+# which ones do is random. Lengths, standard deviations and ratios are linear in such sums to first
+# order, so that they have residuals e, too.
+
+class MeanEstimate(NamedTuple):
+    """Means, their standard errors, and the degrees of freedom of these, each (groups,)."""
+
+    mean: Floats
+    error: Floats
+    freedom: Floats
+
+
+def ratio_terms(residuals: Floats, counted: Masks) -> tuple[Integers, Floats]:
+    """Return the number of draws and the residuals' sum of squared deviations, (groups, cells).
+
+    ``residuals`` and the draws that are ``counted`` are (groups, cells, draws).
+    """
+    units = counted.sum(axis=2)
+    with np.errstate(all="ignore"):
+        mean = np.where(counted, residuals, 0.0).sum(axis=2) / np.maximum(units, 1)
+        squares = np.square(np.where(counted, residuals - mean[..., None], 0.0)).sum(axis=2)
+    return units, squares
+
+
+def estimate_mean(
+    mean: Floats, residuals: Floats, used: Integers, run: Masks
+) -> MeanEstimate:
+    """Return means (groups,) with their standard errors, by the residuals (groups, cells, draws).
+
+    A cell with a single draw has no variance of its own and gets the pooled one. The degrees of
+    freedom are Welch's (Biometrika 34, 1947, the form with f + 2): a few cells with the largest
+    errors can make most of the variance. They are at most `Sample.freedom`; 0 of these: standard
+    error NaN.
+
+    Parameters
+    ----------
+    mean
+        The estimates.
+    residuals
+        What each draw adds to the sum of ``used * (value - mean)``.
+    used
+        How many values of each draw count.
+    run
+        The draws that were run.
+    """
+    sample = Sample(used)
+    n, most = sample.n, sample.freedom
+    units, m2 = ratio_terms(residuals, run)
+    repeated = units > 1
+    rest, m2 = np.where(repeated, units - 1.0, 0.0), np.where(repeated, m2, 0.0)
+    with np.errstate(all="ignore"):
+        terms = (rest + 1.0) * m2 / np.maximum(rest, 1.0)  # n_c s_c²
+        variance = terms.sum(axis=1)
+        welch = variance**2 / (terms**2 / (rest + 2.0)).sum(axis=1) - 2.0
+        single = (units == 1).sum(axis=1)
+        pooled = single * m2.sum(axis=1) / rest.sum(axis=1)
+        variance = variance + np.where(single > 0, pooled, 0.0)
+        degrees = np.where(most > 0, np.fmin(most, welch), np.nan)
+        error = np.where(most > 0, np.sqrt(variance) / n, np.nan)
+    return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
+
+
+Interval = tuple[Floats, Floats, Floats]
+"""Value, low and high, each (groups,)."""
+
+
+def half_width(estimate: MeanEstimate, level: float) -> Floats:
+    """Return half the width of Student's interval."""
+    return np.asarray(estimate.error * special.stdtrit(estimate.freedom, (1.0 + level) / 2.0))
+
+
+def symmetric(estimate: MeanEstimate, level: float) -> Interval:
+    """Return Student's interval of means."""
+    half = half_width(estimate, level)
+    return estimate.mean, estimate.mean - half, estimate.mean + half
+
+
+def exponential(estimate: MeanEstimate, level: float) -> Interval:
+    """Return the interval of positive means: Student's of the logarithm, by the delta method."""
+    mean, low, high = symmetric(estimate, level)
+    with np.errstate(all="ignore"):
+        factor = np.exp(half_width(estimate, level) / mean)
+        return (mean, np.where(mean == 0.0, low, mean / factor),
+                np.where(mean == 0.0, high, mean * factor))
+
+
+UNSEEN_FACTOR = 2.0
+"""Errors that no draw showed are taken to be at most so many times as large as the largest seen.
+
+On draws whose worst 1 % carries half of the squares, on Student's t with 4 degrees of freedom and
+on lognormal errors with a logarithm's deviation of 0.8, a root mean square at its limit is then
+met in less than 5 % of the samples of 50, 100 and 400; without, in up to 49 %
+(`pytest -m long tests/analysis/test_requirements_at_the_limit.py`).
+"""
+
+
+def with_unseen_tail(
+    high: Floats, largest: Floats, draws: Integers | Floats, level: float = LEVEL
+) -> Floats:
+    """Return upper ends of mean squares that hold rare large errors which no draw showed.
+
+    A sample without outliers says nothing of their size, but it bounds their share: with
+    probability 1 - a, a = (1 - level) / 2, less than p = 1 - a^(1/n) of the population is of a
+    kind that none of n draws is of (Clopper and Pearson's end without a success; over cells the
+    geometric mean of the shares seen is at most the arithmetic one, so that it holds there, too).
+    Errors of that share are taken to be at most `UNSEEN_FACTOR` times as large as the largest that
+    was seen. That is an assumption: no sample can tell. It lets the end be a p-th part of the
+    square of that and a (1 - p)-th part of the end for what was seen.
+
+    The end of 100 normal errors of one component is then 1.7 times their root mean square, and 1.3
+    times of 400.
+
+    Parameters
+    ----------
+    high
+        Upper ends (groups,) of the mean squares of what was seen.
+    largest
+        Largest squares (groups,) that were seen.
+    draws
+        Independent draws (groups,).
+    level
+        Of the interval.
+    """
+    with np.errstate(all="ignore"):
+        share = -np.expm1(np.log((1.0 - level) / 2.0) / draws)
+        end = (1.0 - share) * high + share * UNSEEN_FACTOR**2 * largest
+        return np.where(np.isfinite(largest), np.fmax(high, end), high)
+
+
+def length_interval(estimate: MeanEstimate, components: int, level: float = LEVEL) -> Interval:
+    """Return the interval of the length of a mean vector, at least 0.
+
+    Along its own direction the mean vector is a plain mean, and the upper end is Student's. The
+    mean's length grows by chance, so the lower end is Scheffé's: the length minus
+    sqrt(k d / (d - k + 1) · F(k, d - k + 1)) standard errors, k components, d degrees of freedom.
+    By the Cauchy-Schwarz inequality this holds a bias of 0 whenever Hotelling's T² does, in 95 %
+    at least. With 50 normal errors of 3 components it covers 0.97 (a large bias) to 0.995 (a bias
+    of its error).
+    """
+    length, low, high = symmetric(estimate, level)
+    rest = estimate.freedom - (components - 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        reach = np.sqrt(
+            components * estimate.freedom / rest * special.fdtri(components, rest, level))
+        low = np.where(rest > 0.0, np.fmax(0.0, length - reach * estimate.error), 0.0)
+    return length, np.where(np.isnan(estimate.error), np.nan, low), high
+
+
+# --------------------------------------------------------------------------------------------------
+# A statistic of poses: a record that says what of the blocks it needs, and the variables it gives.
+#
+# All intervals are at 95 %, over the random draws, conditional on the grid; NaN if no cell has
+# two draws that count.
+
+@dataclass(frozen=True)
+class Output:
+    """A variable that a statistic gives."""
+
+    name: str
+    meaning: str
+    units: str
+    dtype: str = "f8"
+    flags: type[IntEnum] | None = None
+
+    def attributes(self) -> dict[str, Any]:
+        """Return its attributes."""
+        return cf_attributes(self.meaning, self.units, self.flags)
+
+
+INTERVAL = {"": "", "_low": "lower end of the 95 % interval: ",
+            "_high": "upper end of the 95 % interval: "}
+"""Endings of names, of a value and of its interval's ends, with what meanings begin with."""
+
+
+def with_interval(name: str, meaning: str, units: str) -> list[Output]:
+    """Return a variable and the ends of its interval."""
+    return [Output(f"{name}{end}", words + meaning, units) for end, words in INTERVAL.items()]
+
+
+def interval_variables(name: str, interval: Sequence[NDArray[Any]]) -> Variables:
+    """Return a value and the ends of its interval, (value, low, high), by name."""
+    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
+
+
+class Statistic(ABC, Generic[ViewT]):
+    """What is computed of poses; generic over the view of them."""
+
+    @abstractmethod
+    def outputs(self) -> Sequence[Output]:
+        """Return the variables that it gives."""
+
+    @abstractmethod
+    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+        """Return the variables, each (groups,), of poses whose draws are of a design."""
+
+
+def guarded(statistic: Statistic[ViewT]) -> Statistic[ViewT]:
+    """Return a statistic with the interval by which something is decided.
+
+    Upper ends of means of squares then hold rare errors that no draw showed.
+    """
+    if not hasattr(statistic, "guarded"):
+        return statistic
+    return cast("Statistic[ViewT]", replace(cast("Any", statistic), guarded=True))
+
+
+# --------------------------------------------------------------------------------------------------
+# Counts of poses, and rates of them with intervals of a binomial proportion.
+
+@dataclass(frozen=True)
+class Count(Statistic[ViewT]):
+    """How many poses there are of a kind.
+
+    With names for these also the ``draws`` that they are worth, and whether intervals exist:
+    ``drawn``.
+    """
+
+    name: str
+    meaning: str
+    of: Callable[[ViewT], Masks]
+    draws: str = ""
+    drawn: str = ""
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the variables."""
+        count = Output(self.name, self.meaning, "1", "i8")
+        return [count, Output(self.draws, "random draws that the intervals are of", "1", "i8"),
+                Output(self.drawn, "whether any cell has two draws", "1", "?")
+                ] if self.draws else [count]
+
+    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:  # noqa: ARG002
+        """Return the counts."""
+        sample = Sample(*columns.by_draw(lambda poses, _: (self.of(poses),)))
+        more = {self.draws: sample.draws, self.drawn: sample.drawn} if self.draws else {}
+        return {self.name: sample.n, **more}
+
+
+@dataclass(frozen=True)
+class Rate(Statistic[ViewT]):
+    """The share of ``used`` that are ``successes``, with an interval of a level.
+
+    It is Wilson's, or Clopper and Pearson's if it is to be ``exact``, or sampling was stopped.
+
+    n of the interval is the number of draws that the rate is worth (`Design.worth`), and the
+    successes are rounded outwards to whole draws. It is a little wide if the cells' rates differ.
+    """
+
+    name: str
+    meaning: str
+    successes: Callable[[ViewT], Masks]
+    used: Callable[[ViewT], Masks]
+    level: float = LEVEL
+    counts: Sequence[tuple[str, str]] = ()
+    """Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted."""
+    with_jeffreys: bool = False
+    exact: bool = False
+    draws_name: str = "draws"
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the rate, its interval, and the counts that are asked for."""
+        draws = Output(self.draws_name, "random draws that the interval is of", "1", "i8")
+        return [
+            *(Output(name, meaning, "1", "i8") for name, meaning in self.counts),
+            *([draws] if self.counts else []),
+            *with_interval(self.name, self.meaning, "1"),
+            *(with_interval(f"{self.name}_jeffreys", f"{self.meaning} (Jeffreys)", "1")[1:]
+              if self.with_jeffreys else []),
+        ]
+
+    def by_draw(self, columns: Columns[ViewT]) -> tuple[Integers, Integers]:
+        """Return the numbers of successes and of poses that count, (groups, cells, draws) each."""
+        def masks(poses: ViewT, _: slice) -> tuple[Masks, Masks]:
+            used = self.used(poses)
+            return self.successes(poses) & used, used
+
+        hits, used = columns.by_draw(masks)
+        return hits, used
+
+    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+        """Return the rate and its intervals."""
+        hits_by_draw, used = self.by_draw(columns)
+        level, sample = design.level(self.level), Sample(used)
+        n, hits = sample.n, Sample(hits_by_draw).n
+        draws = whole(design.worth(hits_by_draw, used, level))
+        with np.errstate(invalid="ignore"):
+            values: Variables = {self.name: hits / n}
+        if self.counts:
+            names = (name for name, _ in self.counts)
+            values |= dict(zip(names, (n, hits), strict=False)) | {self.draws_name: draws}
+        kinds = {"": clopper_pearson if self.exact or design.stopped else wilson}
+        if self.with_jeffreys:
+            kinds["_jeffreys"] = jeffreys
+        fewest, most = scaled_to_draws(hits, n, draws)
+        for ending, interval in kinds.items():
+            low, high = interval(fewest, draws, level)[0], interval(most, draws, level)[1]
+            values[f"{self.name}{ending}_low"] = np.where(sample.drawn, low, np.nan)
+            values[f"{self.name}{ending}_high"] = np.where(sample.drawn, high, np.nan)
+        return values
+
+
+def newcombe_and_mcnemar(
+    both: Integers, first: Integers, second: Integers, neither: Integers, draws: Integers,
+    drawn: Masks, level: float = LEVEL,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the difference of two paired rates, its interval's ends, and McNemar's p-value.
+
+    ``both``, ``first`` (alone), ``second`` (alone) and ``neither`` are counts of pairs, scaled to
+    ``draws`` if these are fewer; without ``drawn`` the interval and the p-value are NaN.
+    Newcombe, Statistics in Medicine 17 (1998), pages 2635-2650, method 10, with the continuity
+    correction of the correlation; the test is the exact binomial one of the discordant pairs.
+    """
+    n = both + first + second + neither
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = draws / np.maximum(n, 1)
+        rates, lows, highs = [], [], []
+        for hits in (both + second, both + first):
+            rates.append(hits / n)
+            fewest, most = scaled_to_draws(hits, n, draws)
+            lows.append(wilson(fewest, draws, level)[0])
+            highs.append(wilson(most, draws, level)[1])
+        margins = ((both + first) * (second + neither)).astype(np.float64) * (
+            (both + second) * (first + neither))
+        cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
+        # Of counts scaled to draws.
+        corrected = np.maximum(cross * scale**2 - draws / 2, 0.0)
+        lessened = np.where(cross > 0, corrected, cross * scale**2)
+        correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
+
+        def reach(up: Floats, down: Floats) -> Floats:
+            squares = up**2 - 2 * correlation * up * down + down**2
+            return np.sqrt(np.maximum(squares, 0.0))
+
+        difference = rates[0] - rates[1]
+        low = difference - reach(rates[0] - lows[0], highs[1] - rates[1])
+        high = difference + reach(highs[0] - rates[0], rates[1] - lows[1])
+        _, fewer = scaled_to_draws(np.minimum(first, second), n, draws)
+        discordant = np.maximum(scaled_to_draws(first + second, n, draws)[0], fewer)
+        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
+    low, high, p_value = (np.where(drawn, each, np.nan) for each in (low, high, p_value))
+    return difference, low, high, p_value
+
+
+# --------------------------------------------------------------------------------------------------
+# Means of poses' values with their intervals: bias, standard deviation, root mean square.
+
+class Sums(NamedTuple):
+    """What a mean needs of each draw.
+
+    Attributes
+    ----------
+    values
+        Sums of the values (groups, cells, draws, components).
+    used
+        How many count (groups, cells, draws).
+    run
+        Whether the draw was run (groups, cells, draws).
+    largest
+        The largest first component (groups,); -inf of none.
+    """
+
+    values: Floats
+    used: Integers
+    run: Masks
+    largest: Floats
+
+    @property
+    def mean(self) -> Floats:
+        """Mean values (groups, components)."""
+        with np.errstate(all="ignore"):
+            return np.asarray(self.values.sum(axis=(1, 2)) / Sample(self.used).n[:, None])
+
+    def estimate(self, mean: Floats, values: Floats) -> MeanEstimate:
+        """Return a mean (groups,), ``values`` (groups, cells, draws) being the draws' sums."""
+        with np.errstate(all="ignore"):
+            residuals = values - mean[:, None, None] * self.used
+        return estimate_mean(mean, residuals, self.used, self.run)
+
+
+@dataclass(frozen=True)
+class Mean(Statistic[ViewT]):
+    """A mean of values, (groups, cells, draws, settings, components), with Student's interval.
+
+    Values that are NaN do not count.
+    """
+
+    name: str
+    meaning: str
+    units: str
+    values: Callable[[ViewT], Floats]
+    used: Callable[[ViewT], Masks]
+    level: float = LEVEL
+    tail_share: ClassVar[float] = TAIL_SHARE
+    """Where sampling was stopped."""
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the mean and its interval."""
+        return with_interval(self.name, self.meaning, self.units)
+
+    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+        """Return the mean and its interval."""
+        level = design.level(self.level, self.tail_share)
+        return interval_variables(self.name, self.interval(columns, design, level))
+
+    def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
+        """Return value, low and high."""
+        sums = self.sums(columns)
+        return symmetric(sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
+
+    def sums(self, columns: Columns[ViewT], centre: Floats | None = None) -> Sums:
+        """Return what it needs of each draw: the values, or their squared distance to a centre.
+
+        ``centre`` is (groups, components).
+        """
+        def parts(poses: ViewT, groups: slice) -> tuple[NDArray[Any], ...]:
+            values = self.values(poses)
+            missing = functools.reduce(
+                np.logical_or, (np.isnan(values[..., k]) for k in range(values.shape[-1])))
+            used = np.asarray(self.used(poses) & ~missing)
+            if centre is not None:
+                values = component_sum(
+                    np.square(values - centre[groups, None, None, None]))[..., None]
+            largest = np.where(used, values[..., 0], -np.inf).max(axis=3, initial=-np.inf)
+            return (np.where(used[..., None], values, 0.0), used, poses.draws[..., None],
+                    largest[..., None])
+
+        values, used, run, largest = columns.by_draw(parts)
+        return Sums(values, used, run > 0, largest.max(axis=(1, 2), initial=-np.inf))
+
+
+class MeanLength(Mean[ViewT]):
+    """The length of the mean of vectors, with the interval of `length_interval`."""
+
+    def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
+        """Return value, low and high."""
+        sums = self.sums(columns)
+        mean, components = sums.mean, sums.mean.shape[1]
+        length = np.linalg.norm(mean, axis=1)
+        with np.errstate(all="ignore"):
+            direction = np.where(
+                length[:, None] > 0.0, mean / length[:, None], np.eye(1, components))
+        along = component_sum(sums.values * direction[:, None, None])
+        return length_interval(sums.estimate(length, along), components, level)
+
+
+class RootMeanSquareRatio(Mean[ViewT]):
+    """The root of the ratio of two means of squares, of the same poses: components 1 over 0.
+
+    Its interval is Student's of the logarithm, by the delta method.
+    """
+
+    def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
+        """Return value, low and high."""
+        sums = self.sums(columns)
+        mean = sums.mean
+        with np.errstate(all="ignore"):
+            shares = sums.values / mean[:, None, None]
+            difference = sums.estimate(np.zeros(len(mean)), shares[..., 1] - shares[..., 0])
+            factor = np.exp(half_width(difference, level) / 2.0)
+            ratio = np.sqrt(mean[:, 1] / mean[:, 0])
+            return ratio, ratio / factor, ratio * factor
+
+
+@dataclass(frozen=True)
+class PositiveMean(Mean[ViewT]):
+    """The mean of squares, or of other values that are not negative.
+
+    Its interval is Student's of the logarithm. If it is ``guarded``, as all by which something is
+    decided, the upper end also holds rare large values that the draws did not show
+    (`with_unseen_tail`).
+    """
+
+    guarded: bool = False
+
+    def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:
+        """Return value, low and high."""
+        sums = self.scores(columns)
+        value, low, high = exponential(
+            sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
+        if self.guarded:
+            sample = Sample(sums.used)
+            draws = sample.n / design.points if design.unit is Unit.replicate else (
+                sample.freedom + 1)
+            high = with_unseen_tail(high, sums.largest, draws, level)
+        return value, low, high
+
+    def scores(self, columns: Columns[ViewT]) -> Sums:
+        """Return the sums of what the mean is of."""
+        return self.sums(columns)
+
+
+class RootMeanSquare(PositiveMean[ViewT]):
+    """The root of the mean of squares, which are the values.
+
+    Squares are skewed, and a mean square's error goes with its size: Student's interval is right
+    for the logarithm. With 50 normal errors in 1, 5, 10 or 25 cells it covers 0.938 to 0.954,
+    without the logarithm 0.92 to 0.95; with Laplace's tails 0.90 to 0.94.
+    """
+
+    tail_share: ClassVar[float] = SPREAD_TAIL_SHARE
+
+    def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:
+        """Return value, low and high."""
+        value, low, high = map(np.sqrt, super().interval(columns, design, level))
+        return value, low, high
+
+
+class StandardDeviation(RootMeanSquare[ViewT]):
+    """The root of the summed variances of a vector's components about their mean (n - 1)."""
+
+    def scores(self, columns: Columns[ViewT]) -> Sums:
+        """Return the sums of squared distances to the mean, each times n / (n - 1)."""
+        sums = self.sums(columns, self.sums(columns).mean)
+        n = Sample(sums.used).n
+        with np.errstate(all="ignore"):
+            factor = n / (n - 1.0)
+            return sums._replace(values=sums.values * factor[:, None, None, None],
+                                 largest=sums.largest * factor)
+
+
+# --------------------------------------------------------------------------------------------------
+# Root mean square of errors of which rare flips make most: an interval that counts unseen ones.
+#
+# With 2 % flips of 60 degrees among errors of half a degree the mean square is nearly that of the
+# flips alone, and a third of all samples of 50 has none of them: whatever is computed from such a
+# sample alone says nothing of the mean square. What bounds it is how many flips the sample may
+# have missed, and that no rotation error is larger than half a turn.
+
+FLIPS: Rate[Poses] = Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
+"""The share of flips among the solved."""
+
+
+@dataclass(frozen=True)
+class FlipMixture(Statistic[Poses]):
+    """The root mean square over solved poses, with an interval that holds if flips are rare.
+
+    The mean square is (1 - p) u + p v: p the share of flips, u the mean square of the other poses,
+    v that of the flips. The interval's ends are the least and the largest value over the ends of
+    p (Clopper and Pearson, Biometrika 26, 1934), u and v (`PositiveMean`), each right with 97.5 %
+    at either end. Where v has no upper end, or one beyond it, ``bound`` takes its place.
+
+    With 1, 2 and 5 % flips of 60 degrees among errors of half a degree it covers 0.97 to 1.00 from
+    50 draws on. Without a flip in 50 draws the upper end is 48 degrees, in 1,000 draws 11, in
+    10^6 draws 0.6: there are samples without flips of populations with such a mean square.
+    """
+
+    name: str
+    meaning: str
+    units: str
+    squares: Callable[[Poses], Floats]
+    bound: float
+    """The largest error that exists, in the unit of the errors."""
+    flips: Rate[Poses] = FLIPS
+    """The share of flips, p."""
+    level: float = LEVEL
+    guarded: bool = False
+    """Whether the ends of u and v also hold errors that no draw showed, as `PositiveMean` says."""
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the root mean square and its interval."""
+        return with_interval(self.name, self.meaning, self.units)
+
+    def used(self, poses: Poses) -> Masks:
+        """Return the poses that count."""
+        return poses.solved
+
+    def variables(self, columns: Columns[Poses], design: Design) -> Variables:
+        """Return the root mean square and its interval."""
+        level = design.level(self.level, SPREAD_TAIL_SHARE)
+
+        def mean(used: Callable[[Poses], Masks]) -> PositiveMean[Poses]:
+            return PositiveMean("", "", self.units, self.squares, used, guarded=self.guarded)
+
+        square = mean(self.used).sums(columns).mean[:, 0]
+        _, u_low, u_high = mean(lambda poses: poses.unflipped).interval(columns, design, level)
+        _, v_low, v_high = mean(lambda poses: poses.flipped).interval(columns, design, level)
+        lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
+        highs = [np.fmin(high, self.bound**2) for high in (u_high, v_high)]
+        hits, used = self.flips.by_draw(columns)
+        sample, draws = Sample(used), whole(design.worth(hits, used, self.flips.level))
+        fewest, most = scaled_to_draws(Sample(hits).n, sample.n, draws)
+        shares = (clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1])
+        low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
+        high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
+        # What is computed is rounded: the value lies in its interval.
+        interval = (square, np.fmin(low, square), np.fmax(high, square))
+        ends = [np.where(sample.drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
+        return interval_variables(self.name, [np.sqrt(each) for each in ends])
+
+
+def _first_known(first: Floats, second: Floats) -> Floats:
+    """Return the first that is not NaN of each, or 0."""
+    return np.nan_to_num(np.where(np.isnan(first), second, first), nan=0.0)
+
+
+# --------------------------------------------------------------------------------------------------
+# Quantiles of errors, exact, with rank intervals.
+
+PERCENTS = {"median": 50, "p95": 95, "p99": 99}
+
+
+class IntervalOf(Flag):
+    """Why an interval has both ends, or not."""
+
+    not_run = flag(0, "No pose counts.", counted=False)
+    given = flag(1, "Both ends exist.", present=True)
+    nothing_drawn = flag(2, "No cell has two draws that count.")
+    too_few_draws = flag(3, "An end lies beyond the smallest or the largest draw.")
+
+
+MAX_VALUES = 2 * 10**8
+"""Values of a column that are sorted at once: 1.6 GB."""
+
+ROUNDING = 1e-9
+"""Share of a pose by which a rank may be above a whole number."""
+
+
+def values_at(ascending: NDArray[Any], ranks: Integers) -> Floats:
+    """Return the values (groups, ...) at ranks from 1; NaN for those that do not exist."""
+    exists = (ranks >= 1) & (ranks <= ascending.shape[1])
+    if not ascending.size:
+        return np.full(ranks.shape, np.nan)
+    values = np.take_along_axis(ascending, np.where(exists, ranks - 1, 0), axis=1)
+    return np.where(exists, values, np.nan).astype(np.float64)
+
+
+def quantile_intervals(
+    errors: NDArray[Any], used: Integers, percents: Sequence[int], design: Design,
+    level: float = LEVEL,
+) -> Floats:
+    """Return quantiles and the ends of their intervals, (groups, percents, 3).
+
+    A quantile is the smallest value with at least that share at or below. An end is NaN where it
+    lies beyond all values, and where no cell has two draws.
+
+    The ends are order statistics of the pooled sample: David and Nagaraja, "Order Statistics", 3rd
+    ed. 2003, section 7.1. If cells differ, the count below the quantile varies less than binomially
+    (Hoeffding, Annals of Mathematical Statistics 27, 1956): they then cover more. Ranks are counted
+    in draws. Of photographs, whose markers are correlated, they are Woodruff's: the quantiles at
+    the ends of the interval of the share below the quantile (Journal of the American Statistical
+    Association 47, 1952), Clopper and Pearson's of the number of draws that the share is worth
+    (Korn and Graubard, Survey Methodology 24, 1998).
+
+    Parameters
+    ----------
+    errors
+        (groups, cells, draws, settings); NaN for those that do not count.
+    used
+        How many count of each draw, (groups, cells, draws).
+    percents
+        Of the values, at or below the quantile.
+    design
+        What the draws are.
+    level
+        Probability with which the interval is to hold it.
+    """
+    sample, tail = Sample(used), (1.0 - level) / 2.0
+    ascending = np.sort(errors.reshape(len(errors), math.prod(errors.shape[1:])), axis=1)
+    n, draws, drawn = sample.n, sample.draws, sample.drawn
+    values = np.full((len(n), len(percents), 3), np.nan)
+    for at, percent in enumerate(percents):
+        ranks = np.zeros((len(n), 3), dtype=np.int64)
+        ranks[:, 0] = -(-n * percent // 100)
+        if design.unit is Unit.photograph:
+            value = values_at(ascending, ranks[:, :1])
+            below = sum_of_settings(errors <= value.reshape(-1, 1, 1, 1))
+            worth, share = design.worth(below, used, level), percent / 100.0
+            low = special.betaincinv(share * worth, (1.0 - share) * worth + 1.0, tail)
+            high = special.betaincinv(share * worth + 1.0, (1.0 - share) * worth, 1.0 - tail)
+            ranks[:, 1] = np.ceil(np.nan_to_num(low) * n - ROUNDING)
+            ranks[:, 2] = np.floor(np.nan_to_num(high) * n + ROUNDING) + 1
+        else:
+            for count in np.unique(draws[drawn]).tolist():
+                same = (draws == count) & drawn
+                first, last = interval_ranks(count, percent, level)
+                ranks[same, 1] = first * n[same] // count
+                # One beyond the last if there is no such draw.
+                ranks[same, 2] = -(-last * n[same] // count) if last <= count else n[same] + 1
+        ranks[:, 1:] = np.where(drawn[:, None], ranks[:, 1:], 0)
+        values[:, at] = values_at(ascending, ranks)
+    return values
+
+
+@dataclass(frozen=True)
+class Quantiles(Statistic[ViewT]):
+    """The quantiles of `PERCENTS` of the errors of ``used`` poses; not ``solved`` is infinite.
+
+    The values of a column are in memory at once, up to `MAX_VALUES` of a group, in single precision
+    as errors are stored. Intervals: `quantile_intervals`.
+    """
+
+    name: str
+    """With {} in place of the statistic, such as ``rotation_{}_deg``."""
+    meaning: str
+    units: str
+    errors: Callable[[ViewT], Floats]
+    solved: Callable[[ViewT], Masks]
+    used: Callable[[ViewT], Masks]
+    with_reason: bool = False
+    level: float = LEVEL
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the quantiles and their intervals."""
+        variables = []
+        for statistic, percent in PERCENTS.items():
+            meaning = f"{percent} % quantile of the {self.meaning}, not solved = infinite"
+            variables += with_interval(self.name.format(statistic), meaning, self.units)
+            if self.with_reason:
+                variables.append(Output(
+                    f"{statistic}_interval", f"why the interval of the {percent} % quantile has "
+                    "both ends, or not", "", "u1", IntervalOf))
+        return variables
+
+    def column(self, columns: Columns[ViewT]) -> tuple[NDArray[np.float32], Integers]:
+        """Return the errors (groups, cells, draws, settings), and how many count of each draw."""
+        def values(poses: ViewT) -> Floats:
+            errors = self.errors(poses)
+            known = self.solved(poses) & ~np.isnan(errors)
+            return np.where(self.used(poses), np.where(known, errors, np.inf), np.nan)
+
+        if columns.poses > MAX_VALUES:
+            raise DatasetError(
+                f"quantiles of {columns.poses:,} poses at once: expected at most {MAX_VALUES:,}; "
+                "divide them: keep an axis apart (per=), or take a part of the dataset (isel) for "
+                "each condition")
+        used, = columns.by_draw(lambda poses, _: (self.used(poses),))
+        return columns.column(values), used
+
+    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+        """Return the quantiles, their intervals, and why these may have no ends."""
+        errors, used = self.column(columns)
+        values = quantile_intervals(
+            errors, used, [*PERCENTS.values()], design, design.level(self.level))
+        sample, found = Sample(used), Variables()
+        for at, statistic in enumerate(PERCENTS):
+            found |= interval_variables(self.name.format(statistic), list(values[:, at].T))
+            if self.with_reason:
+                missing = np.isnan(values[:, at, 1:]).any(axis=1)
+                found[f"{statistic}_interval"] = np.select(
+                    [sample.n == 0, ~sample.drawn, missing],
+                    [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
+                    IntervalOf.given)
+        return found
+
+
+@functools.lru_cache(maxsize=4096)
+def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int]:
+    """Return the ranks, from 1, between which the quantile lies.
+
+    It lies beyond each with (1 - level) / 2 at most. 0 and n + 1 stand for ends that the sample
+    does not have.
+
+    Examples
+    --------
+    >>> interval_ranks(100, 50)
+    (40, 61)
+    """
+    p = percent / 100.0
+    reach = 10.0 * np.sqrt(n * p * (1.0 - p)) + 10.0
+    below = np.arange(max(0, int(n * p - reach)), min(n, int(n * p + reach)) + 1)
+    chance = special.bdtr(below, n, p)
+    tail = (1.0 - level) / 2.0
+    first = below[np.searchsorted(chance, tail)]
+    last = below[np.searchsorted(chance, 1.0 - tail)] + 1
+    return int(first), int(last)
+
+
+@functools.cache
+def draws_of_quantile(percent: int, level: float = LEVEL) -> int:
+    """Return the least number of draws at which the interval of a quantile has an upper end.
+
+    From the median on it has a lower one, too.
+
+    >>> draws_of_quantile(95)
+    72
+    """
+    return next(n for n in itertools.count(1) if interval_ranks(n, percent, level)[1] <= n)
+
+
+# --------------------------------------------------------------------------------------------------
+# Bins of a variable of the scene, as a dimension of a table.
+
+Bins = Mapping[str, Sequence[float]]
+"""Edges of bins, by the name of the variable or coordinate that is binned."""
+
+PREFIX = "bin "
+"""What stands before the name of an array that is binned, among a block's arrays."""
+
+
+@dataclass(frozen=True)
+class Binning:
+    """The edges (n + 1,) of the bins [low, high) of each name."""
+
+    edges: Mapping[str, Floats]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of bins of each name."""
+        return tuple(len(edges) - 1 for edges in self.edges.values())
+
+    def masks(self, values: Mapping[str, Floats]) -> Iterator[Masks]:
+        """Yield which of the binned values (...), by name, are in each combination of bins."""
+        # Of values at the last edge and beyond, and of NaN, it is the number of bins.
+        numbers = [np.searchsorted(edges, values[name], side="right") - 1
+                   for name, edges in self.edges.items()]
+        for index in np.ndindex(*self.shape):
+            yield np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
+
+    def split(self, columns: Arrays) -> Iterator[Arrays]:
+        """Yield the columns of each combination: its cells, with the mask of the poses inside."""
+        if not self.edges:
+            yield columns
+            return
+        values = {name: columns.pop(f"{PREFIX}{name}") for name in self.edges}
+        for inside in self.masks(values):
+            cells = inside.any(axis=(0, 2, 3))
+            part = {**columns, INSIDE: inside}
+            yield part if cells.all() else {name: each[:, cells] for name, each in part.items()}
+
+    def coordinates(self, results: xr.Dataset) -> dict[str, Any]:
+        """Return the coordinates of the bins: middles, lower and upper edges."""
+        coordinates: dict[str, Any] = {}
+        for name, edges in self.edges.items():
+            attributes = dict(results[name].attrs)
+            # Of a bin without an end the middle is its other end.
+            finite = np.nan_to_num(edges, neginf=edges[1], posinf=edges[-2])
+            for label, values in ((name, (finite[:-1] + finite[1:]) / 2),
+                                  (f"{name}_low", edges[:-1]), (f"{name}_high", edges[1:])):
+                coordinates[label] = (name, values, attributes)
+        return coordinates
+
+
+def read_bins(
+    results: xr.Dataset, kept: Sequence[str], bins: Bins
+) -> tuple[Binning, dict[str, xr.DataArray]]:
+    """Return the binning, and the arrays that are binned by their names in a block.
+
+    Raises
+    ------
+    ArgumentError
+        For bins of a variable that does not exist or is not one number for each scene, and for
+        edges that do not increase.
+    """
+    if not isinstance(bins, Mapping):
+        raise ArgumentError("bins", bins, "expected names with edges, such as "
+                            '{"marker_area_px": [0, 100, 1000]}')
+    edges, arrays = {}, {}
+    for name, given in bins.items():
+        if name not in results.variables or name in kept:
+            possible = [str(other) for other, variable in results.variables.items()
+                        if variable.dtype.kind == "f" and other not in kept]
+            raise ArgumentError("bins", name, f"no such variable; there are {', '.join(possible)}")
+        array = results[name].reset_coords(drop=True)
+        if name in results.dims:  # an index, which has no chunks
+            array = xr.DataArray(array.to_numpy(), dims=name)
+        scalar = name in results.coords and not array.dims
+        if array.dtype.kind not in "fiu" or scalar or any(dim in LABELS for dim in array.dims):
+            raise ArgumentError("bins", name, "expected a variable of one number for each scene")
+        edges[name], arrays[f"{PREFIX}{name}"] = _increasing(name, given), array
+    return Binning(edges), arrays
+
+
+def _increasing(name: str, given: Any) -> NDArray[np.float64]:
+    """Return the edges, if they are."""
+    try:
+        edges = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        edges = np.empty(0)
+    if edges.ndim != 1 or len(edges) < 2 or not (edges[1:] > edges[:-1]).all():
+        raise ArgumentError("bins", name, "expected at least two increasing edges")
+    return edges
+
+
+# --------------------------------------------------------------------------------------------------
+# Statistics of all poses of a dataset, by group: the one way to a table.
+
+def aggregate(
+    results: xr.Dataset,
+    inputs: Mapping[str, xr.DataArray],
+    kept: Sequence[str],
+    statistics: Sequence[Statistic[ViewT]],
+    view: Callable[[Arrays], ViewT],
+    bins: Bins | None = None,
+    *,
+    stopped: bool | None = None,
+) -> xr.Dataset:
+    """Return the statistics of the poses of each combination of ``kept`` and of bins.
+
+    Parameters
+    ----------
+    results
+        The dataset whose coordinates and variables name what is kept and binned.
+    inputs
+        The arrays, by name, of which ``view`` makes the poses that the statistics read.
+    kept
+        The dimensions of the table; all others are pooled.
+    statistics
+        What to compute.
+    view
+        Makes the view from a block's arrays, (groups, cells, draws, settings, ...).
+    bins
+        Edges (n + 1,) of bins [low, high) of a variable or coordinate of the scene.
+    stopped
+        Whether sampling was stopped; by default what the dataset's attributes say.
+
+    Returns
+    -------
+    xr.Dataset
+        A variable (*kept, *bins) for each output, computed.
+
+    Raises
+    ------
+    ArgumentError
+        For bins that cannot be.
+    """
+    binning, binned = read_bins(results, kept, bins or {})
+    layout, columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
+    tables = []
+    for part in binning.split(columns):
+        of_part = Columns(part, view)
+        tables.append({name: values for statistic in statistics
+                       for name, values in statistic.variables(of_part, design).items()})
+    shape = (*(layout.sizes[name] for name in layout.kept), *binning.shape)
+    dims = (*layout.kept, *binning.edges)
+    variables = {
+        output.name: (
+            dims, np.stack([table[output.name] for table in tables], axis=-1).reshape(shape).astype(
+                output.dtype), output.attributes())
+        for statistic in statistics for output in statistic.outputs()}
+    coordinates = {name: value.variable for name, value in results.coords.items()
+                   if set(value.dims) <= set(kept) and not is_fixed(value)}
+    return xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
+
+
+def arranged(
+    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str], *,
+    stopped: bool | None = None,
+) -> tuple[Layout, Arrays, Design]:
+    """Return the layout of a dataset's dimensions, its columns in it, and the draws' design."""
+    stopped = is_sampling_stopped(results) if stopped is None else stopped
+    if stopped and (common := common_trials(results, inputs, kept)) is not None:
+        inputs = {**inputs, COMMON: common}
+    layout = Layout.of(results, inputs, kept)
+    unit = Unit.replicate if layout.order is not None else (
+        Unit.photograph if of_photographs(results) else Unit.trial)
+    points = math.prod(layout.sizes[name] for name in layout.settings)
+    return layout, {name: layout.arranged(array) for name, array in inputs.items()}, Design(
+        unit, points, stopped)
+
+
+# Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the
+# other dimensions of camera, marker and pose make cells, a fixed grid; all others that are pooled
+# (effects, levels, renderers, settings of detector and estimator, and names that are no
+# parameter's) see the same draws (`sweep.experiment.draws`), so that their values together count
+# as one draw.
+
+@dataclass(frozen=True)
+class Layout:
+    """What each dimension is: kept, of cells, of draws, or of settings.
+
+    ``order`` are the indices of the trials by replicate, if they have such: then replicates stand
+    in the place of draws.
+    """
+
+    sizes: Mapping[str, int]
+    kept: tuple[str, ...]
+    cells: tuple[str, ...]
+    draws: tuple[str, ...]
+    settings: tuple[str, ...]
+    order: NDArray[np.intp] | None = None
+
+    @classmethod
+    def of(
+        cls, results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]
+    ) -> Layout:
+        """Return the layout of the dimensions of some arrays of a dataset."""
+        sizes = {name: results.sizes[name] for name in kept}
+        for array in inputs.values():
+            sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}
+        pooled = [name for name in sizes if name not in kept]
+        draws = tuple(name for name in pooled if name == DRAWS)
+        cells = tuple(
+            name for name in pooled if name != DRAWS and is_grid_axis(name, results))
+        return cls(
+            sizes, tuple(kept), cells, draws,
+            tuple(name for name in pooled if name not in (*cells, *draws)),
+            replicate_order(results, draws))
+
+    def arranged(self, array: xr.DataArray) -> NDArray[Any]:
+        """Return the values of an array as (groups, cells, draws, settings, ...)."""
+        parts = (self.kept, self.cells, self.draws, self.settings)
+        named = [*itertools.chain(*parts)]
+        inner = [str(dim) for dim in array.dims if dim not in named]
+        # Of dimensions that make an axis together an array has all, or is repeated along all.
+        own = [part if set(part) & set(array.dims) else () for part in parts]
+        dims = [*itertools.chain(*own), *inner]
+        sizes = {**self.sizes, **{name: array.sizes[name] for name in inner}}
+        values = array.variable.transpose(*(name for name in dims if name in array.dims)).to_numpy()
+        values = values.reshape([sizes[name] if name in array.dims else 1 for name in dims])
+        values = np.broadcast_to(values, [sizes[name] for name in dims])
+        rest = values.shape[len(dims) - len(inner):]
+        values = values.reshape((*(math.prod(sizes[name] for name in part) for part in own), *rest))
+        shape = [math.prod(sizes[name] for name in part) for part in parts]
+        values = np.broadcast_to(values, (*shape, *rest))
+        if self.order is None:
+            return values
+        points = shape[2] // REPLICATES * shape[3]  # what is of a replicate stands together
+        return values[:, :, self.order].reshape((*shape[:2], REPLICATES, points, *rest))

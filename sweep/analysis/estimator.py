@@ -182,8 +182,9 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
     if not 0 < array.shape[3] < MAX_SLICES:
         return np.asarray(array.sum(axis=3, dtype=dtype))
     total = array[:, :, :, 0].astype(dtype)
-    for k in range(1, array.shape[3]):
-        total += array[:, :, :, k]
+    with np.errstate(all="ignore"):  # of infinite errors of both signs it is NaN
+        for k in range(1, array.shape[3]):
+            total += array[:, :, :, k]
     return total
 
 

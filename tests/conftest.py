@@ -118,6 +118,20 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 @pytest.fixture
+def claim(record_property):
+    """Record what a test shows: ``claim(what, against, worst, unit)``; the worst of cases counts.
+
+    `tests/evidence.py` gathers the claims of the long tests into the table of tests/README.md.
+    """
+    def recorded(what, against, worst, unit=""):
+        print(f"\n{what}, against {against}: {worst:.2g} {unit}")
+        record_property("claim", {
+            "what": what, "against": against, "worst": float(worst), "unit": unit})
+
+    return recorded
+
+
+@pytest.fixture
 def no_child():
     """Small runs are computed in this process, for tests to which it does not matter where."""
     from support.here import calls_here  # noqa: PLC0415  (its assertions are rewritten by then)

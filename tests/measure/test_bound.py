@@ -281,10 +281,13 @@ def known(value):
 
 
 @lengths(24, 600)
-def test_bound_is_that_of_differences_of_the_exact_image(count):
+def test_bound_is_that_of_differences_of_the_exact_image(count, claim):
     scenes = [value for value in drawn(count, 1) if known(value)]
     assert len(scenes) > 0.95 * count
-    row("sharp", len(scenes), max(map(sharp_difference, scenes)), SHARP_TOLERANCE)
+    worst = max(map(sharp_difference, scenes))
+    claim("the accuracy bound, sides 8-150 px, cut by the frame",
+          "central differences of the exact image at 1e-7 rad, 600 scenes", worst, "of itself")
+    assert worst <= SHARP_TOLERANCE
 
 
 def whole(value):

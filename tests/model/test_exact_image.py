@@ -81,9 +81,10 @@ coordinates below 1000 px, each off by about 1e-13 in double precision."""
 
 
 @lengths(12, 200)
-def test_every_pixel_equals_its_clipped_area(count):
+def test_every_pixel_equals_its_clipped_area(count, claim):
     worst = max(worst_difference(value) for value in drawn_poses(count, 1, (8, 600), 85))
-    print(f"{count} poses: worst difference from clipping {worst:.1e} px")
+    claim("every pixel of an undistorted image", "polygon clipping written in the test, 200 poses, "
+          "sides 8-600 px, tilts to 85°", worst, "of a pixel")
     assert worst < TOLERANCE
 
 

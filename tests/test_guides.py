@@ -18,8 +18,8 @@ import pytest
 
 from support.here import calls_here
 from sweep.cli import main
-from sweep.experiment.board_rules import read_board
 from sweep.experiment.parameters import Stage
+from sweep.experiment.photographs import read_board
 from sweep.experiment.pipeline import Pipeline
 from sweep.photographs.twins import read_scene
 

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 import sweep
 from sweep.analysis import simulation_gap
-from sweep.experiment.board_rules import read_board
 from sweep.experiment.experiment import scene_plugins
+from sweep.experiment.photographs import read_board
 from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
 from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
 from sweep.model.extent import marker_boxes

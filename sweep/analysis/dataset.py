@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from sweep.analysis.poses import AXIS, DETECTION_INPUTS, NOT_LOOKED_FOR, REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.experiment.document import SEARCH, read_document
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import FIXED, LABELS, SCHEMA, VARIABLES, with_descriptions
-from sweep.experiment.stopping import SEARCH, StoppingRule
-from sweep.experiment.toml_text import read_document
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import shown
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics

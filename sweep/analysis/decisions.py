@@ -61,9 +61,10 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.axes import TRIAL
+from sweep.experiment.document import SEARCH
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import cf_attributes
-from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.measure.flags import Flag, flag
 from sweep.messages import shown
 from sweep.model.marker import module_count
@@ -869,7 +870,7 @@ def walk(decision: Decisions, keeps: Masks) -> Walk:
 # --------------------------------------------------------------------------------------------------
 # The choice that meets requirements at all conditions: of a size, and among other settings.
 #
-# What a choice is stands in `sweep.experiment.stopping`, when one is answered in
+# What a choice is stands in `sweep.experiment.sampling`, when one is answered in
 # `sweep.analysis.decisions`. Every alternative, a combination of the values of the axes ``among``,
 # has its own answer.
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
-    from sweep.experiment.stopping import StoppingRule
+    from sweep.experiment.sampling import StoppingRule
     from sweep.integrity.reproduction import Reproduction
     from sweep.isolation.child_process import Child
 

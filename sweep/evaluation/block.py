@@ -43,7 +43,7 @@ from sweep.evaluation.variables import (
     compute,
     compute_estimation,
 )
-from sweep.experiment.beliefs import CALIBRATED
+from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.grid import (
     Block,
     block_indices,

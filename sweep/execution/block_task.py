@@ -21,12 +21,11 @@ from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.experiment.grid import Block, block_indices
-from sweep.experiment.parameters import Stage
+from sweep.experiment.parameters import Stage, lacking_plugins
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.plugins import lacking_plugins
 from sweep.experiment.rules import file_digest
+from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import Variable
-from sweep.experiment.stopping import StoppingRule
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.processor import processor

@@ -36,8 +36,8 @@ from sweep.execution.limits import (
     THREAD_COUNT_TIMEOUT_S,
     VERSIONS_S,
 )
+from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.plugins import lacking_plugins
 from sweep.isolation.child_process import SINGLE_THREADED, in_main_thread
 from sweep.isolation.machine import (
     be_killed_before_others,

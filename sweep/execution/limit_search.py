@@ -14,10 +14,9 @@ from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import Summary
+from sweep.experiment.document import MAX_BYTES, SEARCH, read_document
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import search_settings, texts_in
-from sweep.experiment.stopping import SEARCH
-from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.model.image_file import read_regular
 from sweep.store.lifecycle import (
     names_store,

@@ -24,7 +24,7 @@ from sweep.execution.limits import MAX_FAILED_BLOCKS
 from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.stopping import StoppingRule, digest_of
+from sweep.experiment.sampling import StoppingRule, digest_of
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import duration, notice
 from sweep.sampling.rules import Decider, Decision, Stopping, Waves, condition_axes

@@ -45,10 +45,10 @@ from sweep.execution.status import (
     summary_of,
     summary_of_complete,
 )
+from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import MAX_TRIALS
-from sweep.experiment.stopping import SEARCH
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.document import read_value
 from sweep.experiment.parameters import PARAMETERS, Parameter
 from sweep.experiment.pipeline import Pipeline, displaced_by
-from sweep.experiment.toml_text import python_boolean, read_value
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
@@ -107,7 +107,7 @@ def _row(axis: Axis, written: str) -> int:
 
 def _value(parameter: Parameter | None, written: str) -> Any:
     try:
-        value = read_value(python_boolean(written))
+        value = read_value(written)
     except ValueError:
         value = written
     if parameter is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.axes import Distribution
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
+from sweep.model.calibration import CalibrationError
 from sweep.model.camera import (
     PER_SIDE,
     VIEW_PARAMETERS,
@@ -566,3 +567,40 @@ def bits(
     """Return 64 random bits for each scene (arguments as :func:`uniform`)."""
     start = mixed(keys ^ _hash(f"{seed}\n{quantity}"))
     return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1))))
+
+
+# --------------------------------------------------------------------------------------------------
+# Draws of a calibration: the camera's numbers as an estimator believes them.
+
+CALIBRATED = "calibrated_"
+"""Begins the names of numbers that a calibration gives, among a scene's values."""
+
+NORMAL = Distribution("normal", 0.0, 1.0)
+
+
+def calibrated_columns(
+    error: CalibrationError, values: Mapping[str, Column], count: int,
+    draw: Callable[[str], Floats],
+) -> dict[str, Column]:
+    """Return the numbers that a calibration gives of each scene's camera.
+
+    Parameters
+    ----------
+    error
+        The calibration's error.
+    values
+        The values of ``count`` scenes.
+    draw
+        Name of a quantity -> uniform numbers (count,) in (0, 1).
+    """
+    view = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))
+    lenses = np.zeros((count, len(error.names) - len(view)))
+    for row, lens in enumerate(values["distortion"].listed(count) if lenses.size else ()):
+        lenses[row, : len(lens)] = lens
+    truth = [np.array(np.broadcast_to(number, (count,)), dtype=np.float64) for number in view]
+    normals = [NORMAL.at(draw(CALIBRATED + name)) for name in error.names]
+    numbers = error.believed([*truth, *lenses.T], normals)
+    return {
+        CALIBRATED + name: Column.of(number)
+        for name, number in zip(error.names, numbers, strict=True)
+    }

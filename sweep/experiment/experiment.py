@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, cast
 
 from sweep.experiment.axes import Axis, Distribution, combinations
-from sweep.experiment.parameters import Parameter, Stage
-from sweep.experiment.plugins import parameters_with
+from sweep.experiment.parameters import STATED, Parameter, Stage, parameters_with
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
+from sweep.model.calibration import CalibrationError
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin
@@ -18,39 +20,38 @@ from sweep.plugins.declared import DeclaredPlugin
 # --------------------------------------------------------------------------------------------------
 # What a document and the pipeline that is read from it have in common: values on a grid.
 
+@dataclass(frozen=True)
 class Grid:
     """The value, the axis or the distribution of every parameter.
 
     Attributes
     ----------
-    fixed
-        Value of every parameter that is neither an axis nor drawn.
-    given
-        Names of the parameters that the document has.
-    distributions
-        Distribution of every parameter that is drawn per trial.
-    axes
-        The grid's dimensions, in the document's order; by name while a document is read.
-    plugins
-        The plug-ins that the document names.
     seed, sampling
         The seed of all random draws, and how those of a cell's trials relate
         (:data:`sweep.experiment.draws.SAMPLINGS`).
+    fixed
+        Value of every parameter that is neither an axis nor drawn.
+    given
+        Names of the parameters that the document has, even with a value that cannot be.
+    distributions
+        Distribution of every parameter that is drawn per trial.
+    axes
+        The grid's dimensions, in the document's order.
+    plugins
+        The plug-ins that the document names.
     files
         Path as written -> SHA-256 of every file that the document refers to.
     folder
         Where relative paths start.
     """
 
-    __slots__ = ()
-
-    fixed: Mapping[str, Any]
-    given: frozenset[str] | set[str]
-    distributions: Mapping[str, Distribution]
-    axes: Any
-    plugins: tuple[DeclaredPlugin, ...]
     seed: int
     sampling: str
+    fixed: Mapping[str, Any]
+    given: AbstractSet[str]
+    distributions: dict[str, Distribution]
+    axes: Sequence[Axis]
+    plugins: tuple[DeclaredPlugin, ...]
     files: Mapping[str, str]
     folder: str
 
@@ -63,20 +64,17 @@ class Grid:
         """Return the plug-in of a kind by its name; None if it is not one of the document's."""
         return next((p for p in self.plugins if (p.kind, p.name) == (kind, name)), None)
 
-    def _dimensions(self) -> Collection[Axis]:
-        return self.axes.values() if isinstance(self.axes, dict) else self.axes
-
     def axis(self, name: str) -> Axis | None:
         """Return an axis by name."""
-        return next((axis for axis in self._dimensions() if axis.name == name), None)
+        return next((axis for axis in self.axes if axis.name == name), None)
 
     def axis_of(self, parameter: str) -> Axis | None:
         """Return the axis along which a parameter varies, alone or together with others."""
-        return next((axis for axis in self._dimensions() if parameter in axis.columns), None)
+        return next((axis for axis in self.axes if parameter in axis.columns), None)
 
     def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
         """Return the axes that bind to the given stages, in the document's order."""
-        return tuple(axis for axis in self._dimensions() if axis.stage in stages)
+        return tuple(axis for axis in self.axes if axis.stage in stages)
 
     def size(self, *stages: Stage) -> int:
         """Return the number of grid points over the axes of the given stages."""
@@ -93,13 +91,22 @@ class Grid:
         """Return whether a parameter takes a value for which ``condition`` holds."""
         return any(condition(value) for value in self.values_of(name) if value is not None)
 
+    @property
+    def calibration(self) -> CalibrationError | None:
+        """The error of the calibration that an estimator believes; None if none does."""
+        if "calibration" not in self.values_of("believed"):
+            return None
+        sd, covariance = (self.fixed[name] for name in STATED)
+        count = len(sd) or round(len(covariance) ** 0.5)
+        return CalibrationError.of(sd, covariance, count - 4)
+
     def arrangements(self, names: Collection[str] = ARRANGING) -> Iterator[tuple[Any, ...]]:
         """Yield the values of `ARRANGING` of each combination of the axes of some parameters.
 
         Those along other axes have their first value.
         """
         first = {name: self.values_of(name)[0] for name in ARRANGING}
-        axes = [axis for axis in self._dimensions() if not set(axis.columns).isdisjoint(names)]
+        axes = [axis for axis in self.axes if not set(axis.columns).isdisjoint(names)]
         for chosen in combinations(axes):
             board = first | chosen
             yield tuple(board[name] for name in ARRANGING)

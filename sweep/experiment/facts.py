@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from sweep.experiment.beliefs import belief_notes
 from sweep.experiment.experiment import relative_sizes, target_word
 from sweep.experiment.grid import Experiment
-from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, WORLD
+from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, STATED, WORLD
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,
     full_frame_reason,
@@ -375,8 +374,28 @@ class Facts:
         ]
         return [
             *lines, *_centre_notes(facts), *self._fold_notes(), *self._side_notes(),
-            *belief_notes(self.grid.given, self.grid.fixed, self.grid.values_of("believed")),
+            *self._belief_notes(),
         ]
+
+    def _belief_notes(self) -> list[str]:
+        """Return a line for each belief that may surprise."""
+        given, calibrated = self.grid.given, self.grid.calibration is not None
+        lines = [
+            f"believed_{own}_px alone: the {other} believed stays the true one; "
+            "believed_focal_scale is a focal length believed wrongly"
+            for own, other in (("fx", "fy"), ("fy", "fx"))
+            if f"believed_{own}_px" in given and f"believed_{other}_px" not in given
+        ]
+        lines += [
+            f"{name} has no effect: no estimator has believed = calibration" for name in STATED
+            if name in given and not calibrated and self.grid.fixed.get("camera_file") is None
+        ]
+        if calibrated and self.grid.fixed["calibration_sd"]:
+            lines.append(
+                "the calibration's numbers are drawn independently of each other; those of most "
+                "calibrations, fx and fy above all, vary together, which calibration_covariance "
+                "states")
+        return lines
 
     def _side_notes(self) -> list[str]:
         """Return a line if no marker of the grid is of a size that can be detected."""
@@ -481,7 +500,7 @@ class Facts:
         """Return lines for angles and distances that differ off the axis, or do nothing."""
         facts = self.poses
         given, shown = self.grid.given, ~facts.behind
-        in_camera = not given.intersection(WORLD)
+        in_camera = given.isdisjoint(WORLD)
         tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
         apart = np.abs(view - tilt).max(initial=0)
         farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.experiment.axes import TRIAL, Axis, combinations
-from sweep.experiment.beliefs import CALIBRATED, believed_calibration, calibrated_columns
 from sweep.experiment.draws import (
+    CALIBRATED,
     bits,
+    calibrated_columns,
     even_uniform,
     geometry_keys,
     hashed,
@@ -252,7 +253,7 @@ class Experiment:
     @cached_property
     def calibration(self) -> CalibrationError | None:
         """The error of the calibration that an estimator believes; None if none does."""
-        return believed_calibration(self.grid.fixed, self.grid.values_of("believed"))
+        return self.grid.calibration
 
     @cached_property
     def shows_boards(self) -> bool:

@@ -1,4 +1,4 @@
-"""The record of photographs: their files, and the pose of each marker in each of them.
+"""Photographs: files of their boards, and the record of their files and of each marker's pose.
 
 A pipeline names it by the parameter ``photographs``. Its scenes are then photographs, one a trial,
 and the poses are those of the record; with ``simulated`` the images are not the photographs.
@@ -7,30 +7,94 @@ and the poses are those of the record; with ``simulated`` the images are not the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.declaration import Declaration, Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.board_rules import board_of
+from sweep.experiment.document import file_text, read_document
+from sweep.experiment.experiment import Grid
 from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
-from sweep.messages import plain
+from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
+from sweep.model.board_kinds import KINDS
 from sweep.model.image_file import Part, reference
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
 from sweep.plugins.array_file import array_file, read_arrays
 from sweep.typing import Floats, Integers, Masks
 
-if TYPE_CHECKING:
-    from sweep.experiment.experiment import Grid
+# --------------------------------------------------------------------------------------------------
+# Files that describe a board, `BOARD.toml`: all faults of one are found at once.
+
+def read_board(path: str | Path) -> Board:
+    """Return the board that a TOML file describes.
+
+    Raises
+    ------
+    PipelineError
+        One line for each fault: the file, the key, its value, and what was expected.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "board.toml"
+    ...     _ = path.write_text('''kind = "grid"
+    ... dictionary = "DICT_4X4_50"
+    ... rows = 2
+    ... columns = 3
+    ... marker_m = 0.04
+    ... gap_m = 0.01''')
+    ...     read_board(path).marker_ids
+    (0, 1, 2, 3, 4, 5)
+    """
+    return board_of(board_document(path), plain(path))
+
+
+def board_document(path: str | Path) -> dict[str, Any]:
+    """Return the tables and values of a board's file, unchecked; as :func:`read_board`."""
+    try:
+        return read_document(file_text(path))
+    except ValueError as error:
+        raise refusal([f"{plain(path)}: {error}"]) from None
+
+
+_KIND = {"kind": Declared("kind", (str,), MISSING, Declaration(
+    "how its markers are arranged", choices=tuple(KINDS)))}
+
+
+def board_of(document: Mapping[str, Any], source: str) -> Board:
+    """Return the board of a document; as :func:`read_board`, lines beginning with ``source``."""
+    tables = [{key: value for key, value in document.items() if (key == "kind") is is_kind}
+              for is_kind in (True, False)]
+    kind, faults = check_table(_KIND, tables[0], "a board")
+    if not faults:
+        declaring = KINDS[kind["kind"]]
+        values, faults = check_table(
+            declared_fields(declaring), tables[1], f"a board of kind {kind['kind']}")
+    if not faults:
+        made = declaring(**values)
+        faults = [f"{key} = {shown(value)}: expected {expected}"
+                  for key, value, expected in made.faults()]
+    if not faults:
+        board = made.board()
+        if board.is_flat:
+            return board
+        faults = ["markers: expected one plane, for photographs: no z_m, no tilt_deg"]
+    raise refusal([f"{source}: {fault}" for fault in faults])
+
+
+# --------------------------------------------------------------------------------------------------
+# The record: a file of arrays, which is read once in each process.
 
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""

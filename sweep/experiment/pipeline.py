@@ -11,54 +11,59 @@ from typing import Any
 
 import tomlkit
 
-from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL, Axis, Distribution
-from sweep.experiment.cameras import (
-    FILE_DEVIATIONS,
-    FILE_VALUES,
-    OTHER_WAYS,
-    read_camera_file,
-    resolve_sensor,
+from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL
+from sweep.experiment.document import (
+    HEADER,
+    REQUIRE,
+    SEARCH,
+    Reading,
+    Recorded,
+    document_text,
+    file_text,
+    read_document,
+    read_keys,
+    read_value,
+    removed,
+    section_of,
+    toml_item,
 )
 from sweep.experiment.experiment import Grid
 from sweep.experiment.facts import Facts
 from sweep.experiment.grid import Experiment
-from sweep.experiment.parameters import PARAMETERS, RIVALS, Parameter, is_zip
-from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
-from sweep.experiment.reader import (
-    HEADER,
-    REQUIRE,
-    Reading,
-    read_keys,
-    removed,
-    section_of,
+from sweep.experiment.parameters import (
+    EFFECTS_KEY,
+    NAMED_BY,
+    PARAMETERS,
+    RIVALS,
+    STATED,
+    Parameter,
+    is_zip,
+    parameters_with,
+    read_plugins,
 )
-from sweep.experiment.rules import check_rules
+from sweep.experiment.rules import (
+    FILE_VALUES,
+    OTHER_WAYS,
+    check_rules,
+    read_camera_file,
+    resolve_sensor,
+)
 from sweep.experiment.sampling import (
     MAX_TRIALS,
     REQUIRE_KEYS,
+    StoppingRule,
     read_required,
-    read_stopping,
-)
-from sweep.experiment.stopping import SEARCH, StoppingRule
-from sweep.experiment.toml_text import (
-    MAX_BYTES,
-    document_text,
-    python_boolean,
-    quoted_if_bare,
-    read_document,
-    read_value,
-    toml_item,
+    read_search,
 )
 from sweep.messages import MAX_FAULTS, nearest, plain, refusal
 from sweep.model.board_kinds import used_by
-from sweep.model.image_file import read_regular
 from sweep.plugins.declared import DeclaredPlugin
 
 # --------------------------------------------------------------------------------------------------
 # Values that replace those of a pipeline document: ``--set`` changes it, ``--at`` fixes it.
 
 ALTERNATIVES: dict[str, Collection[str]] = {
-    **RIVALS, "camera_file": (*FILE_VALUES, *FILE_DEVIATIONS, *OTHER_WAYS),
+    **RIVALS, "camera_file": (*FILE_VALUES, *STATED, *OTHER_WAYS),
 }
 """Parameter -> those that say the same in another way: choosing it drops them."""
 
@@ -91,7 +96,7 @@ def parse_settings(
             faults.append(f"{start}expected key=value, such as tilt_deg=45")
             continue
         try:
-            value = read_value(quoted_if_bare(python_boolean(written)))
+            value = read_value(written)
         except ValueError:
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
@@ -209,20 +214,15 @@ class Pipeline(Grid):
     ----------
     name
         What stores are named after: the file's stem.
-    title, seed, sampling
-        As the document says; the seed of all random draws, and how those of a cell's trials relate
-        (:data:`sweep.experiment.draws.SAMPLINGS`).
-    fixed, given, distributions, axes, files, folder, plugins
-        As :class:`sweep.experiment.experiment.Grid` has them.
+    title
+        As the document says.
     text
         The effective TOML text: settings and the values of a camera file included.
-    requirements, require_per
-        What is required of the results, as texts, and the axes whose values are conditions: the
-        section [require]. No part of an experiment's identity.
+    requirements, require_per, budget_ms
+        What is required of the results, as texts, the axes whose values are conditions, and the
+        most milliseconds of a frame: the section [require]. No part of an experiment's identity.
     stopping
         When sampling stops, as [search] says; None if every trial is computed.
-    budget_ms
-        The most milliseconds of a frame, if [require] has a budget.
     source
         What lines on faults begin with: the file, if there is one. It is not compared.
 
@@ -238,20 +238,11 @@ class Pipeline(Grid):
 
     name: str
     title: str
-    seed: int
-    sampling: str
-    fixed: Mapping[str, Any]
-    given: frozenset[str]
-    distributions: Mapping[str, Distribution]
-    axes: tuple[Axis, ...]
     text: str
-    files: Mapping[str, str]
-    folder: str
-    plugins: tuple[DeclaredPlugin, ...] = ()
     requirements: tuple[str, ...] = ()
     require_per: tuple[str, ...] = ()
-    stopping: StoppingRule | None = None
     budget_ms: float | None = None
+    stopping: StoppingRule | None = None
     source: str = field(default="pipeline", compare=False)
 
     @cached_property
@@ -302,17 +293,11 @@ class Pipeline(Grid):
         path = Path(path)
         source = plain(path, MAX_SHOWN_PATH_LENGTH)
         try:
-            encoded = read_regular(path, MAX_BYTES)
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            if similar := _similar(path):
-                reason = f"{str(reason).partition(';')[0]}{similar}"
-            raise refusal([f"{source}: cannot be read: {reason}"]) from None
-        try:
-            text = encoded.decode()
-        except UnicodeDecodeError as error:
-            raise refusal([f"{source}: expected UTF-8: byte {error.start} is not"]) from None
-        text = text.removeprefix("\ufeff")
+            text = file_text(path)
+        except ValueError as error:
+            similar = _similar(path)
+            reason = f"{str(error).partition(';')[0]}{similar}" if similar else error
+            raise refusal([f"{source}: {reason}"]) from None
         return Pipeline.from_text(
             text, settings, name=path.stem, source=source, folder=path.parent
         )
@@ -356,14 +341,14 @@ class Pipeline(Grid):
         PipelineError
             One line for each fault of the text or of the settings.
         """
-        reading = Reading(
-            _document(text, source), source, str(folder), files, camera_files, plugins)
+        document = _document(text, source)
+        recorded = Recorded(files, camera_files, plugins)
         chosen = {}
         if settings:
-            parameters = _parameters(reading, settings)
+            parameters = _parameters(document, settings, str(folder), plugins)
             chosen = parse_settings(settings, parameters)
-            apply_settings(reading.document, chosen, parameters)
-        return _checked(reading, text, name, chosen)
+            apply_settings(document, chosen, parameters)
+        return _checked(read_keys(document, source, str(folder), recorded), text, name, chosen)
 
     @staticmethod
     def from_dict(
@@ -434,7 +419,8 @@ class Pipeline(Grid):
             name: list(value) if isinstance(value, tuple) else value
             for name, value in chosen.items()
         }, self.parameters)
-        reading = Reading(document, source, self.folder, None, self.files, self.plugins)
+        recorded = Recorded(cameras=self.files, plugins=self.plugins)
+        reading = read_keys(document, source, self.folder, recorded)
         return _checked(reading, document_text(document), self.name)
 
 
@@ -458,18 +444,19 @@ def _document(text: str, source: str) -> dict[str, Any]:
         raise refusal([f"{source}: {error}"]) from None
 
 
-def _parameters(reading: Reading, settings: Sequence[str]) -> Mapping[str, Parameter]:
+def _parameters(
+    document: Mapping[str, Any], settings: Sequence[str], folder: str,
+    known: Sequence[DeclaredPlugin] | None,
+) -> Mapping[str, Parameter]:
     """Return the parameters of a document once the settings that name plug-ins are applied."""
     naming = {EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values())}
-    chosen = parse_settings(
+    changed = copy.deepcopy(document)
+    apply_settings(changed, parse_settings(
         [each for each in settings
          if each.partition("=")[0].strip().rpartition(".")[2] in naming]
-    )
-    changed = copy.deepcopy(reading.document)
-    apply_settings(changed, chosen)
+    ))
     # Faults are told when it is checked.
-    plugins, _ = read_plugins(changed, reading.folder, reading.known_plugins)
-    return parameters_with(tuple(plugins))
+    return parameters_with(tuple(read_plugins(changed, folder, known)[0]))
 
 
 def _checked(
@@ -479,12 +466,11 @@ def _checked(
 
     ``text`` is its text without the ``chosen`` values, which the document has.
     """
-    read_keys(reading)
-    read_stopping(reading)
+    required = read_required(reading)
+    stopping = read_search(reading, required)
     read_camera_file(reading)
     resolve_sensor(reading)
     check_rules(reading)
-    read_required(reading)
     if reading.faults:
         raise refusal(reading.faults)
     if chosen or reading.stated:
@@ -494,13 +480,10 @@ def _checked(
         for key, value in reading.stated.items():
             written.setdefault("camera", tomlkit.table())[key] = toml_item(value)
         text = tomlkit.dumps(written)
-    return Pipeline(
-        name=name, title=reading.title, seed=reading.seed, sampling=reading.sampling,
-        fixed=reading.fixed,
-        given=frozenset(reading.given), distributions=reading.distributions,
-        axes=tuple(reading.axes.values()), text=text, files=reading.files,
-        folder=str(Path(reading.folder).resolve()), plugins=reading.plugins,
-        requirements=reading.requirements, require_per=reading.require_per,
-        stopping=reading.stopping,
-        budget_ms=reading.budget_ms, source=reading.source,
-    )
+    grid = {each.name: getattr(reading, each.name) for each in fields(Grid)}
+    return Pipeline(**grid | {
+        "given": frozenset(reading.given), "axes": tuple(reading.axes),
+        "folder": str(Path(reading.folder).resolve()),
+    }, name=name, title=reading.title, text=text, stopping=stopping, source=reading.source,
+        requirements=required.requirements, require_per=required.per or (),
+        budget_ms=required.budget_ms)

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sweep.experiment.axes import Axis
-from sweep.experiment.beliefs import STATED
 from sweep.experiment.experiment import Grid
 from sweep.experiment.grid import OPENCV_FIELDS
+from sweep.experiment.parameters import STATED
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.experiment.axes import MAX_DEVIATIONS, Axis
-from sweep.experiment.beliefs import CALIBRATED, believed_calibration
+from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.experiment import largest_board, shows_boards
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
 from sweep.measure.flags import (
@@ -520,7 +520,7 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
                    f"{axis}", "px", jitter, f"shift_{axis}_px")
             for axis in ("u", "v")
         ]
-    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    error = pipeline.calibration
     if error is not None:
         variables += [
             _drawn(f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, "

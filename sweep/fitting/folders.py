@@ -19,11 +19,10 @@ from sweep.analysis import simulation_gap
 from sweep.analysis.simulation_gaps import QUANTILES, RATES
 from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
-from sweep.experiment.board_rules import read_board
+from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import SUFFIX, PhotographRecord, read_record
+from sweep.experiment.photographs import SUFFIX, PhotographRecord, read_board, read_record
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.toml_text import document_text, read_document
 from sweep.fitting.fit import MARKERS, SceneFit, Term, fit_scene, scene_views, shortened
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_scenes
 from sweep.measure.surroundings import BoardMarker, clear_modules

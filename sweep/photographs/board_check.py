@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError, SweepError
-from sweep.experiment.board_rules import board_of
+from sweep.experiment.photographs import board_of
 from sweep.measure import intrinsics
 from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import CalibrationStatus

@@ -13,7 +13,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.experiment.board_rules import board_document, board_of
+from sweep.experiment.photographs import board_document, board_of
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import TruthSource

@@ -11,10 +11,10 @@ import numpy as np
 
 from sweep.errors import ArgumentError, PluginError
 from sweep.experiment.axes import TRIAL, parse_distribution
+from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import PhotographRecord, read_record, shows_photographs
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
 

@@ -20,8 +20,8 @@ from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import CHOICES, StoppingRule
 from sweep.experiment.schema import VARIABLES, Variable
-from sweep.experiment.stopping import CHOICES, StoppingRule
 from sweep.measure.flags import DetectionStatus
 from sweep.store.blocks import RunStore, region
 from sweep.typing import Masks

@@ -42,8 +42,8 @@ from sweep.errors import DatasetError
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import LABELS, VARIABLES, Variable
-from sweep.experiment.stopping import StoppingRule
 from sweep.messages import refusal
 from sweep.sampling.rules import GroupResults, condition_axes
 from sweep.typing import Masks

@@ -24,11 +24,11 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
+from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
 from sweep.experiment.sampling import texts_in
 from sweep.experiment.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
-from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.messages import plain, refusal
 from sweep.model.image_file import read_regular
 from sweep.plugins.declared import RECORDED, recorded_plugins

@@ -15,7 +15,7 @@ from typing import Any
 
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.stopping import not_continued
+from sweep.experiment.sampling import not_continued
 from sweep.installation import check_installation
 from sweep.version import __version__
 

@@ -16,9 +16,10 @@ from sweep.analysis.decisions import Answer, answers
 from sweep.analysis.requirements import Decision
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
+from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.stopping import SEARCH, StoppingRule
+from sweep.experiment.sampling import StoppingRule
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
 from sweep.sampling.searches import store_cells

@@ -3,7 +3,7 @@
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.experiment.board_rules import read_board
+from sweep.experiment.photographs import read_board
 
 CHARUCO = """kind = "charuco"
 dictionary = "4x4_1000"
@@ -58,7 +58,7 @@ def test_each_kind_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "line"), [
-    ("", "kind: expected one of charuco, grid, aprilgrid, markers"),
+    ("", "kind: missing; expected one of charuco, grid, aprilgrid, markers"),
     ('kind = "charucco"', ('kind = "charucco": expected one of charuco, grid, aprilgrid, markers; '
      "did you mean charuco?")),
     ("kind = 3", "kind = 3: expected one of charuco, grid, aprilgrid, markers"),
@@ -97,5 +97,5 @@ def test_a_file_that_cannot_be_read_is_one_line(tmp_path):
             read_board(path)
         assert len(raised.value.faults) == 1
     (tmp_path / "x.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(PipelineError, match="not UTF-8"):
+    with pytest.raises(PipelineError, match="expected UTF-8"):
         read_board(tmp_path / "x.toml")

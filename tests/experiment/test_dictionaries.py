@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from support.lengths import lengths
 from sweep.errors import PipelineError
 from sweep.experiment.axes import TRIAL
+from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import IN_CAMERA, PARAMETERS, superseded
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.toml_text import document_text, read_document
 
 DRAWABLE = [
     name for name in IN_CAMERA

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError, StoreError
-from sweep.experiment.board_rules import read_board
 from sweep.experiment.cell_selection import parse_selection
 from sweep.experiment.parameters import PARAMETERS
+from sweep.experiment.photographs import read_board
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS

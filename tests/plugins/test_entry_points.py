@@ -10,8 +10,8 @@ import pytest
 from sweep.cli import main
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
+from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.plugins import lacking_plugins
 from sweep.plugins import loading
 from sweep.store.provenance import fingerprint
 from tests.plugins.test_detector_plugins import MINE

@@ -15,7 +15,7 @@ from sweep.analysis.intervals import looks_factor
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.stopping import wave_ends
+from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import DetectionStatus
 from sweep.report.limit_figure import as_json, limit_table
 from sweep.sampling.rules import GroupResults

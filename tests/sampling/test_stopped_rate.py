@@ -8,7 +8,7 @@ from scipy import stats
 
 from support.stopped_rate import StoppedRate
 from sweep.analysis.estimator import TAIL_SHARE
-from sweep.experiment.stopping import wave_ends
+from sweep.experiment.sampling import wave_ends
 
 ALPHA = 0.05 * TAIL_SHARE
 RATES = (0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 1.0)

@@ -10,7 +10,7 @@ from support.stores import by_hand, same
 from sweep.errors import PipelineError
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.stopping import wave_ends
+from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import DetectionStatus
 from sweep.sampling.rules import Waves, block_unit, make_rule
 from sweep.store.lifecycle import open_dataset

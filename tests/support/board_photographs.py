@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from support.board_scenes import BoardPose, board_scene, levels_of
-from sweep.experiment.board_rules import board_of
+from sweep.experiment.photographs import board_of
 
 SIZE = (360, 270)
 VIEW = (420.0, 420.0, 180.0, 132.0)

@@ -4,7 +4,7 @@ import json
 
 import sweep
 from support.photographs import photographs, save
-from sweep.experiment.board_rules import board_of
+from sweep.experiment.photographs import board_of
 
 BOARD = {
     "kind": "charuco", "dictionary": "DICT_4X4_50", "squares_x": 5, "squares_y": 4,

@@ -1,0 +1,535 @@
+"""The document of a pipeline: TOML read within bounds and written, and its keys, each checked."""
+
+from __future__ import annotations
+
+import datetime as dt
+import itertools
+import os
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+import tomlkit.items
+
+from sweep.declaration import Declaration, Declared, TablesError, check_table
+from sweep.experiment.axes import (
+    MAX_LISTED,
+    TRIAL,
+    Axis,
+    parse_axis,
+    parse_distribution,
+    parse_trial,
+    zipped_axis,
+)
+from sweep.experiment.draws import SAMPLINGS
+from sweep.experiment.experiment import Grid
+from sweep.experiment.parameters import (
+    EFFECTS_KEY,
+    NAMED_BY,
+    PARAMETERS,
+    REMOVED,
+    SECTIONS,
+    Parameter,
+    is_zip,
+    places,
+    read_plugins,
+    section_of_settings,
+)
+from sweep.messages import MAX_FAULTS, nearest, plain, shown
+from sweep.model.image_file import read_regular
+from sweep.plugins.declared import DeclaredPlugin
+
+# --------------------------------------------------------------------------------------------------
+# TOML: any text gives a document or a reason, and soon.
+
+MAX_BYTES = 250_000
+"""The largest text that is read."""
+
+MAX_PARTS = 8
+"""The most parts of a dotted key: reading it takes time that grows with their square."""
+
+_PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(
+    rf"(?<![A-Za-z0-9_\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}"
+)
+_BARE = re.compile(
+    r"(?=.*[A-Za-z])[A-Za-z0-9][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*(:[A-Za-z_][A-Za-z0-9_]*)?"
+)
+
+
+def file_text(path: str | Path) -> str:
+    """Return the text of a TOML file; ValueError says why it cannot be read."""
+    try:
+        encoded = read_regular(Path(path), MAX_BYTES)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"cannot be read: {reason}") from None
+    try:
+        return encoded.decode().removeprefix("\ufeff")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"expected UTF-8: byte {error.start} is not") from None
+
+
+def read_document(text: str) -> dict[str, Any]:
+    """Return a TOML document.
+
+    Raises
+    ------
+    ValueError
+        What was expected, or why it is no TOML.
+    """
+    try:
+        size = len(text.encode())
+    except UnicodeEncodeError as error:
+        raise ValueError(f"expected UTF-8: character {error.start} is not") from None
+    if size > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES:,} bytes")
+    if _LONG_KEY.search(text):
+        raise ValueError(f"not TOML: expected keys of at most {MAX_PARTS} parts")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"not TOML: {plain(error, 300)}") from None
+    except RecursionError:
+        raise ValueError("not TOML: nested too deeply") from None
+    except ValueError:
+        # Python reads no more than 4300 digits.
+        raise ValueError("not TOML: a number of too many digits") from None
+
+
+def read_value(written: str) -> Any:
+    """Return a value of a command line; ValueError if the text is not exactly one.
+
+    It is written as in TOML. Python's ``True`` and ``False`` count too, and a bare word, such as
+    a solver's name, counts as a string.
+
+    >>> read_value("[0, 4.5]"), read_value("True"), read_value("36h11"), read_value("1e3")
+    ([0, 4.5], True, '36h11', 1000.0)
+    """
+    if written in ("True", "False"):
+        return written == "True"
+    try:
+        document = read_document(f"value = {written}")
+    except ValueError:
+        if _BARE.fullmatch(written):
+            return written
+        raise
+    value = document.pop("value")
+    if document:
+        raise ValueError("expected one value")
+    return value
+
+
+def document_text(mapping: Mapping[str, Any]) -> str:
+    r"""Return the TOML text of a document: keys, then a table for each mapping.
+
+    Values are what TOML has; tuples and NumPy's arrays count as lists, NumPy's numbers as
+    numbers, paths as strings, and a ``range`` as the axis ``{ range = [start, stop, step] }``.
+
+    Raises
+    ------
+    ValueError
+        One line for each key that TOML cannot hold, or whose value it cannot.
+
+    Examples
+    --------
+    >>> document_text({"seed": 1, "axes": {"trial": 3, "marker_id": range(5)}})
+    'seed = 1\n\n[axes]\ntrial = 3\nmarker_id = {range = [0, 5, 1]}\n'
+    """
+    faults: list[str] = []
+    document = tomlkit.document()
+
+    def add(table: Any, home: str, items: Mapping[str, Any]) -> None:
+        for key, value in items.items():
+            path = plain(f"{home}{key}")
+            try:
+                if not isinstance(key, str):
+                    faults.append(f"{path}: expected a string as key")
+                elif isinstance(value, Mapping) and not home:
+                    add(tables.setdefault(key, tomlkit.table()), f"{key}.", value)
+                else:
+                    table[key] = toml_item(value)
+            except TypeError:
+                faults.append(f"{path} = {plain(repr(value))}: expected a string, a number, true, "
+                              "false, a list or a table")
+            except ValueError:
+                faults.append(f"{path}: expected a number of fewer digits")
+            except RecursionError:
+                faults.append(f"{path}: nested too deeply")
+
+    tables: dict[str, tomlkit.items.Table] = {}
+    add(document, "", mapping)
+    document.update(tables)  # tables stand below all keys
+    if faults:
+        raise ValueError("\n".join(faults))
+    return tomlkit.dumps(document)
+
+
+def toml_item(value: Any) -> tomlkit.items.Item:
+    """Return a value as tomlkit's, tables in one line; TypeError if TOML has no such value."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    if isinstance(value, range):
+        value = {"range": [value.start, value.stop, value.step]}
+    if isinstance(value, Mapping):
+        inline = tomlkit.inline_table()
+        inline.update({str(key): toml_item(item) for key, item in value.items()})
+        return inline
+    if isinstance(value, (list, tuple)):
+        # Made at once: tomlkit's arrays take time that grows with the square of what is appended.
+        parts = [part for item in value for part in (tomlkit.ws(", "), toml_item(item))]
+        return tomlkit.items.Array(parts[1:], tomlkit.items.Trivia())
+    if isinstance(value, (str, bool, int, float, dt.date, dt.time)):
+        return tomlkit.item(value)
+    raise TypeError(type(value).__name__)
+
+
+# --------------------------------------------------------------------------------------------------
+# The keys of a document. All faults are gathered: a value that cannot be is left out of the grid.
+
+MAX_HOMES = 3
+"""Keys of an unknown section whose own sections are named."""
+
+REQUIRE = "require"
+"""The section of what the results must fulfil (`sweep.experiment.sampling`)."""
+
+SEARCH = "search"
+"""The section of what is searched (`sweep.experiment.sampling`)."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a store has recorded, in place of files and plug-ins, which may have moved; or None.
+
+    Attributes
+    ----------
+    files
+        Path as written -> SHA-256 of every file.
+    cameras
+        The same of camera files alone, whose values the document has.
+    plugins
+        The plug-ins.
+    """
+
+    files: Mapping[str, str] | None = None
+    cameras: Mapping[str, str] | None = None
+    plugins: Sequence[DeclaredPlugin] | None = None
+
+
+@dataclass(frozen=True)
+class Reading(Grid):
+    """What a document says, as far as it could be read, and its faults.
+
+    Attributes
+    ----------
+    document
+        The document, as TOML has it: tables are dictionaries.
+    source
+        The name that messages begin with.
+    title
+        As the document says.
+    recorded
+        What a store has recorded of files and plug-ins.
+    unread
+        Parameters that name plug-ins that cannot be used, and the sections of their settings: any
+        key may be theirs.
+    stated
+        Values that a camera file has, by parameter: they are written into the document's text.
+    faults
+        One line each: source, key, value, expectation.
+    """
+
+    fixed: dict[str, Any]
+    given: set[str]
+    axes: list[Axis]
+    files: dict[str, str]
+    document: Mapping[str, Any]
+    source: str
+    title: str
+    recorded: Recorded
+    unread: set[str] = field(default_factory=set)
+    stated: dict[str, Any] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+    def note(self, key: str, problem: str) -> None:
+        """Note a fault without a value."""
+        self.faults.append(f"{self.source}: {key}: {problem}")
+
+    def fault(self, key: str, value: Any, expected: str) -> None:
+        """Note a fault of a key's value."""
+        self.note(f"{plain(key)} = {shown(value)}", f"expected {expected}")
+
+    def refuse(self, name: str, expected: str) -> None:
+        """Note a fault of a parameter as the document has it."""
+        parameter = self.parameters[name]
+        path = next(iter(places(self.document, parameter)), f"{parameter.section}.{name}")
+        self.fault(path, self.written(name), expected)
+
+    def refuse_value(self, name: str, value: Any, expected: str) -> None:
+        """Note a fault of one of a parameter's values."""
+        self.fault(f"{self.parameters[name].section}.{name}", value, expected)
+
+    def refuse_values(self, name: str, expected: str, wrong: Callable[[Any], bool]) -> None:
+        """Note a fault of each value of a parameter on the grid that is wrong."""
+        for value in dict.fromkeys(filter(wrong, self.values_of(name))):
+            self.refuse_value(name, value, expected)
+
+    def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
+        """Note an unknown key, with the nearest known one if the line will be printed."""
+        hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
+        self.note(plain(key), f"{problem}{removed(key.rpartition('.')[2]) or hint}")
+
+    def unknown_key(self, section: str, key: str, known: Sequence[str], expected: str = "") -> None:
+        """Note a key that a section does not have, with the section where it or a similar one is.
+
+        ``known`` are the section's keys; ``expected`` says so in words.
+        """
+        homes = dict.fromkeys(known, "") | {
+            name: home for name in (*self.parameters, TRIAL, *HEADER)
+            if name not in known and (home := self._home_of(name))
+        }
+        hint = removed(key)
+        if not hint and len(self.faults) < MAX_FAULTS:
+            hint = f"; it belongs {homes[key]}" if homes.get(key) else (
+                nearest(key, list(homes), 0.8) or nearest(key, known))
+            similar = hint.removeprefix("; did you mean ").removesuffix("?")
+            if homes.get(similar):
+                hint = f"{hint[:-1]} {homes[similar]}?"
+        self.note(plain(f"{section}.{key}"), f"unknown key{expected}{hint}")
+
+    def _home_of(self, name: str) -> str:
+        """Return where a key belongs, in words; empty for an unknown one."""
+        section = section_of(name, self.parameters)
+        return f"under [{section}]" if section else (
+            "at the top, above the sections" if name in HEADER else "")
+
+    def table(self, name: str) -> Mapping[str, Any]:
+        """Return a table of the document; an empty one where it is missing, or no table."""
+        table = self.document.get(name)
+        return table if isinstance(table, dict) else {}
+
+    def is_active(self, switch: str) -> bool:
+        """Return whether a switch has, or was meant to have, another than its neutral value."""
+        values, off = self.values_of(switch), self.parameters[switch].default
+        return any(value != off for value in values) if values else switch in self.given
+
+    def together(self, *names: str) -> Iterator[tuple[Sequence[Any], ...]]:
+        """Yield values of some parameters, all of which meet on the grid.
+
+        A set of values for each parameter: all its values, or of parameters that go together along
+        an axis one row after the other.
+        """
+        columns = [
+            {name: axis.columns[name] for name in names if name in axis.columns}
+            for axis in self.axes
+        ]
+        joint = [each for each in columns if len(each) > 1]
+        rows = (dict.fromkeys(zip(*each.values(), strict=True)) for each in joint)
+        for chosen in itertools.product(*rows):
+            row = dict(zip(itertools.chain(*joint), itertools.chain(*chosen), strict=True))
+            yield tuple((row[name],) if name in row else self.values_of(name) for name in names)
+
+    def written(self, name: str) -> Any:
+        """Return the value that the document gives a parameter, for messages."""
+        given = places(self.document, self.parameters[name]).values()
+        return next(iter(given), self.fixed.get(name))
+
+
+def removed(key: str) -> str:
+    """Return what to do instead of a parameter of an earlier version; empty for others."""
+    return f"; {REMOVED[key]}" if key in REMOVED else ""
+
+
+def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
+    """Return the section that a parameter belongs under; empty for an unknown name."""
+    if name == TRIAL:
+        return "axes"
+    return parameters[name].section if name in parameters else ""
+
+
+MAX_TITLE_LENGTH = 200
+
+
+def _title(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MAX_TITLE_LENGTH or not value.isprintable():
+        raise ValueError(f"a string: one line of at most {MAX_TITLE_LENGTH} characters")
+    return value
+
+
+def _effects(value: Any) -> list[str]:
+    if (
+        not isinstance(value, list) or len({*map(str, value)}) < len(value)
+        or not all(isinstance(name, str) and name for name in value)
+    ):
+        raise ValueError('a list of plug-ins, each once, such as ["haze"]')
+    return value
+
+
+HEADER = {
+    declared.name: declared for declared in (
+        Declared("title", (str,), "", Declaration("title", reads=_title)),
+        Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
+        Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
+        Declared(EFFECTS_KEY, (list,), (), Declaration("plug-ins", reads=_effects)),
+    )
+}
+"""Keys that stand above the sections."""
+
+
+def read_keys(
+    document: Mapping[str, Any], source: str, folder: str, recorded: Recorded
+) -> Reading:
+    """Return what a document says: its keys, each checked on its own.
+
+    Files that it names, and the sections of requirements and of a search, are read elsewhere.
+    """
+    header, lines = check_table(
+        HEADER, {key: value for key, value in document.items() if key in HEADER}, "")
+    plugins, faults = read_plugins(document, folder, recorded.plugins)
+    reading = Reading(
+        seed=header["seed"], sampling=header["sampling"], title=header["title"], fixed={},
+        given=set(), distributions={}, axes=[], plugins=tuple(plugins), folder=folder,
+        files={each.file: each.digest for each in plugins if each.file},
+        document=document, source=source, recorded=recorded,
+        faults=[f"{source}: {line}" for line in lines],
+    )
+    for kind, key, name, expected in faults:
+        reading.fault(key, name, expected)
+        reading.unread.add(section_of_settings(kind))
+        if kind in NAMED_BY:
+            reading.unread.add(NAMED_BY[kind].name)
+    for key, value in document.items():
+        if key in HEADER or key in (REQUIRE, SEARCH):
+            continue
+        if key != "axes" and key not in SECTIONS:
+            _refuse_key(reading, key, value)
+        elif not isinstance(value, dict):
+            reading.fault(key, value, f"a table: [{key}]")
+    for section in SECTIONS:
+        for key, value in reading.table(section).items():
+            _read_key(reading, section, key, value)
+    _read_axes(reading)
+    for parameter in reading.parameters.values():
+        if parameter.name not in reading.given:
+            reading.fixed[parameter.name] = parameter.default
+    return reading
+
+
+def _refuse_key(reading: Reading, key: str, value: Any) -> None:
+    """Note an unknown key, or section, that stands above all sections."""
+    if home := section_of(key, reading.parameters):
+        reading.fault(key, value, f"it under [{home}]")
+        return
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
+    kind = "a section" if isinstance(value, dict) else "a key"
+    homes = [f"{name} belongs under [{section_of(name, reading.parameters)}]"
+             for name in (value if isinstance(value, dict) else ())
+             if section_of(name, reading.parameters)][:MAX_HOMES]
+    reading.unknown(key, "; ".join([
+        f"unknown; expected {kind} of {', '.join(known)}",
+        *([] if nearest(key, known) else homes)]), key, known)
+
+
+def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
+    """Read a key of a section: a value, or a distribution."""
+    path = f"{section}.{key}"
+    parameter = reading.parameters.get(key)
+    if parameter is None or parameter.section != section:
+        if section in reading.unread and not section_of(key, reading.parameters):
+            return
+        if is_zip(value):
+            reading.fault(path, value, "parameters that go together under [axes]")
+        else:
+            reading.unknown_key(section, key, [
+                each.name for each in reading.parameters.values() if each.section == section])
+        return
+    reading.given.add(key)
+    try:
+        if isinstance(value, dict):
+            reading.distributions[key] = parse_distribution(parameter, value)
+        else:
+            reading.fixed[key] = parameter.check(value)
+    except TablesError as error:
+        reading.faults.extend(f"{reading.source}: {path}{line}" for line in error.lines)
+    except ValueError as error:
+        if key not in reading.unread:
+            axis = "; several values are an axis: they go under [axes]" if (
+                isinstance(value, list) and tuple not in parameter.types) else ""
+            reading.fault(path, value, f"{error}{axis}")
+
+
+def _read_axes(reading: Reading) -> None:
+    quota = MAX_LISTED
+    for key, value in reading.table("axes").items():
+        if key not in reading.parameters and key != TRIAL and is_zip(value):
+            axis = _read_zip(reading, key, value["zip"], quota)
+        else:
+            axis = _read_axis(reading, key, value, quota)
+        if axis is not None:
+            reading.axes.append(axis)
+            listed = [v for v in axis.columns.values() if not isinstance(v, range)]
+            quota -= len(axis) * len(listed)
+
+
+def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = "") -> Axis | None:
+    """Return the axis of one parameter, or note why there is none.
+
+    Of a parameter that goes together with others, ``table`` is the name of their axis.
+    """
+    path = f"axes.{table}.{key}" if table else f"axes.{key}"
+    try:
+        if key == TRIAL and not table:
+            return parse_trial(value)
+        if key == TRIAL:
+            raise ValueError("it as an axis of its own: every cell has the same trials")
+        if key in HEADER:
+            reading.unknown_key("axes", key, ())
+        elif key in reading.given:
+            other = next((other for other in places(reading.document, reading.parameters[key])
+                          if other != path), "it")
+            raise ValueError(f"it once: {other} is given too; delete one of them")
+        elif key in reading.parameters:
+            reading.given.add(key)
+            return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
+        elif isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
+            raise ValueError(
+                "parameters that go together as "
+                "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip")
+        elif not reading.unread:
+            reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
+    except ValueError as error:
+        if key not in reading.unread:
+            reading.fault(path, value, str(error))
+    return None
+
+
+def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -> Axis | None:
+    """Return the axis of parameters that go together, or note why there is none."""
+    path = f"axes.{key}"
+    if not key.isidentifier():
+        reading.note(plain(path), "expected a name of letters, digits and underscores")
+        return None
+    columns: dict[str, Sequence[Any]] = {}
+    quota //= max(len(members), 1)
+    for name, value in members.items():
+        axis = _read_axis(reading, name, value, quota, key)
+        if axis is not None and len(axis) > quota:
+            reading.fault(f"{path}.{name}", value, "at most 10^6 values, all axes together")
+        elif axis is not None:
+            columns[name] = axis.values
+    if len(members) < 2:
+        reading.fault(path, {"zip": members}, "at least two parameters that go together")
+    if len(columns) < max(len(members), 2):
+        return None
+    try:
+        return zipped_axis(key, columns, reading.parameters)
+    except ValueError as error:
+        reading.note(path, f"expected {error}")
+        return None

@@ -63,7 +63,7 @@ from sweep.store.lifecycle import (
     reopen,
 )
 from sweep.store.locations import absolute_url, check_writable, exists, open_storage
-from sweep.store.lock import changing, closing, is_written, writing
+from sweep.store.lock import changing, is_written, writing
 from sweep.store.provenance import differences
 
 if TYPE_CHECKING:
@@ -386,10 +386,9 @@ def _compute_and_close(
             tally.watch(waiting)
         tally.begin(done)
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
-        with closing(store.url, store.storage):
-            _check_same_rule(store)
-            if not store.finished:  # by another process that wrote it, too
-                close(store)
+        _check_same_rule(store)
+        if not store.finished:  # by another process that wrote it, too
+            close(store)
     return tally.computed
 
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 
 from sweep.execution.runner import recompute
 from sweep.execution.status import close
 from sweep.integrity.recomputation import computable
-from sweep.integrity.verification import SAMPLE, IntegrityReport, damaged_store, report_on
+from sweep.integrity.verification import SAMPLE, IntegrityReport, report_on
 from sweep.store.blocks import RunStore, drop_block
 from sweep.store.files import delete_files, sync, write_files
-from sweep.store.layout import documents, planned_arrays
-from sweep.store.lifecycle import MEASURED, open_store, write_root
+from sweep.store.layout import planned_arrays, planned_files
+from sweep.store.lifecycle import (
+    MEASURED,
+    checksums,
+    is_of_table,
+    open_store,
+    open_unchecked,
+    write_root,
+)
 from sweep.store.locations import translate_errors
 from sweep.store.lock import changing
 
@@ -46,7 +52,7 @@ def repair(
     RunError
         If blocks failed.
     """
-    store = damaged_store(url, "r+")
+    store = open_unchecked(url, "r+")
     before = report_on(store, sample)
     lasting = [each for each in before.damage if before.unstable and each.where == before.unstable]
     if before.damage == lasting and not before.left_over:
@@ -65,7 +71,7 @@ def repair(
             recompute(store, numbers, workers=workers, time_limit_s=time_limit_s)
         if store.finished:
             close(store)
-    after = report_on(damaged_store(url), 0)
+    after = report_on(open_unchecked(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.unstable, after.damage = before.unstable, after.damage + lasting
     remaining = {damage.where for damage in after.damage}
@@ -76,18 +82,16 @@ def repair(
 def _rewrite(store: RunStore, keys: Collection[str]) -> None:
     """Write the files of these keys that follow from the pipeline; delete those of tables.
 
-    A finished store's tables are written when it is closed again.
+    A finished store's tables are written when it is closed again, but for what was measured.
     """
-    planned = planned_arrays(store.pipeline, store.blocks.extents)
-    write_files(store.storage, {
-        key: json.dumps(content).encode() for key, content in documents(planned).items()
-        if key in keys})
-    for array in planned:
-        if array.values is not None and any(key.startswith(f"{array.path}/") for key in keys):
-            array.create(store.group)
+    planned = planned_files(planned_arrays(store.pipeline, store.blocks.extents))
+    again = {key: planned[key] for key in keys if key in planned}
+    write_files(store.storage, again)
+    metadata = store.run_metadata
+    files = {**metadata["files"], **checksums(again)}
     for group in MEASURED:
         if any(key.startswith(f"{group}/") for key in keys):
             sync(store.storage.delete_dir(group))
-    delete_files(store.storage, [key for key in keys if key.startswith(("cost/", "failures/"))])
-    if not store.finished:
-        write_root(store, store.run_metadata)
+            files = {key: value for key, value in files.items() if not key.startswith(f"{group}/")}
+    delete_files(store.storage, filter(is_of_table, keys))
+    write_root(store, {**metadata, "files": files})

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -35,21 +33,18 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.declared import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import make_rule, scenes_needed
-from sweep.store.blocks import BEGUN, UNPARSED, RunStore, committed, parsed_receipt
+from sweep.store.blocks import BEGUN, RunStore, committed, receipts_or_faults
 from sweep.store.chunks import receipt_key
-from sweep.store.files import read_files, read_json, sync
-from sweep.store.layout import checksum_of, documents, is_sound, planned_arrays
+from sweep.store.files import read_files, sync
+from sweep.store.layout import checksum_of, is_sound
 from sweep.store.lifecycle import (
-    GROUPS,
-    changed_coordinates,
-    read_attributes,
-    root_attributes,
-    schema_faults,
-    store_of,
+    CHANGED,
+    changed_files,
+    is_root_sound,
+    open_unchecked,
+    read_listed,
 )
-from sweep.store.locations import open_storage
 from sweep.store.lock import LOCKS, is_written
-from sweep.store.provenance import environment
 from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
@@ -131,8 +126,6 @@ class IntegrityReport:
 THREADS, WINDOW = 4, 256
 """Blocks that are read and checked at a time, and that are submitted at a time."""
 
-CHANGED = "changed: does not fit its checksum"
-
 
 def check_blocks(
     store: RunStore, numbers: Sequence[int], report: IntegrityReport
@@ -144,34 +137,30 @@ def check_blocks(
         # A window at a time: there may be very many.
         for start in range(0, len(numbers), WINDOW):
             some = numbers[start : start + WINDOW]
-            checked = pool.map(partial(_checked_block, store), some)
-            for number, (size, receipt, damage) in zip(some, checked, strict=True):
+            for size, receipt, damage in pool.map(partial(_checked_block, store), some):
                 report.bytes += size
                 report.damage += damage
-                if receipt is not None and not damage:
+                if receipt is not None and receipt.block is not None and not damage:
                     processors.update(receipt.processors)
-                    sound[number] = receipt
+                    sound[receipt.block] = receipt
     report.processors = dict(processors)
     return sound
 
 
 def _checked_block(store: RunStore, number: int) -> tuple[int, Receipt | None, list[Damage]]:
-    """Return the size of a block's files, its receipt if that is sound, and what is damaged."""
-    key, chunks = receipt_key(number), store.chunks.keys(number)
-    content, *contents = read_files(store.storage, [key, *chunks.values()])
-    receipt, faults = None, {}
-    try:
-        receipt = parsed_receipt(store, number, content)
-    except UNPARSED as error:
-        faults[key] = "missing" if content is None else f"changed: {error}"
-    for (name, chunk), values in zip(chunks.items(), contents, strict=True):
-        if values is None:
-            faults[chunk] = "missing"
-        elif not is_sound(values) or (
-            receipt is not None and receipt.checksums.get(name) != checksum_of(values)
-        ):
-            faults[chunk] = CHANGED
-    size = sum(len(each or b"") for each in (content, *contents))
+    """Return the size of a block's chunks, its receipt if that is sound, and what is damaged."""
+    ((_, receipt, fault),) = receipts_or_faults(store, [number])
+    faults = {receipt_key(number): fault} if fault else {}
+    checksums = {} if receipt is None else receipt.checksums
+    keys = {store.chunks.key(variable.name, number): variable.name for variable in store.variables}
+    contents = read_files(store.storage, list(keys))
+    for (key, name), content in zip(keys.items(), contents, strict=True):
+        if content is None:
+            faults[key] = "missing"
+        elif not is_sound(content) or checksum_of(content) != checksums.get(
+                name, checksum_of(content)):
+            faults[key] = CHANGED
+    size = sum(len(content or b"") for content in contents)
     return size, receipt, [Damage(key, what, number) for key, what in faults.items()]
 
 
@@ -190,77 +179,6 @@ def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport
                number)
         for number in numbers if number not in current
     ]
-
-
-# --------------------------------------------------------------------------------------------------
-# Files outside the blocks: metadata, coordinates, tables of the run.
-
-TABLES = ("cost", "failures")
-"""Groups that a finished store has."""
-
-
-def check_files(store: RunStore, report: IntegrityReport) -> set[str]:
-    """Check the files that belong to the store and to no block; return their keys."""
-    planned = planned_arrays(store.pipeline, store.blocks.extents)
-    root = read_json(store.storage, "zarr.json") or {}
-    copies = _copies(root)
-    groups = [name for name in GROUPS if report.finished or name not in TABLES]
-    tables = [path for path in copies if path.startswith(tuple(f"{name}/" for name in TABLES))]
-    paths = list(dict.fromkeys([*(each.path for each in planned), *groups, *tables]))
-    stored = {path: read_json(store.storage, f"{path}/zarr.json") for path in paths}
-
-    # Another version of sweep or of Zarr may word documents otherwise.
-    own = store.run_metadata["environment"].get("sweep") == environment()["sweep"]
-    expected = documents(planned) if own else {}
-    faults = schema_faults(store)
-    for path, document in stored.items():
-        wanted = expected.get(f"{path}/zarr.json", copies.get(path, document))
-        if document is None or document != wanted:
-            faults.setdefault(path, "missing or changed")
-    found = {f"{path}/zarr.json" if path in stored else path: fault
-             for path, fault in faults.items()}
-
-    attributes = root_attributes(store.pipeline, planned, store.run_metadata)
-    if own and any(root["attributes"].get(name) != value for name, value in attributes.items()):
-        found["zarr.json"] = "its attributes differ from the pipeline's"
-    elif report.finished and not faults and any(
-        copies.get(path) != document for path, document in stored.items()
-    ):
-        found["zarr.json"] = "its copy of the metadata differs from the arrays' own"
-
-    sound = [each for each in planned if each.path not in faults]
-    chunks = {key for each in planned for key, _, _ in each.pieces()}
-    found |= changed_coordinates(store, sound)
-    for path in tables:
-        if path not in faults and (stored[path] or {}).get("node_type") == "array":
-            read = dict(_read_table(store, path))
-            chunks |= read.keys()
-            found |= {key: fault for key, fault in read.items() if fault}
-    keys = {"zarr.json", *(f"{path}/zarr.json" for path in stored), *chunks}
-    report.damage += [Damage(key, fault) for key, fault in found.items()]
-    report.bytes += sum(len(each or b"") for each in read_files(store.storage, sorted(keys)))
-    return keys
-
-
-def _copies(root: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the root's copy of all metadata by path; empty of an unfinished store."""
-    try:
-        copies = dict(root["consolidated_metadata"]["metadata"])
-        return {path: {key: value for key, value in copy.items() if key != "consolidated_metadata"}
-                for path, copy in copies.items()}
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return {}
-
-
-def _read_table(store: RunStore, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the key of each chunk of an array of a table, and how it is damaged if it is."""
-    array: Any = store.group[path]
-    counts = [math.ceil(size / chunk) for size, chunk in zip(
-        array.shape, array.chunks, strict=True)]
-    for number in itertools.product(*map(range, counts)):
-        key = f"{path}/{array.metadata.encode_chunk_key(number)}"
-        (content,) = read_files(store.storage, [key])
-        yield key, "missing" if content is None else "" if is_sound(content) else CHANGED
 
 
 # --------------------------------------------------------------------------------------------------
@@ -448,13 +366,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     """
     if sample < 0:
         raise ArgumentError("sample", sample, "expected at least 0")
-    return report_on(damaged_store(url), sample)
-
-
-def damaged_store(url: str, mode: str = "r") -> RunStore:
-    """Open a store that may be damaged."""
-    storage = open_storage(url, mode)
-    return store_of(url, storage, read_attributes(url, storage), mode)
+    return report_on(open_unchecked(url), sample)
 
 
 def report_on(store: RunStore, sample: int) -> IntegrityReport:
@@ -462,40 +374,42 @@ def report_on(store: RunStore, sample: int) -> IntegrityReport:
     done = committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
     numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
-    listed, left = sync(_listed(store, numbers if report.finished else done))
-    left -= check_files(store, report)
-    left = {key for key in left if not key.startswith(f"{LOCKS}/")}
-    report.files = listed - len(left)
+    listed, others = _listed(store, numbers if report.finished else done)
+    listing = read_listed(store, tables=True)
+    others -= {"zarr.json", *listing, *map(receipt_key, numbers)}
+    others = {key for key in others if not key.startswith(f"{LOCKS}/")}
+    report.files = listed - len(others)
+    report.bytes = sum(len(content or b"") for content in listing.values())
+    report.damage = [Damage(key, fault) for key, fault in changed_files(store, listing).items()]
+    if not is_root_sound(store):
+        report.damage.append(Damage("zarr.json", CHANGED))
     sound = check_blocks(store, numbers, report)
     if report.finished:
         check_needed(store, sound, report)
     check_scenes(store, sample, sound, report)
     if not is_written(store.storage):
         report.left_over = sorted(
-            key for key in left
-            if report.finished or not _of_unfinished_block(store, key, done)
-        )
+            key for key in others if report.finished or not _of_unfinished_block(store, key))
     return report
 
 
-async def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[str]]:
-    """Return how many files there are, and the keys of those that belong to no checked block.
+def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[str]]:
+    """Return how many files there are, and the keys of those that are no chunk of a checked block.
 
     There may be 25 million files.
     """
-    count, others = 0, set()
-    async for key in store.storage.list_prefix(""):
-        count += 1
-        number = store.chunks.number(key)
-        if number is None or number not in checked:
-            others.add(key)
-    return count, others
+    async def others() -> tuple[int, set[str]]:
+        count, left = 0, set()
+        async for key in store.storage.list_prefix(""):
+            count += 1
+            number = store.chunks.number(key)
+            if number is None or number not in checked:
+                left.add(key)
+        return count, left
+
+    return sync(others())
 
 
-def _of_unfinished_block(store: RunStore, key: str, done: Container[int]) -> bool:
-    """Return whether a key belongs to a block that a run will write again."""
-    number = store.chunks.number(key)
-    begun = key.removeprefix(f"{BEGUN}/")
-    if number is None and begun.isdecimal():
-        number = int(begun)
-    return number is not None and number not in done
+def _of_unfinished_block(store: RunStore, key: str) -> bool:
+    """Return whether a key is of a block that was begun, and that a run will write again."""
+    return store.chunks.number(key) is not None or key.startswith(f"{BEGUN}/")

@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 import time
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, cast
@@ -16,7 +16,6 @@ from typing import Any, cast
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import Store
-from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
 from sweep.experiment.grid import Block, Blocks
@@ -26,6 +25,7 @@ from sweep.store.chunks import Chunks, receipt_key
 from sweep.store.files import (
     absent_files,
     delete_files,
+    list_folder,
     read_files,
     read_json,
     sync,
@@ -33,7 +33,7 @@ from sweep.store.files import (
     write_files,
 )
 from sweep.store.layout import RECEIPTS, checksum_of
-from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
+from sweep.store.locations import is_remote, remote_run_id, translate_errors
 from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
@@ -85,14 +85,9 @@ class RunStore:
         return f"{self.url}/{self.run_id}" if is_remote(self.url) else self.url
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Return an array by its path; its metadata is read once.
-
-        Chunks are written even if they hold nothing but the fill value: the missing chunk of a
-        committed block is a deleted one.
-        """
+        """Return an array by its path; its metadata is read once."""
         if name not in self._arrays:
-            array = cast("zarr.Array[Any]", self.group[name])
-            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+            self._arrays[name] = cast("zarr.Array[Any]", self.group[name])
         return self._arrays[name]
 
     @property
@@ -120,9 +115,7 @@ def run_metadata_in(attributes: Mapping[str, Any]) -> dict[str, Any]:
     KeyError, TypeError, ValueError
         If there are none.
     """
-    metadata = attributes["sweep"]
-    # Up to format 5 they were an object, which netCDF cannot hold.
-    return dict(json.loads(metadata) if isinstance(metadata, str) else metadata)
+    return dict(json.loads(attributes["sweep"]))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -227,15 +220,11 @@ def drop_block(store: RunStore, block: Block) -> None:
 
 def check_not_replaced(store: RunStore) -> None:
     """Raise StoreReplacedError if another run has replaced the store since it was opened."""
-    current: str | None
-    if is_remote(store.url):
-        current = remote_run_id(store.url)
-    else:
-        try:
-            group = open_group(LocalStore(store.url, read_only=True), "r")
-            current = run_metadata_in(dict(group.attrs))["run_id"]
-        except (KeyError, FileNotFoundError):
-            current = None
+    try:
+        current = (remote_run_id(store.url) if is_remote(store.url)
+                   else store.run_metadata["run_id"])
+    except KeyError:
+        current = None
     if current != store.run_id:
         raise StoreReplacedError(
             f"{store.url}: moved, or replaced by another run, while this run was in progress"
@@ -244,15 +233,9 @@ def check_not_replaced(store: RunStore) -> None:
 
 def committed(store: RunStore) -> set[int]:
     """Return the numbers of the blocks that are committed."""
-    async def gather(keys: AsyncIterator[str]) -> set[int]:
-        return {int(key) async for key in keys if key.isascii() and key.isdecimal()}
-
-    count = len(store.blocks)
-    try:
-        listed = sync(gather(store.storage.list_dir(f"{RECEIPTS}/c")))
-    except FileNotFoundError:
-        return set()
-    return {number for number in listed if number < count}
+    names = list_folder(store.storage, f"{RECEIPTS}/c")
+    numbers = {int(name) for name in names if name.isascii() and name.isdecimal()}
+    return {number for number in numbers if number < len(store.blocks)}
 
 
 def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Receipt]]:
@@ -263,44 +246,40 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Rec
     StoreError
         If one is missing or damaged.
     """
+    for number, receipt, fault in receipts_or_faults(store, numbers):
+        if receipt is None:
+            raise StoreError(
+                f"{store.url}: the receipt of block {number} is damaged ({fault}); "
+                "`sweep verify --repair` repairs it"
+            )
+        yield number, receipt
+
+
+def receipt_of(store: RunStore, block: Block) -> Receipt | None:
+    """Return a block's receipt; None if it is not committed, or its receipt is damaged."""
+    ((_, receipt, _),) = receipts_or_faults(store, [store.blocks.number(block)])
+    return receipt
+
+
+def receipts_or_faults(
+    store: RunStore, numbers: Iterable[int]
+) -> Iterator[tuple[int, Receipt | None, str]]:
+    """Yield blocks' numbers in order, each with its receipt, or None and what is wrong with it.
+
+    A receipt of another block or run commits nothing.
+    """
     ordered = sorted(numbers)
     for start in range(0, len(ordered), RECEIPTS_AT_ONCE):
         some = ordered[start : start + RECEIPTS_AT_ONCE]
         contents = read_files(store.storage, [receipt_key(number) for number in some])
         for number, content in zip(some, contents, strict=True):
             try:
-                yield number, parsed_receipt(store, number, content)
-            except UNPARSED as error:
-                raise StoreError(
-                    f"{store.url}: the receipt of block {number} is damaged ({error}); "
-                    "`sweep verify --repair` repairs it"
-                ) from None
-
-
-def receipt_of(store: RunStore, block: Block) -> Receipt | None:
-    """Return a block's receipt; None if it is not committed, or its receipt is damaged."""
-    number = store.blocks.number(block)
-    try:
-        return parsed_receipt(store, number, *read_files(store.storage, [receipt_key(number)]))
-    except UNPARSED:
-        return None
-
-
-def parsed_receipt(store: RunStore, number: int, content: bytes | None) -> Receipt:
-    """Return a block's receipt from its chunk; it raises `UNPARSED` if it is not one of this run's.
-
-    A chunk without content or of another block commits nothing.
-    """
-    if content is None:
-        raise ValueError("missing")
-    receipt = Receipt.from_bytes(content)
-    if (receipt.run_id, receipt.block) != (store.run_id, number):
-        raise ValueError(f"of block {receipt.block} of run {receipt.run_id}")
-    return receipt
-
-
-UNPARSED = (ValueError, AttributeError, KeyError, TypeError, RuntimeError, OSError)
-"""Errors that a damaged receipt may raise."""
+                receipt = Receipt.from_bytes(content)
+                if (receipt.run_id, receipt.block) != (store.run_id, number):
+                    raise ValueError(f"of block {receipt.block} of run {receipt.run_id}")
+                yield number, receipt, ""
+            except ValueError as error:
+                yield number, None, str(error)
 
 
 def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:

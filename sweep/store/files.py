@@ -41,25 +41,22 @@ def read_files(storage: Store, keys: Sequence[str]) -> list[bytes | None]:
 
 def _read(path: str) -> bytes | None:
     try:
-        # A pipe without a writer is read as empty in place of waiting for one.
-        with open(path, "rb", opener=_open_without_waiting) as file:
-            return file.read()
+        return Path(path).read_bytes()
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return None
 
 
-def _open_without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-
-
 def write_files(storage: Store, contents: Mapping[str, bytes]) -> None:
     """Write files, each whole or not at all, in any order."""
-    async def write_all() -> None:
-        await asyncio.gather(*(
+    async def write_all() -> list[BaseException | None]:
+        return await asyncio.gather(*(
             storage.set(key, cpu.Buffer.from_bytes(content)) for key, content in contents.items()
-        ))
+        ), return_exceptions=True)
 
-    sync(write_all())
+    # Raised once no other write is under way that could make its folder again.
+    for error in sync(write_all()):
+        if error is not None:
+            raise error
 
 
 def delete_files(storage: Store, keys: Iterable[str]) -> None:
@@ -70,32 +67,45 @@ def delete_files(storage: Store, keys: Iterable[str]) -> None:
 
 
 def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[str]:
-    """Yield those of the keys, all below a folder, that are missing, empty, or no file."""
+    """Yield those of the keys, all below a folder, that are missing or empty."""
     if not isinstance(storage, LocalStore):
-        present = sync(_nonempty(storage, folder))
+        present = set(list_files(storage, f"{folder}/"))
         yield from (key for key in keys if key not in present)
         return
     root = os.fspath(storage.root)
     for key in keys:
         try:
-            status = os.stat(f"{root}/{key}")  # noqa: PTH116  (one in 10^6)
+            size = os.stat(f"{root}/{key}").st_size  # noqa: PTH116  (one in 10^6)
         except OSError:
+            size = 0
+        if not size:
             yield key
-        else:
-            if status.st_size == 0 or not stat.S_ISREG(status.st_mode):
-                yield key
 
 
-async def _nonempty(storage: Store, folder: str) -> set[str]:
-    return {key async for key in storage.list_prefix(f"{folder}/")}
-
-
-async def list_folder(storage: Store, prefix: str) -> list[str]:
+def list_folder(storage: Store, folder: str) -> list[str]:
     """Return the names in a folder of a storage; none if there is no such folder."""
+    async def names() -> list[str]:
+        return [name async for name in storage.list_dir(folder)]
+
     try:
-        return [name async for name in storage.list_dir(prefix)]
+        return sync(names())
     except FileNotFoundError:
         return []
+
+
+def list_files(storage: Store, prefix: str = "") -> list[str]:
+    """Return the keys of all files below a prefix."""
+    async def keys() -> list[str]:
+        return [key async for key in storage.list_prefix(prefix)]
+
+    return sync(keys())
+
+
+def files_in(storage: Store) -> dict[str, bytes]:
+    """Return the contents of all files of a storage by key."""
+    keys = list_files(storage)
+    return {key: content or b"" for key, content in zip(
+        keys, read_files(storage, keys), strict=True)}
 
 
 def encoded(content: Mapping[str, Any]) -> bytes:
@@ -103,18 +113,13 @@ def encoded(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":")).encode()
 
 
-def parsed(content: bytes | None) -> dict[str, Any] | None:
+def read_json(storage: Store, key: str) -> dict[str, Any] | None:
     """Return a JSON document's content; None if it is missing or damaged."""
     try:
-        document = json.loads(content or b"")
+        document = json.loads(read_files(storage, [key])[0] or b"")
     except (ValueError, RecursionError):
         return None
     return document if isinstance(document, dict) else None
-
-
-def read_json(storage: Store, key: str) -> dict[str, Any] | None:
-    """Return a JSON document's content; None if it is missing or damaged."""
-    return parsed(read_files(storage, [key])[0])
 
 
 def write_document(storage: Store, key: str, content: Mapping[str, Any]) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -15,7 +14,6 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
-from zarr.core.metadata import ArrayV3Metadata
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
@@ -28,26 +26,18 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import (
     LABELS,
     VARIABLES,
-    FixedValue,
     Variable,
     fixed_values,
     with_description,
 )
 from sweep.model.image_file import IMAGE_SUFFIXES
-from sweep.store.files import read_files, sync
+from sweep.store.files import files_in
 
-FORMAT = 7
+FORMAT = 8
 """Version of the layout of stores; another one is refused."""
 
 RECEIPTS = "commits/receipt"
 """Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
-
-READING_ATTRIBUTES = {
-    "_ARRAY_DIMENSIONS", "_Encoding", "_FillValue", "_Unsigned", "add_offset", "bounds",
-    "calendar", "cell_measures", "coordinates", "dtype", "formula_terms", "grid_mapping",
-    "missing_value", "scale_factor", "units", "valid_max", "valid_min", "valid_range",
-}
-"""Attributes by which xarray, other readers of CF data, and people change the values they read."""
 
 COORDINATE_CHUNK = 1 << 20
 
@@ -66,8 +56,7 @@ class PlannedArray:
     shape, chunks, dtype, dimensions, fill, attributes
         Its metadata; ``fill`` is None for Zarr's default.
     values
-        Returns its values in [start, stop) along the first dimension; None for an array to which
-        blocks or receipts are written later.
+        Its values; None for an array to which blocks or receipts are written later.
     coordinate
         Whether it is a coordinate that is no dimension.
     """
@@ -79,39 +68,29 @@ class PlannedArray:
     dimensions: tuple[str, ...]
     fill: Any = None
     attributes: dict[str, Any] = field(default_factory=dict)
-    values: Callable[[int, int], NDArray[Any]] | None = None
+    values: NDArray[Any] | None = None
     coordinate: bool = False
 
     def create(self, group: zarr.Group) -> None:
         """Create the array and write its values."""
-        # Also what equals the fill value, such as a tilt of 0: a missing chunk is a deleted one.
-        array = self.create_empty(group).with_config({"write_empty_chunks": True})
-        for _, part, values in self.pieces():
-            array[part] = values
-
-    def create_empty(self, group: zarr.Group) -> zarr.Array[Any]:
-        """Create the array without values."""
         options = {} if self.fill is None else {"fill_value": self.fill}
-        return group.create_array(
+        array = group.create_array(
             self.path, shape=self.shape, chunks=self.chunks, dtype=_dtype(self.dtype),
             dimension_names=self.dimensions, compressors=codecs(), attributes=self.attributes,
-            overwrite=True, **options,
+            # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
+            config={"write_empty_chunks": True}, **options,
         )
+        if self.values is not None:
+            array[...] = self.values
 
-    def pieces(self) -> Iterator[tuple[str, Any, NDArray[Any]]]:
-        """Yield the key of each chunk whose values follow from the pipeline, its index, and them.
 
-        The array is cut along its first dimension alone.
-        """
-        if self.values is None:
-            return
-        if not self.shape:
-            yield f"{self.path}/c", ..., self.values(0, 0)
-            return
-        rest = "/0" * (len(self.shape) - 1)
-        for number, start in enumerate(range(0, self.shape[0], self.chunks[0])):
-            stop = min(start + self.chunks[0], self.shape[0])
-            yield f"{self.path}/c/{number}{rest}", slice(start, stop), self.values(start, stop)
+def planned_files(planned: Iterable[PlannedArray]) -> dict[str, bytes]:
+    """Return the contents of the files that an empty store has by key, except the root's."""
+    memory = MemoryStore()
+    group = zarr.open_group(memory, mode="w", zarr_format=3)
+    for array in planned:
+        array.create(group)
+    return {key: content for key, content in files_in(memory).items() if key != "zarr.json"}
 
 
 @cache
@@ -160,12 +139,15 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
         for name, length in zip(variable.inner, variable.inner_shape, strict=True)
     }
     planned += [
-        _labels(name, LABELS[name], {}) if LABELS[name] else _numbers(name, used[name])
+        _coordinate(name, (name,), LABELS[name] or np.arange(used[name], dtype=np.int64), {})
         for name in sorted(used)
     ]
     planned += _distance(pipeline)
     planned += _photographs(pipeline)
-    planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
+    planned += [
+        _coordinate(fixed.name, (), fixed.value, fixed.attributes)
+        for fixed in fixed_values(pipeline) if fixed.name not in VARIABLES
+    ]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
                for each in planned]
@@ -189,50 +171,31 @@ def _variable(
     )
 
 
+def _coordinate(
+    path: str, dimensions: tuple[str, ...], values: Any, attributes: Mapping[str, Any]
+) -> PlannedArray:
+    """Return a coordinate of numbers, truth values or texts along dimensions."""
+    array = np.asarray(values)
+    if array.dtype.kind in "TU":
+        array = array.astype(object)
+    return PlannedArray(
+        path, array.shape, tuple(min(length, COORDINATE_CHUNK) for length in array.shape),
+        "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
+        dict(attributes), array, coordinate=dimensions != (path,),
+    )
+
+
 def _axis(axis: Axis) -> list[PlannedArray]:
     """Return the coordinates of a dimension, and those of the parameters that go together there."""
-    attributes = {"zip": " ".join(axis.columns)} if axis.zipped else {}
+    together = [Axis(name, values, plugged=axis.plugged) for name, values in axis.zipped]
     return [
-        _coordinate(axis, axis.name, attributes),
-        *(
-            _coordinate(Axis(name, values, plugged=axis.plugged), axis.name, {})
-            for name, values in axis.zipped
-        ),
+        _coordinate(each.name, (axis.name,), each.coordinates(), {
+            "long_name": each.meaning,
+            **({"zip": " ".join(each.columns)} if each.zipped else {}),
+            **({"units": each.unit} if each.unit else {}),
+        })
+        for each in (axis, *together)
     ]
-
-
-def _coordinate(axis: Axis, dimension: str, attributes: dict[str, Any]) -> PlannedArray:
-    """Return the values along an axis as a coordinate over a dimension."""
-    attributes = {"long_name": axis.meaning, **attributes}
-    if axis.unit:
-        attributes["units"] = axis.unit
-    if axis.labelled:
-        labels = axis.coordinates().tolist()
-        return dataclasses.replace(
-            _labels(dimension, labels, attributes), path=axis.name,
-            coordinate=axis.name != dimension,
-        )
-    return PlannedArray(
-        axis.name, (len(axis),), (min(len(axis), COORDINATE_CHUNK),),
-        axis.coordinates(0, 1).dtype.str.lstrip("<>|="), (dimension,), None, attributes,
-        axis.coordinates, coordinate=axis.name != dimension,
-    )
-
-
-def _labels(name: str, labels: Any, attributes: dict[str, Any]) -> PlannedArray:
-    values = np.array(list(labels), dtype=object)
-    return PlannedArray(
-        name, values.shape, values.shape, "string", (name,), None, attributes,
-        lambda start, stop: values[start:stop],
-    )
-
-
-def _numbers(name: str, length: int) -> PlannedArray:
-    """Return the coordinate of a dimension that is counted from 0 on."""
-    return PlannedArray(
-        name, (length,), (length,), "int64", (name,), None, {},
-        lambda start, stop: np.arange(start, stop, dtype=np.int64),
-    )
 
 
 def _distance(pipeline: Pipeline) -> list[PlannedArray]:
@@ -252,15 +215,10 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
     distance = np.broadcast_to(
         np.asarray(distance_of_side(values), dtype=np.float64), tuple(len(axis) for axis in axes)
     )
-    return [
-        PlannedArray(
-            "distance_m", distance.shape, distance.shape, "f8",
-            tuple(axis.name for axis in axes), None,
-            {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
-            lambda start, stop: distance[start:stop] if distance.ndim else distance,
-            coordinate=True,
-        )
-    ]
+    return [_coordinate(
+        "distance_m", tuple(axis.name for axis in axes), distance,
+        {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
+    )]
 
 
 def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
@@ -278,62 +236,10 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
         files *= -(-len(trials) // max(len(files), 1))
     if len(files) < len(trials):
         return []
-    files = files[: len(trials)]
-    columns = {
-        "photograph": ([name.rpartition("/")[2] for name, _ in files], "file of the photograph"),
-        "sha256": ([digest for _, digest in files], "SHA-256 of the photograph's file"),
-    }
+    names, digests = zip(*files[: len(trials)], strict=True)
     return [
-        dataclasses.replace(
-            _labels(TRIAL, values, {"long_name": meaning}), path=name, coordinate=True,
-        )
-        for name, (values, meaning) in columns.items()
+        _coordinate("photograph", (TRIAL,), [name.rpartition("/")[2] for name in names],
+                    {"long_name": "file of the photograph"}),
+        _coordinate("sha256", (TRIAL,), digests,
+                    {"long_name": "SHA-256 of the photograph's file"}),
     ]
-
-
-def _fixed(fixed: FixedValue) -> PlannedArray:
-    """Return the coordinate without dimensions of a parameter that is fixed."""
-    text = isinstance(fixed.value, str)
-    value = np.array(fixed.value, dtype=object if text else None)
-    return PlannedArray(
-        fixed.name, (), (), "string" if text else value.dtype.str.lstrip("<>|="), (), None,
-        dict(fixed.attributes), lambda start, stop: value,  # noqa: ARG005  (it has no dimension)
-        coordinate=True,
-    )
-
-
-def documents(planned: Iterable[PlannedArray]) -> dict[str, dict[str, Any]]:
-    """Return the metadata documents of a store with these arrays by key, except the root's."""
-    memory = MemoryStore()
-    group = zarr.open_group(memory, mode="w", zarr_format=3)
-    for array in planned:
-        array.create_empty(group)
-
-    async def keys() -> list[str]:
-        return [key async for key in memory.list_prefix("") if key.endswith("/zarr.json")]
-
-    found = sync(keys())
-    return {key: json.loads(content or b"")
-            for key, content in zip(found, read_files(memory, found), strict=True)}
-
-
-def misfit(document: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """Return how an array's metadata document differs from the expected one; empty if it fits.
-
-    Of the attributes, only those are compared that change the values which readers return:
-    another version of sweep may word the others differently.
-    """
-    try:
-        stored, wanted = (_schema(each) for each in (document, expected))
-    except Exception as error:  # a damaged or forged document may raise anything
-        return f"unreadable: {' '.join(str(error).split())[:200]}"
-    return next((f"{name} {stored.get(name)}, expected {wanted.get(name)}"
-                 for name in {**wanted, **stored} if stored.get(name) != wanted.get(name)), "")
-
-
-def _schema(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what decides how values are read, as this version of Zarr writes it."""
-    schema = ArrayV3Metadata.from_dict(dict(document)).to_dict()
-    attributes = dict(document.get("attributes", {}))
-    return {**schema, "attributes": {
-        name: attributes[name] for name in sorted(attributes.keys() & READING_ATTRIBUTES)}}

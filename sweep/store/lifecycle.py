@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import json
 import math
@@ -13,15 +12,14 @@ import uuid
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import numpy as np
 import zarr
 import zarr.errors
-from zarr.abc.buffer import Buffer, BufferPrototype
-from zarr.abc.store import ByteRequest, Store
-from zarr.storage import LocalStore, WrapperStore
+from zarr.abc.store import Store
+from zarr.storage import LocalStore, MemoryStore
 
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.document import MAX_BYTES, read_document
@@ -35,29 +33,29 @@ from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.blocks import (
     BEGUN,
     RunStore,
+    check_not_replaced,
     check_whole,
     committed,
     run_metadata_in,
 )
-from sweep.store.chunks import Chunks
 from sweep.store.files import (
     delete_files,
+    encoded,
+    files_in,
     list_folder,
-    parsed,
     read_files,
     read_json,
     sync,
     write_document,
+    write_files,
 )
 from sweep.store.layout import (
     FORMAT,
     RECEIPTS,
     PlannedArray,
     codecs,
-    documents,
-    is_sound,
-    misfit,
     planned_arrays,
+    planned_files,
 )
 from sweep.store.locations import (
     POINTER,
@@ -77,91 +75,44 @@ from sweep.store.provenance import environment, fingerprint
 if TYPE_CHECKING:
     import xarray as xr
 
-
 # --------------------------------------------------------------------------------------------------
-# Whether a store's arrays are those that its pipeline asks for.
+# Files of no block. The run's metadata list them with the CRC-32 of their contents: metadata of
+# the arrays and coordinates from the creation on, tables once a store is finished.
 
-GROUPS = ("commits", "cost", "failures")
-"""The groups of a store."""
+TABLES = ("cost", "failures")
+"""Groups that a finished store has."""
 
+MEASURED = ("cost/tradeoff", "cost/renderers")
+"""Groups within groups that no receipt could restore."""
 
-def schema_faults(store: RunStore) -> dict[str, str]:
-    """Return the faults of a store's arrays by name: missing, unknown, or of another schema."""
-    expected = documents(planned_arrays(store.pipeline, store.blocks.extents))
-    arrays = {key.removesuffix("/zarr.json"): content for key, content in expected.items()}
-    listed = {key for key in sync(list_folder(store.storage, "")) if not key.startswith(".")}
-    names = sorted((listed | arrays.keys()) - {"zarr.json", *GROUPS})
-    contents = read_files(store.storage, [f"{name}/zarr.json" for name in names])
-    faults: dict[str, str] = {}
-    for name, content in zip(names, contents, strict=True):
-        if name not in arrays:
-            if content is not None:
-                faults[name] = "not part of a sweep store"
-        elif content is None:
-            faults[name] = "missing"
-        elif fault := misfit(parsed(content) or {}, arrays[name]):
-            faults[name] = fault
-    return faults
+CHANGED = "changed: does not fit its checksum"
 
 
-# --------------------------------------------------------------------------------------------------
-# What readers see of a store: its committed blocks, and coordinates as its pipeline has them.
-
-class CommittedBlocks(WrapperStore[Store]):
-    """A storage without the chunks of blocks that were not committed when it was made.
-
-    A writer may be at any block meanwhile, or may have been killed in the midst of one. It holds
-    only what can be pickled, so that a dataset on it can be sent to other processes.
-    """
-
-    def __init__(self, store: Store, chunks: Chunks, committed: bytes) -> None:
-        super().__init__(store)
-        self._chunks, self._committed = chunks, committed
-
-    def _with_store(self, store: Store) -> Self:
-        return type(self)(store, self._chunks, self._committed)
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether two show the same blocks of the same storage."""
-        return super().__eq__(other) and self._committed == getattr(other, "_committed", None)
-
-    __hash__ = None  # type: ignore[assignment]
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        """Return a key's content; None if it is of a block that was not committed."""
-        number = self._chunks.number(key)
-        if number is not None and not self._committed[number]:
-            return None
-        return await super().get(key, prototype, byte_range)
+def checksums(contents: Mapping[str, bytes]) -> dict[str, int]:
+    """Return the CRC-32 of files by key."""
+    return {key: crc32(content) for key, content in contents.items()}
 
 
-def as_committed(store: RunStore, committed: Collection[int]) -> Store:
-    """Return the storage of a store with the chunks of these blocks alone."""
-    shown = np.zeros(len(store.blocks), dtype=np.uint8)
-    shown[list(committed)] = 1
-    return CommittedBlocks(store.storage, store.chunks, shown.tobytes())
+def is_of_table(key: str) -> bool:
+    """Return whether a key belongs to a table of a finished store."""
+    return key.partition("/")[0] in TABLES
 
 
-def changed_coordinates(store: RunStore, planned: Iterable[PlannedArray]) -> dict[str, str]:
-    """Return the keys of chunks that are not as the pipeline has them, and why.
+def changed_files(
+    store: RunStore, contents: Mapping[str, bytes | None]
+) -> dict[str, str]:
+    """Return which of the listed files are missing or changed, and which of the two, by key."""
+    written = store.run_metadata["files"]
+    return {
+        key: "missing" if content is None else CHANGED for key, content in contents.items()
+        if content is None or crc32(content) != written[key]
+    }
 
-    Coordinates that are drawn for each scene are variables of the blocks.
-    """
-    faults = {}
-    for array in planned:
-        for key, part, values in array.pieces():
-            (content,) = read_files(store.storage, [key])
-            if not content:
-                faults[key] = "missing"
-            elif not is_sound(content):
-                faults[key] = "changed: does not fit its checksum"
-            else:
-                stored = np.asarray(store.array(array.path)[part])
-                if stored.shape != values.shape or not (stored == values).all():
-                    faults[key] = "its values differ from the pipeline's"
-    return faults
+
+def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
+    """Return the contents of the listed files by key, with or without those of tables."""
+    keys = [key for key in store.run_metadata["files"] if tables or not is_of_table(key)]
+    return dict(zip(keys, read_files(store.storage, keys), strict=True))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -174,7 +125,7 @@ UNREADABLE = (
     AttributeError, KeyError, TypeError, ValueError, RecursionError, OSError,
     zarr.errors.BaseZarrError,
 )
-"""Errors that reading a foreign, damaged or forged document may raise."""
+"""Errors that reading a foreign or damaged document may raise."""
 
 NEW_RUN = "run its pipeline into a new store: `sweep run PIPELINE --store NEW`"
 
@@ -185,49 +136,22 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     Raises
     ------
     StoreError
-        If there is no store, or something else, or its arrays are not those of its pipeline.
+        If there is no store, or something else, or metadata or coordinates of it are damaged.
     """
-    url = checked_url(url)
-    storage = open_storage(url, mode)
-    store = store_of(url, storage, read_attributes(url, storage), mode)
-    try:
-        faults = schema_faults(store)
-    except (FileNotFoundError, zarr.errors.BaseZarrError):
+    store = open_unchecked(url, mode)
+    # Tables may be written at this moment, and blocks do not need them.
+    for key, fault in changed_files(store, read_listed(store, tables=False)).items():
+        check_not_replaced(store)
         raise StoreError(
-            f"{url}: was deleted or replaced while it was opened; try again") from None
-    if faults:
-        name, fault = next(iter(faults.items()))
-        raise StoreError(
-            f"{url}: does not fit its pipeline: {name}: {fault}; `sweep verify` lists all faults"
-        )
+            f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
     return store
 
 
-def read_attributes(url: str, storage: Store) -> dict[str, Any]:
-    """Return the attributes of a storage's root.
-
-    Raises
-    ------
-    StoreError
-        If there are none.
-    """
-    try:
-        root = read_json(storage, "zarr.json") or {}
-        return dict(root["attributes"])
-    except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
-    except UNREADABLE:
-        if sync(list_folder(storage, RECEIPTS)):
-            raise StoreError(
-                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
-            ) from None
-        raise StoreError(not_a_store(url)) from None
-
-
-def store_of(
-    url: str, storage: Store, attributes: Mapping[str, Any], mode: str = "r"
-) -> RunStore:
-    """Return the store that has these root attributes; StoreError if they are no store's."""
+def open_unchecked(url: str, mode: str = "r") -> RunStore:
+    """Open a store that may be damaged; StoreError if its pipeline is lost."""
+    url = checked_url(url)
+    storage = open_storage(url, mode)
+    attributes = read_attributes(url, storage)
     try:
         metadata = run_metadata_in(attributes)
         if metadata["format"] != FORMAT:
@@ -249,6 +173,41 @@ def store_of(
         raise StoreError(not_a_store(url)) from None
 
 
+def read_attributes(url: str, storage: Store) -> dict[str, Any]:
+    """Return the attributes of a storage's root.
+
+    Raises
+    ------
+    StoreError
+        If there are none.
+    """
+    try:
+        root = read_json(storage, "zarr.json") or {}
+        return dict(root["attributes"])
+    except PermissionError as error:
+        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
+    except UNREADABLE:
+        if list_folder(storage, RECEIPTS):
+            raise StoreError(
+                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
+            ) from None
+        raise StoreError(not_a_store(url)) from None
+
+
+def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
+    """Return the run's metadata of a store that may be damaged or of another format.
+
+    Raises
+    ------
+    StoreError
+        If it is not a store.
+    """
+    try:
+        return run_metadata_in(read_attributes(url, storage))
+    except UNREADABLE:
+        raise StoreError(not_a_store(url)) from None
+
+
 def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
     """Create an empty store for a pipeline, its chunks equal to blocks of ``extents``.
 
@@ -258,60 +217,8 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         If nothing can be written there.
     """
     run_id = uuid.uuid4().hex
-    with translate_errors(url, "written"):
-        if is_remote(url):
-            _lay_out(storage_at(f"{url}/{run_id}", read_only=False), pipeline, extents, run_id)
-            # The URL points to it once it is complete.
-            write_document(storage_at(url, read_only=False), "zarr.json", {
-                "zarr_format": 3, "node_type": "group", "attributes": {POINTER: run_id},
-            })
-        else:
-            check_writable(url)
-            _remove_deleted(url)
-            building = _beside(url, "new")
-            try:
-                _lay_out(LocalStore(building), pipeline, extents, run_id)
-                building.rename(Path(url).resolve())
-            except BaseException:
-                _remove_unfinished(building)
-                raise
-    return open_store(url, "r+")
-
-
-def _beside(url: str, ending: str) -> Path:
-    """Return an unused path in the folder of a local store, which may lie behind a link."""
-    path = Path(url).resolve()
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
-
-
-def _remove_deleted(url: str) -> None:
-    """Delete what killed processes left of stores that they were deleting here."""
-    path = Path(url).resolve()
-    for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
-        shutil.rmtree(doomed, ignore_errors=True)
-
-
-def _remove_unfinished(folder: Path) -> None:
-    """Delete a store that could not be created.
-
-    After the first write that fails, Zarr's others go on for a moment and may add files again.
-    """
-    absent = 0
-    for _ in range(50):
-        if folder.exists():
-            shutil.rmtree(folder, ignore_errors=True)
-            absent = 0
-        elif (absent := absent + 1) == 3:
-            return
-        time.sleep(0.02)
-
-
-def _lay_out(storage: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
-    """Write a store's coordinates, its empty arrays, and its attributes."""
-    group = open_group(storage, "w-")
     planned = planned_arrays(pipeline, extents)
-    for array in planned:
-        array.create(group)
+    files = planned_files(planned)
     metadata = {
         "format": FORMAT,
         "name": pipeline.name,
@@ -326,12 +233,39 @@ def _lay_out(storage: Store, pipeline: Pipeline, extents: tuple[int, ...], run_i
         ),
         "created": utc_now(),
         "finished": False,
+        "files": checksums(files),
     }
-    group.attrs.update(root_attributes(pipeline, planned, metadata))
+    root = _sealed(_group_document(root_attributes(pipeline, planned, metadata)))
+    with translate_errors(url, "written"):
+        if is_remote(url):
+            write_files(storage_at(f"{url}/{run_id}", read_only=False), {
+                **files, "zarr.json": encoded(root)})
+            # The URL points to it once it is complete.
+            write_document(
+                storage_at(url, read_only=False), "zarr.json", _group_document({POINTER: run_id}))
+        else:
+            check_writable(url)
+            path = Path(url).resolve()  # a link may lead there
+            for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
+                shutil.rmtree(doomed, ignore_errors=True)  # a killed process began it
+            building = _beside(path, "new")
+            try:
+                write_files(LocalStore(building), {**files, "zarr.json": encoded(root)})
+                building.rename(path)
+            except BaseException:
+                shutil.rmtree(building, ignore_errors=True)
+                raise
+    return open_store(url, "r+")
 
 
-CHECKSUM = "checksum"
-"""Attribute of the root: the CRC-32 of the pipeline's text and of the run's metadata."""
+def _beside(path: Path, ending: str) -> Path:
+    """Return an unused path in the folder of a local store."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
+
+
+CHECKSUM, SEAL = "checksum", "seal"
+"""Attributes of the root: the CRC-32 of the pipeline's text and of the run's metadata, without
+which a store is lost, and that of the whole document, which can be written again."""
 
 
 def root_attributes(
@@ -353,6 +287,23 @@ def root_attributes(
 
 def _checksum(attributes: Mapping[str, Any]) -> str:
     return f"{crc32(attributes['pipeline'].encode() + attributes['sweep'].encode()):08x}"
+
+
+def _group_document(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+
+
+def _sealed(root: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the root's document with the checksum of all else that it holds."""
+    attributes = {name: value for name, value in root["attributes"].items() if name != SEAL}
+    text = json.dumps({**root, "attributes": attributes}, sort_keys=True)
+    return {**root, "attributes": {**attributes, SEAL: f"{crc32(text.encode()):08x}"}}
+
+
+def is_root_sound(store: RunStore) -> bool:
+    """Return whether nothing was changed in the root's document, which has a pipeline."""
+    root = read_json(store.storage, "zarr.json") or {}
+    return root == _sealed(root)
 
 
 def utc_now() -> str:
@@ -378,25 +329,15 @@ def remove_store(url: str) -> None:
             sync(pointer.delete_dir(str(metadata["run_id"])))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
-        doomed = _beside(url, "deleted")
+        path = Path(url).resolve()
+        doomed = _beside(path, "deleted")
         with changing(url, storage):
-            Path(url).resolve().rename(doomed)
+            path.rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
 
-def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
-    """Return the run's metadata of a store that may be damaged or of another format.
-
-    Raises
-    ------
-    StoreError
-        If it is not a store.
-    """
-    try:
-        return run_metadata_in(read_attributes(url, storage))
-    except UNREADABLE:
-        raise StoreError(not_a_store(url)) from None
-
+# --------------------------------------------------------------------------------------------------
+# What readers see of a store: its committed blocks.
 
 POSES_TOGETHER = 1 << 20
 """Poses of a Dask chunk: a task for each block would take longer than reading the block."""
@@ -431,20 +372,15 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     finished = store.finished
     done = check_whole(store, finished=finished)
     try:
-        planned = planned_arrays(store.pipeline, store.blocks.extents)
-        for key, fault in changed_coordinates(store, planned).items():
-            raise StoreError(
-                f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
-            storage = store.storage if finished else as_committed(store, done)
             dataset: xr.Dataset = xr.open_zarr(
-                storage, chunks=None, consolidated=False, zarr_format=3)
+                store.storage, chunks=None, consolidated=False, zarr_format=3)
             if dataset.nbytes <= read_bytes:
                 dataset = dataset.load()
             else:
                 dataset = xr.open_zarr(
-                    storage, chunks=_together(store), consolidated=False, zarr_format=3)
+                    store.storage, chunks=_together(store), consolidated=False, zarr_format=3)
             # Short, and asked for one by one.
             together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
             dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})
@@ -455,19 +391,44 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
         raise StoreError(
             f"{store.url}: damaged ({reason_of(error)}); `sweep verify --repair` repairs it"
         ) from None
+    dataset = dataset.assign_coords(texts)
+    if not finished:
+        dataset = _only_committed(store, dataset, done)
     ordered = [
         each.name for each in (*VARIABLES.values(), *PHOTOGRAPH_SCHEMA)
         if each.name in dataset.data_vars
     ]
-    return with_descriptions(dataset.assign_coords(texts)[ordered])
+    return with_descriptions(dataset[ordered])
+
+
+def _only_committed(
+    store: RunStore, dataset: xr.Dataset, done: Collection[int]
+) -> xr.Dataset:
+    """Return results with fill values in all blocks but those that are ``done``.
+
+    A writer may be at any other block meanwhile, or may have been killed in the midst of one.
+    """
+    import xarray as xr  # noqa: PLC0415  (as above)
+
+    shown = np.zeros(store.blocks.counts, dtype=bool)
+    shown.flat[list(done)] = True
+    for k, (extent, length) in enumerate(
+            zip(store.blocks.extents, store.blocks.lengths, strict=True)):
+        shown = shown.repeat(extent, axis=k).take(range(length), axis=k)
+    mask = xr.DataArray(shown, dims=[axis.name for axis in store.pipeline.experiment.scene_axes])
+    masked = {
+        variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)
+        for variable in store.variables
+    }
+    drawn = masked.keys() & dataset.coords.keys()
+    return dataset.assign({name: values for name, values in masked.items() if name not in drawn}
+                          ).assign_coords({name: masked[name] for name in drawn})
 
 
 # --------------------------------------------------------------------------------------------------
 # The end of a run in its store: groups beside the results, and the mark "finished".
-
-MEASURED = ("cost/tradeoff", "cost/renderers")
-"""Groups within groups that no receipt could restore."""
-
+#
+# Two processes may close a store at once: they write the same files, and delete none.
 
 def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
     """Close a complete store: write its groups, consolidate the metadata, mark it finished."""
@@ -487,15 +448,36 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
         key: value for key, value in store.run_metadata.items()
         if key not in ("finished_at", "counts")
     }
+    files = {key: value for key, value in metadata["files"].items() if not is_of_table(key)}
     with translate_errors(store.url, "written"):
-        write_root(store, {**metadata, "finished": False}, pipeline)
-        for name in ("cost", "failures"):
+        write_root(store, {**metadata, "finished": False, "files": files}, pipeline)
+        for name in TABLES:
             sync(store.storage.delete_dir(name))
 
 
 def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
     """Write a dataset to a group of a finished store, and consolidate the metadata again."""
     _write_groups(store, {name: content}, store.run_metadata)
+
+
+def _write_groups(
+    store: RunStore, groups: Mapping[str, xr.Dataset], metadata: Mapping[str, Any]
+) -> None:
+    memory = MemoryStore()
+    for name, content in groups.items():
+        # Zarr 3 specifies strings of variable length, none of a fixed one.
+        texts = [label for label in content.variables if content[label].dtype.kind == "U"]
+        content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
+            memory, group=name, mode="w", zarr_format=3, consolidated=False,
+            encoding={label: {"compressors": codecs()} for label in content.variables},
+            write_empty_chunks=True,
+        )
+    within = tuple(f"{name}/" for name in groups)
+    files = {key: content for key, content in files_in(memory).items() if key.startswith(within)}
+    with translate_errors(store.url, "written"):
+        sync(store.storage.delete_dir(BEGUN))
+        write_files(store.storage, files)
+        write_root(store, {**metadata, "files": {**metadata["files"], **checksums(files)}})
 
 
 def write_root(
@@ -508,38 +490,18 @@ def write_root(
     """
     pipeline = pipeline or store.pipeline
     planned = planned_arrays(pipeline, store.blocks.extents)
-    root: dict[str, Any] = {
-        "zarr_format": 3, "node_type": "group",
-        "attributes": root_attributes(pipeline, planned, metadata),
-    }
+    root: Mapping[str, Any] = _group_document(root_attributes(pipeline, planned, metadata))
     if metadata["finished"]:
+        memory = MemoryStore()
+        keys = [key for key in metadata["files"] if key.endswith("zarr.json")]
+        documents = zip(keys, read_files(store.storage, keys), strict=True)
+        write_files(memory, {
+            "zarr.json": encoded(root), **{key: content for key, content in documents if content}})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-            zarr.consolidate_metadata(store.storage, zarr_format=3)
-        written = read_json(store.storage, "zarr.json") or {}
-        root["consolidated_metadata"] = written["consolidated_metadata"]
-    # Written last: a kill before it leaves a store that is closed again.
-    write_document(store.storage, "zarr.json", root)
-
-
-def _write_groups(
-    store: RunStore, groups: Mapping[str, xr.Dataset], metadata: Mapping[str, Any]
-) -> None:
-    with translate_errors(store.url, "written"):
-        sync(store.storage.delete_dir(BEGUN))
-        for name, content in groups.items():
-            for child in sync(list_folder(store.storage, name)):
-                if f"{name}/{child}" not in MEASURED:
-                    with contextlib.suppress(ValueError):  # a file, such as the group's zarr.json
-                        sync(store.storage.delete_dir(f"{name}/{child}"))
-            # Zarr 3 specifies strings of variable length, none of a fixed one.
-            texts = [label for label in content.variables if content[label].dtype.kind == "U"]
-            content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
-                store.storage, group=name, mode="a", zarr_format=3, consolidated=False,
-                encoding={label: {"compressors": codecs()} for label in content.variables},
-                write_empty_chunks=True,
-            )
-        write_root(store, metadata)
+            zarr.consolidate_metadata(memory, zarr_format=3)
+        root = read_json(memory, "zarr.json") or root
+    write_document(store.storage, "zarr.json", _sealed(root))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -3,95 +3,39 @@
 from __future__ import annotations
 
 import contextlib
-import gc
-import json
 import os
 import re
 import sys
 import tempfile
 import uuid
-import warnings
-import weakref
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
-from typing import Any, Self
 from urllib.parse import unquote, urlsplit
 
-import numpy as np
 import zarr
 import zarr.errors
 from zarr.abc.store import Store
-from zarr.buffer import default_buffer_prototype
-from zarr.storage import FsspecStore, LocalStore, MemoryStore
+from zarr.storage import FsspecStore, LocalStore
 
 from sweep.errors import StoreError
 from sweep.messages import nearest_file, plain
-from sweep.store.files import delete_files, sync, write_document
+from sweep.store.files import delete_files, write_document
 
-# --------------------------------------------------------------------------------------------------
-# Whether Zarr works as it is configured: what it cannot read is else taken for a damaged store.
 
 def check_zarr() -> None:
-    """Check that Zarr reads what it writes.
-
-    Raises
-    ------
-    StoreError
-        If Python runs without assertions, or the user's configuration of Zarr makes that fail.
-    """
+    """Raise StoreError if Python runs without assertions, which Zarr needs to read groups."""
     if sys.flags.optimize:
         raise StoreError(
             "Zarr cannot read groups where Python leaves out assertions; unset PYTHONOPTIMIZE, and "
             "run Python without -O"
         )
-    if reason := _failure():
-        given = [f"{name}={os.environ[name]}" for name in os.environ if name.startswith("ZARR_")]
-        raise StoreError(plain(
-            f"Zarr does not work with its configuration ({', '.join(given) or '~/.config/zarr'}): "
-            f"{reason}; correct it, or take it away", 600,
-        ))
-
-
-@cache
-def _failure() -> str:
-    """Return why a configuration that is not Zarr's own does not work, empty if it does."""
-    configuration: Any = zarr.config
-    if [configuration.config] == configuration.defaults:
-        return ""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of coroutines that were never begun
-        reason = ""
-        try:
-            _write_and_read()
-        except Exception as error:
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        gc.collect()
-    return reason
-
-
-def _write_and_read() -> None:
-    storage = MemoryStore()
-    group = zarr.create_group(storage, zarr_format=3)
-    numbers = group.create_array("numbers", shape=(4,), chunks=(2,), dtype="float64")
-    texts = group.create_array("texts", shape=(2,), chunks=(1,), dtype=str)
-    numbers[:] = np.arange(4)
-    texts[:] = np.array(["a", "b"], dtype=object)
-    document = sync(storage.get("zarr.json", default_buffer_prototype()))
-    json.loads(document.to_bytes() if document is not None else b"")
-    again = zarr.open_group(storage, mode="r", zarr_format=3)
-    for name, wanted in (("numbers", [0, 1, 2, 3]), ("texts", ["a", "b"])):
-        array = again[name]
-        if not isinstance(array, zarr.Array) or np.asarray(array[:]).tolist() != wanted:
-            raise ValueError(f"an array of {name} is read with other values than it was written")
 
 
 # --------------------------------------------------------------------------------------------------
 # Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
 #
-# No path is written by two runs. On this machine, a run holds its store by the folder that it
-# opened, wherever that is moved; a remote store's data lie under the run's id, to which the
-# store's URL points.
+# A remote store's data lie under the run's id, to which the store's URL points, so that no key is
+# written by two runs.
 
 POINTER = "sweep_run"
 """Attribute at a remote store's URL: the id of the run whose data are the store's."""
@@ -253,9 +197,6 @@ def exists(url: str) -> bool:
 def open_storage(url: str, mode: str = "r") -> Store:
     """Return the storage that holds a store's files.
 
-    With ``mode`` "r+" a local store is held by its folder: writes go to that folder even if
-    another store has since taken its path.
-
     Raises
     ------
     StoreError
@@ -269,10 +210,7 @@ def open_storage(url: str, mode: str = "r") -> Store:
     try:
         if not Path(url).is_dir():
             raise StoreError(not_a_store(url))
-        if mode == "r" or not Path("/proc/self/fd").is_dir():
-            return storage_at(url, read_only=mode == "r")
-        check_zarr()
-        return _HeldStore(_HeldFolder(url))
+        return storage_at(url, read_only=mode == "r")
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
 
@@ -286,26 +224,6 @@ def _similar(url: str) -> str:
         if similar := nearest_file(url) or nearest_file(Path("runs") / Path(url).name):
             return similar
     return "; create one with `sweep run`"
-
-
-class _HeldFolder:
-    """A folder that is held open as long as this object lives."""
-
-    def __init__(self, path: str) -> None:
-        self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        weakref.finalize(self, os.close, self.descriptor)
-
-
-class _HeldStore(LocalStore):
-    """A local storage that holds its folder."""
-
-    def __init__(self, folder: _HeldFolder, *, read_only: bool = False) -> None:
-        super().__init__(f"/proc/self/fd/{folder.descriptor}", read_only=read_only)
-        self._folder = folder
-
-    def with_read_only(self, read_only: bool = False) -> Self:
-        """Return the same folder's storage, to be read only."""
-        return type(self)(self._folder, read_only=read_only)
 
 
 def enclosing_store(path: Path) -> Path | None:

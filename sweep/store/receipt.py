@@ -105,16 +105,21 @@ class Receipt:
         return packed(struct.pack("<II", 1, len(text)) + text)
 
     @classmethod
-    def from_bytes(cls, chunk: bytes) -> Receipt:
+    def from_bytes(cls, chunk: bytes | None) -> Receipt:
         """Return the receipt that a chunk holds.
 
         Raises
         ------
-        ValueError, RuntimeError, TypeError, KeyError
-            If it fails its checksum, or holds something else.
+        ValueError
+            If the chunk is missing, fails its checksum, or holds something else.
         """
-        content = json.loads(unpacked(chunk)[8:])
-        failures = tuple(FailedCell(**failure) for failure in content["failures"])
-        return cls(**content | {
-            "processors": tuple(content["processors"]), "failures": failures,
-        })
+        if chunk is None:
+            raise ValueError("missing")
+        try:
+            content = json.loads(unpacked(chunk)[8:])
+            failures = tuple(FailedCell(**failure) for failure in content["failures"])
+            return cls(**content | {
+                "processors": tuple(content["processors"]), "failures": failures,
+            })
+        except (AttributeError, KeyError, TypeError, RuntimeError) as error:
+            raise ValueError(f"no receipt: {error}") from None

@@ -2,19 +2,21 @@
 
 import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from zarr.storage import MemoryStore
 
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
+from sweep.store.files import files_in, write_files
 from sweep.store.lifecycle import create_store, open_store, remove_store
-from sweep.store.lock import changing, closing, is_written, writing
+from sweep.store.lock import changing, is_written, writing
 
 TEXT = "axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40"
 
@@ -33,8 +35,6 @@ def store(pipeline, tmp_path, monkeypatch):
 def test_writers_exclude_nobody_who_writes_and_refuse_all_changes(store, pipeline):
     with writing(store.url, store.storage), writing(store.url, store.storage):
         assert status(store.url).being_written
-        with closing(store.url, store.storage):
-            pass
         for change in (
             lambda: remove_store(store.url), lambda: drop_failed(store),
             lambda: execute(pipeline, store.url, overwrite=True),
@@ -55,22 +55,52 @@ def test_one_process_changes_a_store_and_others_are_refused(store):
                 pass
 
 
-def test_a_store_is_closed_by_one_process_after_another(store):
-    held, order = threading.Event(), []
+@pytest.fixture
+def another_storage(monkeypatch):
+    """A storage that is no folder of this machine, as an object store's."""
+    monkeypatch.setattr(locks, "SILENCE_S", 0.6)
+    return MemoryStore()
 
-    def first():
-        with closing(store.url, store.storage):
-            held.set()
-            time.sleep(0.1)
-            order.append("first")
 
-    thread = threading.Thread(target=first)
-    thread.start()
-    held.wait()
-    with closing(store.url, store.storage):
-        order.append("second")
-    thread.join()
-    assert order == ["first", "second"]
+def test_keys_of_an_object_store_are_renewed_exclude_and_go(another_storage):
+    with writing("s3://a", another_storage), writing("s3://a", another_storage):
+        time.sleep(1.0)  # they would be out of date
+        assert is_written(another_storage)
+        with pytest.raises(StoreError, match="is writing it"), changing("s3://a", another_storage):
+            pass
+    assert not is_written(another_storage)
+    with changing("s3://a", another_storage):
+        for other in (writing, changing):
+            with pytest.raises(StoreError, match="is writing it"), other("s3://a", another_storage):
+                pass
+    assert files_in(another_storage) == {}
+
+
+def test_the_key_of_a_process_that_was_killed_is_free_after_a_while(another_storage):
+    write_files(another_storage, {f"{locks.CHANGE}dead": str(time.time()).encode()})
+    assert is_written(another_storage)
+    time.sleep(0.7)
+    with changing("s3://a", another_storage):
+        pass
+
+
+def test_of_many_changes_of_an_object_store_at_once_one_at_most_is_inside(another_storage):
+    inside, most, refused = [], [], []
+
+    def change(number):
+        try:
+            with changing("s3://a", another_storage):
+                inside.append(number)
+                most.append(len(inside))
+                time.sleep(0.01)
+                inside.remove(number)
+        except StoreError:
+            refused.append(number)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(change, range(40)))
+    assert max(most, default=1) == 1
+    assert len(most) + len(refused) == 40
 
 
 def test_the_lock_of_a_process_that_was_killed_is_free_at_once(store):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from sweep.store.lifecycle import CHECKSUM, _checksum
+from sweep.store.lifecycle import CHECKSUM, _checksum, _sealed
 
 
 def files(url):
@@ -48,7 +48,7 @@ def edit_root(url, change):
     attributes["sweep"] = json.dumps(metadata)
     if isinstance(attributes["pipeline"], str):
         attributes[CHECKSUM] = _checksum(attributes)
-    path.write_text(json.dumps(root))
+    path.write_text(json.dumps(_sealed(root)))
 
 
 def editable(url, name):

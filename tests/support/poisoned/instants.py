@@ -23,7 +23,6 @@ from sweep.execution.status import close
 from sweep.experiment.grid import block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import closing as alone
 
 PATIENCE_S = 300
 
@@ -39,8 +38,7 @@ def closing(url, file, number):
     """Close one of several complete stores, as a run does."""
     del file
     store = open_store(f"{url}/{number}.zarr", "r+")
-    with alone(store.url, store.storage):
-        close(store)
+    close(store)
 
 
 def creating(url, file, number):

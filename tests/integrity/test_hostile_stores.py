@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-import zarr
 
 import sweep
 from support.store_files import edit_receipt, edit_root

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     from sweep.analysis.dataset import decode_flags
     from sweep.diagnosis.detection import DetectionModel
-    from sweep.execution.cluster import Cluster
+    from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.folders import FittedScene

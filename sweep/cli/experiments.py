@@ -229,7 +229,8 @@ def plan(options: argparse.Namespace) -> int:
         say(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
     say("\nExpected")
     over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
-    how = "in one process" if expected.small else f"with {expected.workers} workers"
+    most = "at most " if pipeline.stopping is not None else ""
+    how = "in one process" if expected.workers == 1 else f"with {expected.workers} workers"
     rows = {
         "poses": _poses_plan(pipeline, expected),
         "results": f"{expected.results:,}" if pipeline.stopping is None else (
@@ -238,17 +239,16 @@ def plan(options: argparse.Namespace) -> int:
         "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
         "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled{ended})",
-        "time": f"{over}{duration(expected.seconds)} {how}",
+        "time": f"{most}{over}{duration(expected.seconds)} {how}",
     }
     for name, text in rows.items():
         say(f"  {name:8} {text}")
-    for line in _pilot_lines(pipeline, expected):
-        say(f"  {line}")
     demand = library.forecast.Demand(
         expected.seconds, expected.workers, expected.bytes, expected.files
     )
     refused = library.forecast.objections(
-        demand, library.forecast.free_disk(f"runs/{pipeline.name}.zarr")
+        demand, library.forecast.free_disk(f"runs/{pipeline.name}.zarr"),
+        up_to=pipeline.stopping is not None,
     )
     for line in refused:
         say(f"warning: the run {line}")
@@ -268,28 +268,11 @@ def _rule_lines(rule: StoppingRule) -> list[str]:
 
 
 def _poses_plan(pipeline: Pipeline, expected: Forecast) -> str:
-    """Return how many poses a run computes; to a precision, about how many."""
+    """Return how many poses a run computes; in waves, how many at least and at most."""
     if pipeline.stopping is None:
         return f"{expected.poses:,}"
-    if expected.pilot is None:
-        return f"at most {expected.poses:,}"
-    likely = float(f"{expected.pilot.share * expected.poses:.2g}")
-    return f"about {likely:,.0f} of at most {expected.poses:,}"
-
-
-def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:
-    """Return what a pilot says of a run to a precision, or why there is none."""
-    rule, pilot = pipeline.stopping, expected.pilot
-    if rule is None:
-        return []
-    if pilot is None:
-        return ["how many poses are needed was not tried, poses take too long"]
-    trials = pilot.share * rule.max_trials
-    lines = [f"about {trials:,.0f} trials a condition, by a pilot of {pilot.conditions} of them"]
-    if pilot.unsettled:
-        lines.append(f"about {100 * pilot.unsettled:.2g} % of the conditions need more than "
-                     f"{rule.max_trials:,} trials")
-    return lines
+    least = round(expected.least_share * expected.poses)
+    return f"at least {least:,}, at most {expected.poses:,}"
 
 
 # --------------------------------------------------------------------------------------------------

@@ -1,4 +1,8 @@
-"""Runs on a Dask cluster: blocks, calibration, reuse, progress, status and forecasts."""
+"""Runs: blocks in processes or on a Dask cluster, reuse, progress, status and forecasts."""
 
 BLOCK_TASK = "sweep.execution.block_task"
 """What a child process imports that measures scenes and computes blocks."""
+
+TIME_LIMIT_S = 600.0
+"""Block timeout in seconds, more if blocks are long (`sweep.execution.forecast.MAX_BLOCK_SHARE`);
+the search for a scene that never returns keeps within it."""

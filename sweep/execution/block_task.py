@@ -18,7 +18,7 @@ from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
 from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
-from sweep.execution.limits import TIME_LIMIT_S
+from sweep.execution import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage, lacking_plugins

@@ -13,33 +13,16 @@ from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreError
-from sweep.evaluation.block import compute_block, run_cells
-from sweep.execution.limits import (
-    BLOCK_S,
-    BLOCKS_PER_S,
-    BLOCKS_PER_WORKER,
-    MAX_BLOCK_BYTES,
-    MAX_BLOCK_S,
-    MAX_BLOCK_SCENES,
-    MAX_BLOCK_SHARE,
-    MAX_BLOCKS,
-    MIN_BLOCK_S,
-    PLAN_EFFECTS_S,
-    PLAN_SCENES_S,
-    SMALL_RUN_S,
-    TIME_LIMIT_S,
-    TIMING_LIMIT_S,
-    TIMING_S,
-    WAVE_BLOCK_S,
-)
+from sweep.evaluation.block import run_cells
+from sweep.execution import TIME_LIMIT_S
+from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, Blocks
+from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs, shows_photographs
 from sweep.experiment.pipeline import Pipeline
@@ -48,20 +31,21 @@ from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedErro
 from sweep.isolation.machine import default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
-from sweep.sampling.rules import (
-    GroupResults,
-    Stopping,
-    block_unit,
-    condition_axes,
-    in_order_of_results,
-    make_rule,
-)
+from sweep.sampling.rules import Stopping, block_unit, make_rule
 from sweep.store.blocks import RunStore, receipts
 from sweep.store.locations import is_remote
-from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # What a scene takes: a seeded random batch of scenes is timed in a child process.
+
+TIMING_S = 0.2
+"""Seconds of the batch of scenes that is timed before blocks are cut."""
+
+TIMING_LIMIT_S = 5.0
+"""Seconds after which it is abandoned: it is known by then that blocks are small."""
+
+TIMING_SHARE = 1 / 8
+"""Share of a block's time limit after which it is, too."""
 
 MAX_BATCH = 1536
 """Most scenes of a batch."""
@@ -75,8 +59,8 @@ COMPILATION_LIMIT_S = 900.0
 UNMEASURED_S = 0.01
 """Assumed cost of a scene if the measurement crashed."""
 
-MIN_ROUNDS = 3
-"""How often pipelines are timed at least that are compared."""
+ROUNDS = 3
+"""How often pipelines are timed that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +74,7 @@ class Timing:
     sampled
         Scenes that were timed.
     over
-        Whether these took too long and were abandoned: a scene takes more than ``scene_s``.
+        Whether these took too long and were abandoned: a scene takes about ``scene_s`` or more.
     """
 
     scene_s: float
@@ -98,9 +82,7 @@ class Timing:
     over: bool = False
 
 
-def seconds_of(
-    pipelines: Sequence[Pipeline], count: int, budget_s: float = 0.0
-) -> tuple[list[float], int]:
+def seconds_of(pipelines: Sequence[Pipeline], count: int) -> tuple[list[float], int]:
     """Return the seconds that each pipeline takes for the same scenes, and the number of scenes.
 
     Seconds are those of this thread, since others use the processors meanwhile, and compilation
@@ -112,13 +94,10 @@ def seconds_of(
         Pipelines of the same grid.
     count
         Scenes of the sample; of photographs all markers of one.
-    budget_s
-        Seconds in which further turns begin.
     """
     indices = _sample(pipelines[0], count)
     spent: list[list[float]] = []
-    rounds = MIN_ROUNDS if len(pipelines) > 1 else 1
-    while len(spent) < rounds or sum(map(sum, spent)) < budget_s:
+    for _ in range(ROUNDS if len(pipelines) > 1 else 1):
         spent.append([])
         for pipeline in pipelines:
             begun, compiled = time.thread_time(), compilation_s()
@@ -126,7 +105,7 @@ def seconds_of(
             took_s = time.thread_time() - begun - (compilation_s() - compiled)
             spent[-1].append(max(took_s, 1e-9))
     number = len(indices[0]) if indices else 1
-    return [statistics.median(each) for each in zip(*spent, strict=True)], number
+    return [statistics.median(times) for times in zip(*spent, strict=True)], number
 
 
 def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
@@ -142,33 +121,39 @@ def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
     return [grid.ravel().astype(np.intp) for grid in np.meshgrid(*each, indexing="ij")]
 
 
-def measure(
-    child: Child, pipeline: Pipeline, budget_s: float = TIMING_S, limit_s: float = TIMING_LIMIT_S
-) -> Timing:
-    """Time a batch of scenes in a child process, for about ``budget_s`` seconds.
+def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
+    """Time a batch of scenes for about ``budget_s`` seconds.
 
     One scene is computed first, so that code is compiled and caches are filled; batches grow until
-    one takes as long. A batch that takes longer than ``limit_s`` is abandoned, and the child ends.
+    one takes as long.
+    """
+    seconds_of([pipeline], 1)
+    count = 1
+    while True:
+        (spent_s,), sampled = seconds_of([pipeline], count)
+        wanted = min(int(budget_s * sampled / spent_s), MAX_BATCH)
+        if wanted <= 2 * count:
+            return Timing(spent_s / sampled, sampled)
+        count = min(wanted, GROWTH * count)
+
+
+def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -> Timing:
+    """Time a batch of scenes in a child process, which ends if that takes too long.
 
     Raises
     ------
     ChildDiedError, ChildRaisedError
         If a scene crashes the child, or raises.
     """
-    count, warm = 1, False
-    while True:
-        try:
-            (spent_s,), sampled = child.call(
-                seconds_of, [pipeline], count, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
-        except ChildDiedError as error:
-            if not error.timed_out:
-                raise
-            return Timing(limit_s / count, count, over=True)
-        scene_s = spent_s / sampled
-        wanted = min(int(budget_s / scene_s), MAX_BATCH)
-        if warm and wanted <= 2 * count:
-            return Timing(scene_s, sampled)
-        count, warm = min(max(wanted, 1), GROWTH * count) if warm else 1, True
+    try:
+        timing: Timing = child.call(
+            timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
+    except ChildDiedError as error:
+        child.restart()
+        if not error.timed_out:
+            raise
+        return Timing(limit_s, 1, over=True)
+    return timing
 
 
 def measured_or_assumed(child: Child, pipeline: Pipeline, limit_s: float) -> Timing:
@@ -177,13 +162,42 @@ def measured_or_assumed(child: Child, pipeline: Pipeline, limit_s: float) -> Tim
     Also if this machine is at fault: whether the workers' are is seen by their blocks.
     """
     try:
-        return measure(child, pipeline, limit_s=min(limit_s, TIMING_LIMIT_S))
+        return measure(child, pipeline, limit_s)
     except (ChildDiedError, ChildRaisedError, MachineFaultError):
         return Timing(UNMEASURED_S, 0)
 
 
 # --------------------------------------------------------------------------------------------------
 # The blocks of a run: about two seconds of work each.
+
+BLOCK_S = 2.0
+"""Work in a block of most runs: a lost block costs its work."""
+
+MIN_BLOCK_S = 0.1
+
+WAVE_BLOCK_S = 0.5
+"""Least work in a block of a run in waves, if all its scenes are needed: soon few of them are."""
+
+BLOCKS_PER_S = 75
+"""Blocks that all workers together finish in a second: a scheduler does about 180 of them, so that
+larger clusters get larger blocks."""
+
+MAX_BLOCKS = 100_000
+"""Blocks of a run, of about 25 files each: longer runs get larger blocks."""
+
+MAX_BLOCK_S = 3600.0
+"""Work that a block takes at most: jobs of clusters end after hours, and lose a block each. A
+run of 11 years of one processor has 100,000 of these; longer ones have more."""
+
+MAX_BLOCK_SHARE = 1 / 10
+"""Share of a block's time limit that its work is to take: scenes may cost more than was measured.
+A time limit that the user gives bounds the work; else the work raises the limit."""
+
+BLOCKS_PER_WORKER = 6
+"""With little work, blocks are cut smaller so that every worker has some until the end."""
+
+MAX_BLOCK_BYTES = 256_000_000
+MAX_BLOCK_SCENES = 200_000
 
 LARGER = 1.2
 """By how much blocks are made larger until there are few enough."""
@@ -289,163 +303,6 @@ def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int,
 
 
 # --------------------------------------------------------------------------------------------------
-# What a run in waves will need, from a small pilot: some conditions, their first wave.
-#
-# The trials of the pilot are drawn again (the bootstrap) in the place of those to come, and the
-# rule of stopping is applied wave by wave. So it is one method for every rule.
-
-PILOT_S = 3.0
-"""Seconds in which a pilot computes poses."""
-
-PILOT_LIMIT_S = 8.0
-"""Seconds after which a pilot is ended: its rule may be slow to decide."""
-
-MAX_CONDITIONS = 40
-"""Conditions of the pilot; pooled cells are a condition together."""
-
-MAX_VALUES = 20_000_000
-"""Values of a variable that are simulated: with many trials or configurations, fewer conditions."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pilot:
-    """What a run in waves is expected to need.
-
-    Attributes
-    ----------
-    conditions
-        Conditions that were sampled.
-    share
-        Share of the grid's poses that is needed.
-    unsettled
-        Share of the conditions that need more than ``max_trials``.
-    """
-
-    conditions: int
-    share: float
-    unsettled: float
-
-
-def pilot(pipeline: Pipeline, scene_s: float, budget_s: float) -> Pilot | None:
-    """Compute the first wave of some conditions and return what a run is expected to need.
-
-    Parameters
-    ----------
-    pipeline
-        One with a rule of stopping.
-    scene_s
-        Seconds that a scene takes.
-    budget_s
-        Seconds of computation; None is returned if they are too short for one condition.
-    """
-    whole = make_rule(pipeline)
-    if whole is None:
-        raise TypeError(pipeline.stopping)
-    pooled = math.prod(
-        len(axis) for axis in condition_axes(pipeline) if axis.name in whole.coupled)
-    most = min(
-        budget_s / (scene_s * whole.ends[0] * pooled), MAX_CONDITIONS,
-        MAX_VALUES / (whole.ends[-1] * pooled * pipeline.size(Stage.detection, Stage.estimation)),
-    )
-    if most < 1:
-        return None
-    part = _part(pipeline, whole, int(most))
-    rule = make_rule(part)
-    if rule is None:
-        raise TypeError(part.stopping)
-    trials, mask = _simulated(part, rule, _first_wave(part, rule))
-    coupled = tuple(
-        k for k, axis in enumerate(condition_axes(part)) if axis.name in rule.coupled)
-    unsettled = mask.any(axis=coupled)
-    return Pilot(unsettled.size, float(trials.mean()) / rule.ends[-1], float(unsettled.mean()))
-
-
-def pilot_in(child: Child, pipeline: Pipeline, scene_s: float, budget_s: float) -> Pilot | None:
-    """Return a pilot that is made in a child process; None also if its rule takes too long.
-
-    Raises
-    ------
-    ChildDiedError, ChildRaisedError
-        If a scene crashes the process, or raises.
-    """
-    try:
-        found: Pilot | None = child.call(
-            pilot, pipeline, scene_s, budget_s, limit_s=PILOT_LIMIT_S, grace_s=COMPILATION_LIMIT_S)
-    except ChildDiedError as error:
-        child.restart()
-        if not error.timed_out:
-            raise
-        return None
-    return found
-
-
-def _part(pipeline: Pipeline, rule: Stopping, most: int) -> Pipeline:
-    """Return a pipeline with some values of the axes that are not coupled, evenly spread."""
-    counts = {axis.name: len(axis) for axis in condition_axes(pipeline)
-              if axis.name not in rule.coupled}
-    while math.prod(counts.values()) > most:
-        longest = max(counts, key=lambda name: counts[name])
-        counts[longest] -= 1
-    return dataclasses.replace(pipeline, axes=tuple(
-        _some(axis, counts[axis.name]) if axis.name in counts else axis for axis in pipeline.axes
-    ))
-
-
-def _some(axis: Axis, count: int) -> Axis:
-    """Return an axis with so many of its values: the middles of equal parts."""
-    chosen = [int((k + 0.5) * len(axis) / count) for k in range(count)]
-
-    def taken(values: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(values[k] for k in chosen)
-
-    return dataclasses.replace(
-        axis, values=taken(axis.values),
-        zipped=tuple((name, taken(values)) for name, values in axis.zipped),
-    )
-
-
-def _first_wave(pipeline: Pipeline, rule: Stopping) -> dict[str, NDArray[Any]]:
-    """Return the results of the first wave of all conditions."""
-    axes = pipeline.experiment.scene_axes
-    block = Block((0,) * len(axes), tuple(
-        rule.ends[0] if axis.name == TRIAL else len(axis) for axis in axes))
-    values = compute_block(pipeline, block)
-    return {
-        variable.name: in_order_of_results(pipeline, variable, values[variable.name])
-        for variable in pipeline.experiment.variables
-        if variable.name in {"detection", *rule.variables}
-    }
-
-
-def _simulated(
-    pipeline: Pipeline, rule: Stopping, first: dict[str, NDArray[Any]]
-) -> tuple[Floats, Masks]:
-    """Return the trials that each scene needs, and which need more; over the condition axes."""
-    names = [axis.name for axis in condition_axes(pipeline)]
-    shape, along = tuple(len(axis) for axis in condition_axes(pipeline)), len(names)
-    generator = np.random.Generator(np.random.PCG64(0))
-    drawn = generator.integers(0, rule.ends[0], rule.ends[-1])
-    drawn[: rule.ends[0]] = np.arange(rule.ends[0])
-    variables = {variable.name: variable for variable in pipeline.experiment.variables}
-    values = {name: np.take(array, drawn, axis=along) for name, array in first.items()}
-    trials = np.full(shape, float(rule.ends[0]))
-    mask = np.ones(shape, dtype=bool)
-    for wave in range(1, len(rule.ends) + 1):
-        done = rule.ends[wave - 1]
-        results = GroupResults(
-            pipeline, (0,) * along, shape, wave, done,
-            {name: np.take(values[name], range(done), axis=along) for name in rule.variables},
-        )
-        mask = np.array(rule.needed(results), dtype=bool)
-        if wave == len(rule.ends) or not mask.any():
-            break
-        trials[mask] += rule.ends[wave] - done
-        for name, array in values.items():
-            array[~mask, done : rule.ends[wave]] = variables[name].not_needed
-    return trials, mask
-
-
-# --------------------------------------------------------------------------------------------------
 # Time and disk of a run, which is refused if it takes longer than a day, or more than the disk has.
 
 MAX_S = 86_400.0
@@ -498,19 +355,23 @@ def free_disk(url: str) -> FreeDisk | None:
 
 
 def demand_of(
-    pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int, share: float = 1.0
+    pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int
 ) -> Demand:
-    """Return what the ``left`` of a run's blocks take, if a share of their poses is needed.
+    """Return what the ``left`` of a run's blocks take.
 
     A block has a file for each variable, and its receipt.
     """
-    poses = math.ceil(share * pipeline.size(Stage.scene) * left / max(blocks, 1))
+    poses = math.ceil(pipeline.size(Stage.scene) * left / max(blocks, 1))
     files = left * (len(pipeline.experiment.variables) + 1)
     return Demand(poses * scene_s / workers, workers, bytes_per_block(pipeline, poses), files)
 
 
-def objections(demand: Demand, free: FreeDisk | None) -> list[str]:
+def objections(
+    demand: Demand, free: FreeDisk | None, *, up_to: bool = False
+) -> list[str]:
     """Return why a run has to be confirmed; nothing if it need not be.
+
+    ``up_to``: the demand is the most that it may take.
 
     Examples
     --------
@@ -519,10 +380,10 @@ def objections(demand: Demand, free: FreeDisk | None) -> list[str]:
     >>> objections(Demand(60, 2, 10**9, 9), FreeDisk(10**12, None))
     []
     """
-    found = []
+    found, about = [], "up to" if up_to else "about"
     if demand.seconds > MAX_S:
         workers = f"{demand.workers} worker{'s' if demand.workers > 1 else ''}"
-        found.append(f"takes about {duration(demand.seconds)} with {workers}")
+        found.append(f"takes {about} {duration(demand.seconds)} with {workers}")
     if free is not None and demand.bytes > free.bytes:
         found.append(
             f"writes {byte_count(demand.bytes)} before compression, and {byte_count(free.bytes)} "
@@ -534,21 +395,14 @@ def objections(demand: Demand, free: FreeDisk | None) -> list[str]:
 
 
 def check_affordable(
-    url: str, pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int,
-    child: Child,
+    url: str, pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int
 ) -> None:
     """Raise StoreError if the ``left`` of a run's blocks have to be confirmed.
 
-    A run whose sampling stops is judged by a pilot, if all its poses were too many.
+    A run whose sampling stops is judged by all its trials: how many it needs, nobody knows.
     """
-    run = pipeline, scene_s, workers, blocks, left
-    found = objections(demand_of(*run), free_disk(url))
-    if found and pipeline.stopping is not None:
-        with contextlib.suppress(ChildDiedError, ChildRaisedError):
-            expected = pilot_in(child, pipeline, scene_s, PILOT_S)
-            if expected is not None:
-                found = objections(demand_of(*run, expected.share), free_disk(url))
-    if found:
+    demand = demand_of(pipeline, scene_s, workers, blocks, left)
+    if found := objections(demand, free_disk(url), up_to=pipeline.stopping is not None):
         raise StoreError(
             f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
             "`--yes` (in Python, yes=True)"
@@ -567,17 +421,18 @@ def scene_s_of(store: RunStore, done: AbstractSet[int], timing: Timing | None = 
 # --------------------------------------------------------------------------------------------------
 # The forecast of a run: blocks, bytes, memory and time, and what each effect costs.
 
+PLAN_SCENES_S = 1.5
+"""Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes."""
+
+PLAN_EFFECTS_S = 1.5
+"""Seconds of a forecast in which effects are measured."""
+
 EFFECT_SCENES = 24
 """Most scenes on which effects are measured."""
 
-PILOT_SHARE = 0.6
-"""Share of the time for effects in which a pilot computes poses."""
-
-START_S = 3.0
+START_S = 1.5
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
 
-SMALL_START_S = 1.2
-"""The same of a small run, which is computed in one child process without a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -591,19 +446,16 @@ class Forecast:
     block, blocks, files
         Scenes of a block along each scene axis; number of blocks, and of the files that they make.
     bytes, worker_bytes
-        Size of the store before compression; memory of a worker. Of a run to a precision, files and
-        bytes are those of the poses that a pilot expects to be needed.
+        Size of the store before compression; memory of a worker.
     pose_s, sampled
         Mean seconds a pose, all configurations included; scenes that were measured.
     over
         Whether the measurement was abandoned: a pose takes more than ``pose_s``.
     workers, seconds
         Number of workers, and how long they would take.
-    small
-        Whether the run is so small that one process computes it, without a cluster.
-    pilot
-        Of a run to a precision, what it is expected to need of the poses, after which ``seconds``
-        are estimated; None of a run of fixed trials, or if poses take too long for a pilot.
+    least_share
+        Share of the poses that is computed in any case: of a run in waves the first wave. All else
+        is that of all poses.
     """
 
     poses: int
@@ -618,8 +470,7 @@ class Forecast:
     over: bool
     workers: int
     seconds: float
-    small: bool
-    pilot: Pilot | None = None
+    least_share: float = 1.0
 
 
 def forecast(
@@ -646,31 +497,25 @@ def forecast(
     RunError
         If a measured scene crashes its process, or raises.
     """
-    count = default_workers() if workers is None else workers
-    if count < 1:
+    if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
     costs: dict[str, float] = {}
-    expected: Pilot | None = None
     try:
         with Child("sweep.execution.forecast") as child:
-            timing = measure(child, pipeline, limit_s=PLAN_SCENES_S)
-            left_s = PLAN_EFFECTS_S
-            if not timing.over and pipeline.stopping is not None:
-                expected = pilot_in(child, pipeline, timing.scene_s, PILOT_SHARE * left_s)
-                left_s *= 1 - PILOT_SHARE
+            timing = measure(child, pipeline, PLAN_SCENES_S)
             if not timing.over and switches:
-                costs = _effect_costs(child, pipeline, switches, timing.scene_s, left_s)
+                costs = _effect_costs(child, pipeline, switches, timing.scene_s)
     except (ChildDiedError, ChildRaisedError) as error:
         raise RunError(
             f"a measured scene crashed its process ({last_line(error)}); `sweep run` isolates it "
             "and computes the others"
         ) from None
-    poses = pipeline.size(Stage.scene)
-    share = 1.0 if expected is None else expected.share
-    small = workers is None and share * poses * timing.scene_s < SMALL_RUN_S
-    blocks = blocks_of(pipeline, timing.scene_s, 1 if small else count)
-    busy = 1 if small else min(count, default_workers(), len(blocks))
-    demand = demand_of(pipeline, timing.scene_s, busy, len(blocks), len(blocks), share)
+    poses, least = pipeline.size(Stage.scene), least_share(pipeline)
+    small = workers is None and least * poses * timing.scene_s < SMALL_RUN_S
+    count = workers or (1 if small else default_workers())
+    blocks = blocks_of(pipeline, timing.scene_s, count)
+    busy = min(count, default_workers(), len(blocks))
+    demand = demand_of(pipeline, timing.scene_s, busy, len(blocks), len(blocks))
     # The child ended: its memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     return Forecast(
@@ -685,14 +530,19 @@ def forecast(
         sampled=timing.sampled,
         over=timing.over,
         workers=count,
-        seconds=(SMALL_START_S if small else START_S) + demand.seconds,
-        small=small,
-        pilot=expected,
+        seconds=START_S + demand.seconds,
+        least_share=least,
     ), costs
 
 
+def least_share(pipeline: Pipeline) -> float:
+    """Return the share of the poses that is computed in any case: in waves, that of the first."""
+    rule = make_rule(pipeline)
+    return 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
+
+
 def _effect_costs(
-    child: Child, pipeline: Pipeline, switches: Sequence[str], pose_s: float, budget_s: float
+    child: Child, pipeline: Pipeline, switches: Sequence[str], pose_s: float
 ) -> dict[str, float]:
     """Return the seconds that each effect adds to a pose; none if poses take too long.
 
@@ -700,12 +550,12 @@ def _effect_costs(
     each charged with all of it.
     """
     variants = [pipeline, *(without_effect(pipeline, switch) for switch in switches)]
-    count = min(int(budget_s / (len(variants) * MIN_ROUNDS * pose_s)), EFFECT_SCENES)
+    count = min(int(PLAN_EFFECTS_S / (len(variants) * ROUNDS * pose_s)), EFFECT_SCENES)
     if count < 1:
         return {}
     try:
         spent, number = child.call(
-            seconds_of, variants, count, budget_s, limit_s=2 * budget_s,
+            seconds_of, variants, count, limit_s=2 * PLAN_EFFECTS_S,
             grace_s=COMPILATION_LIMIT_S)
     except ChildDiedError as error:
         if not error.timed_out:

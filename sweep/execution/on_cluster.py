@@ -1,49 +1,271 @@
-"""Blocks on a Dask cluster: how many are out, which worker computes which, and when to give up."""
+"""Blocks on a Dask cluster: a scheduler's address, or the caller's own client or cluster."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import logging
+import os
+import socket
 import time
-import uuid
-from collections import Counter, defaultdict
-from collections.abc import Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
-from distributed import Client, Future, KilledWorker
+from distributed import Client, KilledWorker, Security, get_worker
+from distributed.core import rpc
 
-from sweep.errors import MachineFaultError, RunError, StoreReplacedError
-from sweep.evaluation.machine_faults import machine_fault
+from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
+from sweep.evaluation.machine_faults import exception_line, machine_fault
 from sweep.execution.block_task import compute_blocks
-from sweep.execution.cluster import WorkerState, worker_states, worker_that_failed
-from sweep.execution.engines import Again, Engine, Failed
-from sweep.execution.limits import (
-    BLOCKS_PER_THREAD,
-    FAULT_WINDOW,
-    MAX_ATTEMPTS,
-    MAX_DEATHS,
-    MAX_WORKER_FAULTS,
-    NO_WORKERS_TIMEOUT_S,
-    STALL_S,
-    THREAD_COUNT_INTERVAL_S,
-    THREAD_COUNT_TIMEOUT_S,
-    TIME_LIMIT_S,
-)
-from sweep.execution.progress import Work
+from sweep.execution.executors import MAX_ATTEMPTS, Executor, Failed
+from sweep.experiment.parameters import lacking_plugins
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.machine import ADVICE
 from sweep.messages import notice
-from sweep.store.blocks import RunStore
+from sweep.processor import differing_processors, processor
+from sweep.store.provenance import changes, fingerprint
 from sweep.store.receipt import Receipt
 
-UNKNOWN = "unknown"
-"""In place of the address of a worker that the scheduler does not tell."""
+# --------------------------------------------------------------------------------------------------
+# The client of a cluster whose workers make the same numbers as this process.
+#
+# The caller's client or cluster is only used; no client here becomes Dask's default.
+
+ANSWER_S = 10.0
+"""How long a scheduler may take to answer."""
+
+WORKERS_S = 60.0
+"""How long a run waits for a first worker, for all workers' versions, for which they import this
+package, and after the last worker left."""
 
 
-class OnCluster(Engine[Future[Any]]):
+@runtime_checkable
+class Cluster(Protocol):
+    """A cluster object: LocalCluster, SLURMCluster, KubeCluster, ..."""
+
+    @property
+    def scheduler_address(self) -> str:
+        """The address of its scheduler."""
+
+
+@contextlib.contextmanager
+def connected(
+    pipeline: Pipeline, scheduler: str | None, client: Client | Cluster | None
+) -> Iterator[OnCluster]:
+    """Return what computes on a cluster.
+
+    Parameters
+    ----------
+    pipeline
+        What is to be computed.
+    scheduler
+        Address of a running scheduler.
+    client
+        Without one, the caller's client, which stays open, or cluster object.
+
+    Raises
+    ------
+    ArgumentError
+        If the cluster cannot be used: it does not answer or refuses, has no workers, or a worker
+        has other versions; each within a bounded time.
+    """
+    with contextlib.ExitStack() as stack:
+        if scheduler is not None:
+            argument, name = "scheduler", scheduler
+            stack.enter_context(silenced_dask_loggers())
+            connection = stack.enter_context(_client_of(scheduler))
+        else:
+            argument, name = "client", _name(client)
+            connection = _borrowed(client, name, stack)
+        check_workers(connection, pipeline, argument, name)
+        yield OnCluster(connection)
+
+
+def _client_of(address: str) -> Client:
+    """Return a client that the caller closes.
+
+    If the address begins with ``tls://``, Dask's own configuration names the certificates.
+    """
+    try:
+        parts = urlsplit(address)
+        if not (parts.scheme and parts.hostname and parts.port):
+            raise ValueError(address)
+    except ValueError:
+        raise ArgumentError(
+            "scheduler", address, "expected an address such as tcp://host:8786") from None
+    try:
+        # Dask's client waits without end for a handshake, so that comes first, and alone; in a
+        # thread, since the caller may be in an event loop, as notebooks are.
+        with ThreadPoolExecutor(1) as thread:
+            kind = thread.submit(asyncio.run, _kind_of_server(address)).result()
+        if kind != "Scheduler":
+            reason = f"a {kind} answers there, not a scheduler"
+        else:
+            return Client(address, timeout=ANSWER_S, set_as_default=False)
+    except TimeoutError:
+        reason = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
+    except Exception as error:
+        reason = f"cannot connect: {exception_line(error)}"
+    raise ArgumentError("scheduler", address, reason)
+
+
+async def _kind_of_server(address: str) -> str:
+    """Return the type of server at an address: Scheduler, Worker, Nanny."""
+    options = Security().get_connection_args("client")
+    async with asyncio.timeout(ANSWER_S), rpc(
+        address, timeout=2 * ANSWER_S, connection_args=options
+    ) as server:
+        return str((await server.identity())["type"])
+
+
+def _borrowed(
+    client: Client | Cluster | None, name: str, stack: contextlib.ExitStack
+) -> Client:
+    """Return the caller's client, or a new client of the caller's cluster object."""
+    if not isinstance(client, (Client, Cluster)):
+        raise ArgumentError(
+            "client", client,
+            "expected a distributed.Client or a cluster object such as LocalCluster; "
+            "the address of a scheduler is given as scheduler",
+        )
+    if getattr(client, "asynchronous", False):
+        raise ArgumentError("client", name, "it is asynchronous; expected one that is not")
+    state = getattr(client, "status", "running")
+    state = getattr(state, "name", state)
+    if state in ("closing", "closed", "failed"):
+        raise ArgumentError("client", name, f"it is {state}")
+    if isinstance(client, Client):
+        return client
+    try:
+        own: Client = stack.enter_context(
+            Client(client, timeout=ANSWER_S, set_as_default=False))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ArgumentError("client", name, f"cannot connect: {error}") from None
+    return own
+
+
+def _name(client: object) -> str:
+    """Return what a message calls a client or cluster: its type, and the scheduler's address."""
+    scheduler = getattr(client, "scheduler", None)
+    address = getattr(scheduler, "address", getattr(client, "scheduler_address", None))
+    return f"{type(client).__name__}({address})"
+
+
+class WorkerIdentity(NamedTuple):
+    """What the numbers of a process depend on, and which process it is."""
+
+    versions: dict[str, Any]
+    process: tuple[str, int]
+    lacking_plugins: list[str]
+    processor: str
+
+
+def worker_identity(pipeline: Pipeline) -> WorkerIdentity:
+    """Return what numbers depend on in this process."""
+    return WorkerIdentity(
+        fingerprint(pipeline), (socket.gethostname(), os.getpid()),
+        lacking_plugins(pipeline.plugins, pipeline.folder), processor(),
+    )
+
+
+def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) -> None:
+    """Check that workers have this process's versions and files, and are other processes.
+
+    A line says if their processors have different features, which the last bits of results, and
+    some corners by whole pixels, depend on. A worker that does not answer in time is not checked:
+    each compares its versions with the store's when it gets its first block.
+
+    Raises
+    ------
+    ArgumentError
+        If a worker cannot compute the pipeline as this process would, or none answers.
+    """
+    own = worker_identity(pipeline)
+    try:
+        # A task that any worker may take, so that a cluster that adapts to work starts one.
+        first = client.submit(os.getpid, pure=False)
+        first.result(timeout=WORKERS_S)
+        asked = {
+            worker: client.submit(worker_identity, pipeline, workers=[worker], pure=False)
+            for worker in client.nthreads()
+        }
+        identities: dict[str, WorkerIdentity] = {}
+        deadline = time.monotonic() + WORKERS_S
+        for worker, answer in asked.items():
+            with contextlib.suppress(TimeoutError):
+                identities[worker] = answer.result(timeout=max(deadline - time.monotonic(), 0.1))
+    except TimeoutError:
+        raise ArgumentError(
+            argument, name, f"no workers within {WORKERS_S:.0f} s; start some") from None
+    except Exception as error:
+        raise ArgumentError(
+            argument, name, f"its workers cannot run sweep: {exception_line(error)}") from None
+    if any(worker.process == own.process for worker in identities.values()):
+        raise ArgumentError(
+            argument, name,
+            "its workers are threads of this process, which a scene may end; "
+            "start it with processes=True",
+        )
+    lines = [
+        f"  {address}: {line}"
+        for address, worker in sorted(identities.items())
+        for line in (
+            *(f"{key} {theirs}, here {ours}" for key, theirs, ours in changes(
+                {"builds": {}, **worker.versions}, own.versions)),
+            *worker.lacking_plugins,
+        )
+    ]
+    if lines:
+        raise ArgumentError(
+            argument, name,
+            "workers with other versions; install the same everywhere\n" + "\n".join(lines),
+        )
+    used = Counter(worker.processor for worker in identities.values())
+    for line in differing_processors(used, "workers"):
+        notice(f"warning: {line}")
+
+
+@contextlib.contextmanager
+def silenced_dask_loggers() -> Iterator[None]:
+    """Silence the loggers of Dask while the body runs: this package's errors say what matters."""
+    names = [name for name in list(logging.Logger.manager.loggerDict)
+             if name.partition(".")[0] in ("distributed", "tornado", "asyncio")]
+    before = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in before:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in before.items():
+            logger.setLevel(level)
+
+
+# --------------------------------------------------------------------------------------------------
+# Blocks on the cluster: how many are out, which worker computes which, and when to give up.
+
+BLOCKS_PER_THREAD = 3
+"""Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
+
+MAX_WORKER_FAULTS = 3
+"""Blocks in a row that a worker fails and others compute, after which it is used no more."""
+
+LOOK_S, LOOK_LIMIT_S = 1.0, 2.0
+"""How often the scheduler is asked what workers it has, and how long a run waits for the answer."""
+
+SILENCE_S = 60.0
+"""How long no block may be finished before a line says so."""
+
+AWAY = "the scheduler went away"
+
+
+class OnCluster(Executor):
     """Computes blocks on a cluster.
 
     A block whose worker dies, or whose worker's machine is at fault, is given to others. A worker
-    that often fails what others compute is retired.
+    that fails what others compute is retired.
 
     Parameters
     ----------
@@ -51,174 +273,149 @@ class OnCluster(Engine[Future[Any]]):
         The cluster's client.
     """
 
-    def __init__(
-        self, store: RunStore, client: Client, sources: Sequence[str] = (),
-        time_limit_s: float = TIME_LIMIT_S,
-    ) -> None:
-        super().__init__(store, sources, time_limit_s)
+    def __init__(self, client: Client) -> None:
         self._client = client
-        self._deaths: Counter[int] = Counter()
-        self._faults = WorkerFaults(client)
-        self._states: dict[str, WorkerState] = {}
+        self._states: dict[str, dict[str, Any]] = {}
+        self._faults: Counter[str] = Counter()
+        self._retired: set[str] = set()
         self._asked = 0.0
         self._usable = self._last_block = time.monotonic()
-        self._next_line_s = STALL_S
+        self._next_line_s = SILENCE_S
+        self._look()
+
+    @property
+    def threads(self) -> int:  # type: ignore[override]
+        """Threads of the cluster's workers, which may come and go."""
+        return max(sum(int(state["nthreads"]) for state in self._states.values()), 1)
+
+    def _look(self) -> None:
+        """Ask the scheduler for its workers."""
+        try:
+            if self._client.scheduler is None or self._client.status != "running":
+                raise ConnectionError(AWAY)
+            identity = self._client.sync(
+                self._client.scheduler.identity, n_workers=-1, callback_timeout=LOOK_LIMIT_S)
+            self._states = {worker: state for worker, state in identity["workers"].items()
+                            if worker not in self._retired}
+        except TimeoutError:
+            pass  # it is busy
+        except OSError:
+            raise RunError(AWAY) from None
+        self._asked = time.monotonic()
+        if any(state["status"] != "paused" for state in self._states.values()):
+            self._usable = self._asked
 
     def room(self) -> int:
-        """Return a few blocks for each thread of the cluster, which may grow and shrink.
+        """Return a few blocks for each thread of the cluster.
 
         Raises
         ------
         RunError
-            If the scheduler went away, or no worker has computed or could compute for a minute.
+            If the scheduler went away, or no worker has been able to compute for a minute.
         """
-        now = time.monotonic()
-        if now > self._asked + THREAD_COUNT_INTERVAL_S:
-            try:
-                self._states = worker_states(self._client, THREAD_COUNT_TIMEOUT_S)
-            except TimeoutError:
-                pass  # it is busy
-            except OSError:
-                raise RunError("the scheduler went away") from None
-            self._asked = now
-            if any(state.status != "paused" for state in self._states.values()):
-                self._usable = now
-        if now > self._usable + NO_WORKERS_TIMEOUT_S:
-            paused = f": {self._workers()}" if self._states else "; start some"
-            raise RunError(f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s{paused}")
-        return BLOCKS_PER_THREAD * max(sum(each.threads for each in self._states.values()), 1)
-
-    def check(self) -> None:
-        """Say once in a while that no block is finished, and what the workers do."""
-        self.room()
-        silent_s = time.monotonic() - self._last_block
-        if silent_s >= self._next_line_s:
-            self._next_line_s *= 2
-            notice(
-                f"no block was finished for {silent_s:.0f} s: {len(self.out)} are with "
-                f"{self._workers()}; a block ends after at most {self.time_limit_s:.0f} s"
-            )
+        if time.monotonic() > self._asked + LOOK_S:
+            self._look()
+        if self._asked > self._usable + WORKERS_S:
+            raise RunError(f"there have been no workers for {WORKERS_S:.0f} s: {self._workers()}")
+        return BLOCKS_PER_THREAD * self.threads
 
     def _workers(self) -> str:
-        """Return how many workers there are, and how many of them Dask has paused."""
-        paused = sum(state.status == "paused" for state in self._states.values())
-        line = f"{len(self._states)} workers"
-        return line if not paused else (
-            f"{line}, {paused} of them paused by Dask because of their memory "
-            "(`dask worker --memory-limit`)")
+        paused = sum(state["status"] == "paused" for state in self._states.values())
+        return f"{len(self._states)} workers" + (
+            f", {paused} of them paused by Dask because of their memory "
+            "(`dask worker --memory-limit`)" if paused else "")
 
-    def submit(self, arguments: tuple[Any, ...], others: Sequence[str]) -> Future[Any]:
-        """Give blocks to the cluster: to one of ``others``, unless they leave meanwhile."""
-        (block, *_) = arguments[2]
-        future = self._client.submit(
-            compute_blocks, *arguments, pure=False, key=f"block-{block}-{uuid.uuid4().hex[:8]}",
-            workers=list(others) or None, allow_other_workers=bool(others),
+    def check(self, out: int, limit_s: float) -> None:
+        """Say once in a while that no block is finished, and what the workers do."""
+        silent_s = time.monotonic() - self._last_block
+        if silent_s < self._next_line_s:
+            return
+        self._next_line_s *= 2
+        notice(f"no block was finished for {silent_s:.0f} s: {out} are with {self._workers()}; "
+               f"a block ends after at most {limit_s:.0f} s")
+
+    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+        """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
+        del limit_s
+        others = self._others({each.worker for each in failures}) if failures else []
+        return self._client.submit(
+            on_worker, compute_blocks, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
+            workers=others or None, allow_other_workers=bool(others),
         )
-        future.add_done_callback(self.finished.put)
-        return future
 
-    def result(self, done: Future[Any], work: Work) -> list[Receipt] | Failed | Again:
+    def _others(self, failed_on: Collection[str]) -> list[str]:
+        left = [worker for worker in self._states if worker not in failed_on]
+        hosts = {urlsplit(worker).hostname for worker in failed_on}
+        return [each for each in left if urlsplit(each).hostname not in hosts] or left
+
+    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
         """Return the receipts; what died, or a machine failed, is given to other workers."""
-        number = work.numbers[0]
         try:
-            if done.status == "finished":
-                self._last_block, self._next_line_s = time.monotonic(), STALL_S
-                self._faults.computed(number, len(self._states.keys() - self._faults.retired))
-                try:
-                    receipts: list[Receipt] = done.result()
-                except OSError:  # they come through the scheduler
-                    raise RunError("the scheduler went away") from None
-                return receipts
-            # "lost": the worker died after it committed the block, and its receipt died with it.
-            lost = done.status == "lost" and self._client.status == "running"
-            if not lost and done.status in ("cancelled", "lost"):
-                raise RunError("the scheduler went away")
-            error = None if lost else done.exception()
-            if isinstance(error, StoreReplacedError):
-                raise error
-            if lost or isinstance(error, KilledWorker):
-                # A block that ends its process is computed in isolation when it is begun again,
-                # but it may have been queued behind one, or its workers were killed from outside.
-                self._deaths[number] += 1
-                if self._deaths[number] <= MAX_DEATHS:
-                    return Again()
-                return Failed(
-                    "its workers died again and again; their logs may tell why; if memory ran out, "
-                    f"{ADVICE}", machine_fault=True)
-            fault = None if error is None else machine_fault(error)
-            if fault is None:
-                return Failed(f"{type(error).__name__}: {error}")
-            others = self._faults.others(number, str(done.key), fault)
-            return Again(others) if others else Failed(str(fault), machine_fault=True)
+            if future.status == "finished":
+                worker, result = future.result()  # it comes through the scheduler
+            else:
+                worker, result = "", self._error(future)
+        except OSError:
+            raise RunError(AWAY) from None
         finally:
-            done.release()
+            future.release()
+        if isinstance(result, StoreReplacedError):
+            raise result
+        if result is None or isinstance(result, KilledWorker):
+            # A block that ends its process is computed in isolation when it is begun again, but
+            # it may have been queued behind one, or its workers were killed from outside.
+            return Failed(
+                "its workers died again and again; their logs may tell why; if memory ran out, "
+                f"{ADVICE}", machine_fault=True, tries=MAX_ATTEMPTS)
+        if isinstance(result, BaseException):
+            fault = machine_fault(result)
+            if fault is None:
+                return Failed(f"{type(result).__name__}: {result}")
+            left = self._others({*(each.worker for each in failures), worker})
+            return Failed(str(fault), True, MAX_ATTEMPTS if left else 1, worker)
+        self._last_block, self._next_line_s = time.monotonic(), SILENCE_S
+        self._faults[worker] = 0
+        for failed in failures:
+            if failed.worker not in ("", worker):
+                self._blame(failed)
+        receipts: list[Receipt] = result
+        return receipts
 
-    def end(self) -> None:
-        """Take back what is still out; a caller's cluster outlives the run."""
-        if self.out and self._client.status == "running":
-            with contextlib.suppress(OSError, TimeoutError):
-                self._client.cancel(list(self.out))
-        self.out.clear()
+    def _error(self, future: Any) -> BaseException | None:
+        """Return why a future has no result; None if its worker died with its receipt."""
+        if future.status == "lost" and self._client.status == "running":
+            return None
+        if future.status in ("cancelled", "lost"):
+            raise ConnectionError(AWAY)
+        error: BaseException | None = future.exception()
+        return error
 
-
-class WorkerFaults:
-    """Counts faults of machines by worker: those that fail what others compute are retired.
-
-    :data:`~sweep.execution.limits.MAX_WORKER_FAULTS` are too many, while each worker computes about
-    :data:`~sweep.execution.limits.FAULT_WINDOW` blocks. The last worker stays. ``retired`` are the
-    addresses of those that went; the scheduler may list them for a while.
-    """
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._failed_on: defaultdict[int, list[str]] = defaultdict(list)
-        self._blamed: Counter[str] = Counter()
-        self._computed = 0
-        self._last: dict[str, MachineFaultError] = {}
-        self.retired: set[str] = set()
-
-    def others(self, number: int, key: str, fault: MachineFaultError) -> list[str]:
-        """Note that a block failed; return the workers that may compute it, empty if none is left.
-
-        Workers of machines that did not fail it come before others.
-        """
-        worker = worker_that_failed(self._client, key) or UNKNOWN
-        failed_on = self._failed_on[number]
-        failed_on.append(worker)
-        self._last[worker] = fault
-        try:
-            workers = worker_states(self._client, THREAD_COUNT_TIMEOUT_S)
-        except (OSError, TimeoutError):
-            return []
-        machines = {_machine(failed) for failed in failed_on}
-        left = [each for each in workers if each not in failed_on]
-        if len(failed_on) >= MAX_ATTEMPTS:
-            return []
-        return [each for each in left if _machine(each) not in machines] or left
-
-    def computed(self, number: int, workers: int) -> None:
-        """Note that a block was computed by one of so many workers; retire those that failed it."""
-        self._computed += 1
-        if self._computed % (FAULT_WINDOW * max(workers, 1)) == 0:
-            self._blamed.clear()
-        for worker in set(self._failed_on.pop(number, ())) - {UNKNOWN} - self.retired:
-            self._blamed[worker] += 1
-            if self._blamed[worker] >= MAX_WORKER_FAULTS and workers > 1:
-                del self._blamed[worker]
-                self._retire(worker)
-                return
-
-    def _retire(self, worker: str) -> None:
-        self.retired.add(worker)
-        fault = self._last[worker]
-        notice(
-            f"worker {worker} on {fault.machine} is used no more: {MAX_WORKER_FAULTS} blocks that "
-            f"it failed were computed by others; the last fault: {fault.fault}"
-        )
+    def _blame(self, failed: Failed) -> None:
+        """Count a block that a worker failed and another computed; retire it if they are many."""
+        worker = failed.worker
+        self._faults[worker] += 1
+        if (self._faults[worker] < MAX_WORKER_FAULTS or worker not in self._states
+                or len(self._states) == 1):
+            return
+        self._retired.add(worker)
+        del self._states[worker]
+        notice(f"worker {worker} is used no more: {MAX_WORKER_FAULTS} blocks that it failed were "
+               f"computed by others; the last fault: {failed.reason}")
         with contextlib.suppress(OSError, TimeoutError):
             self._client.retire_workers([worker], close_workers=True)
 
+    def cancel(self, out: Collection[Any]) -> None:
+        """Take back what is still out; a caller's cluster outlives the run."""
+        if out and self._client.status == "running":
+            with contextlib.suppress(OSError, TimeoutError):
+                self._client.cancel(list(out))
 
-def _machine(worker: str) -> str:
-    """Return the host of a worker's address."""
-    return urlsplit(worker).hostname or worker
+
+def on_worker(
+    compute: Callable[..., list[Receipt]], arguments: tuple[Any, ...]
+) -> tuple[str, list[Receipt] | MachineFaultError]:
+    """Compute blocks on a worker; return its address, and receipts or its machine's fault."""
+    try:
+        return get_worker().address, compute(*arguments)
+    except MachineFaultError as fault:
+        return get_worker().address, fault

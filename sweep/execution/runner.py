@@ -11,8 +11,8 @@ import time
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
@@ -23,18 +23,20 @@ from sweep.errors import (
     StoreError,
     StoreReplacedError,
 )
-from sweep.execution import BLOCK_TASK
-from sweep.execution.engines import InChild
+from sweep.execution import BLOCK_TASK, TIME_LIMIT_S
+from sweep.execution.executors import SMALL_RUN_S, Children, Executor
 from sweep.execution.forecast import (
+    TIMING_LIMIT_S,
+    TIMING_SHARE,
     Timing,
     block_time_limit_s,
     blocks_of,
     check_affordable,
+    least_share,
     measured_or_assumed,
     scene_s_of,
 )
-from sweep.execution.limits import SMALL_RUN_S, TIME_LIMIT_S, TIMING_SHARE
-from sweep.execution.progress import AnyOrder, InWaves, ProgressReport, Tally, Waiting
+from sweep.execution.progress import ProgressReport, Tally
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.status import (
     Retry,
@@ -45,12 +47,14 @@ from sweep.execution.status import (
     summary_of,
     summary_of_complete,
 )
+from sweep.execution.waves import InWaves, Waiting, Work, waiting_blocks
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import MAX_TRIALS
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
+from sweep.isolation.machine import default_workers
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
@@ -69,7 +73,7 @@ from sweep.store.provenance import differences
 if TYPE_CHECKING:
     from distributed import Client
 
-    from sweep.execution.cluster import Cluster
+    from sweep.execution.on_cluster import Cluster
 
 
 # --------------------------------------------------------------------------------------------------
@@ -124,9 +128,6 @@ def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
 
-# `sweep.execution.cluster` and `on_cluster` are imported where they are used: Dask is slow to
-# import, and finished stores and small runs need none of it.
-
 
 def execute(
     pipeline: Pipeline,
@@ -153,14 +154,14 @@ def execute(
     store
         Path or URL of the store (default: ``runs/NAME.zarr``).
     workers
-        Processes of the embedded cluster (default: the available processors, or a single child
-        process and no cluster where :data:`SMALL_RUN_S` seconds of work are left).
+        Processes on this machine (default: the available processors, or a single one where less
+        than :data:`SMALL_RUN_S` seconds of work are left).
     scheduler
-        Address of a running Dask scheduler, in place of the embedded cluster. Its workers must
-        reach the store under the same path.
+        Address of a running Dask scheduler, whose workers compute instead. They must reach the
+        store under the same path.
     client
-        A ``distributed.Client`` or cluster object, in place of the embedded cluster; a client
-        stays open.
+        A ``distributed.Client`` or cluster object, whose workers compute instead; a client stays
+        open.
     reuse
         Stores whose finished cells are reused where their parameters agree.
     overwrite
@@ -196,18 +197,18 @@ def execute(
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
-    unfinished = _store_to_continue(url, pipeline, overwrite)
-    again = set(failed_blocks(unfinished)) if retry_failed and unfinished is not None else set()
-    stricter = unfinished is not None and unfinished.pipeline.stopping != pipeline.stopping
-    if unfinished is not None and unfinished.finished and not (again or stricter):
-        return summary_of_complete(unfinished, started)
+    begun = _store_to_continue(url, pipeline, overwrite)
+    again = set(failed_blocks(begun)) if retry_failed and begun is not None else set()
+    stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
+    if begun is not None and begun.finished and not (again or stricter):
+        return summary_of_complete(begun, started)
     for line in pipeline.facts.notes:
         notice(line)
-    if unfinished is not None and is_written(unfinished.storage):
+    if begun is not None and is_written(begun.storage):
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
-    done = set() if unfinished is None else committed(unfinished) - again
-    if unfinished is None:
+    done = set() if begun is None else committed(begun) - again
+    if begun is None:
         check_writable(url)
 
     with contextlib.ExitStack() as stack:
@@ -215,52 +216,46 @@ def execute(
         thread = stack.enter_context(ThreadPoolExecutor(1))
         child = child or Child(BLOCK_TASK)
         stack.callback(child.close)  # the thread waits for it
+        remote = scheduler is not None or client is not None
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
-
         timing: Timing | None = None
-        measuring: Future[Timing] | None = None
         if not done:
-            limit_s = TIMING_SHARE * (time_limit_s or TIME_LIMIT_S)
+            limit_s = min(TIMING_SHARE * (time_limit_s or TIME_LIMIT_S), TIMING_LIMIT_S)
             measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
-        connection: Client | None = None
-        embedded = workers is None and scheduler is None and client is None
-        if embedded and measuring is not None:
             timing = interrupts.await_result(measuring)
-        if not (embedded and _work_s(pipeline, unfinished, done, timing) < SMALL_RUN_S):
-            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+        large = workers is not None or _work_s(pipeline, begun, done, timing) >= SMALL_RUN_S
+        executor: Executor
+        if remote:
+            from sweep.execution.on_cluster import connected  # noqa: PLC0415  (slow to import)
 
-            # Scenes are timed while the workers' processes start.
-            connection = stack.enter_context(
-                connected(pipeline, workers=workers, scheduler=scheduler, client=client)
-            )
-        if timing is None and measuring is not None:
-            timing = interrupts.await_result(measuring)
-        threads = 1 if connection is None else _thread_count(connection)
-        if unfinished is None:
+            executor = stack.enter_context(connected(pipeline, scheduler, client))
+        else:
+            count = workers or default_workers()
+            executor = stack.enter_context(Children(child, count, at_once=large))
+        if begun is None:
             if timing is None:
                 raise AssertionError(url)
-            blocks = blocks_of(pipeline, timing.scene_s, threads, block_s, time_limit_s)
+            blocks = blocks_of(
+                pipeline, timing.scene_s, executor.threads, block_s, time_limit_s)
             scene_s = timing.scene_s
         else:
-            blocks, scene_s = unfinished.blocks, scene_s_of(unfinished, done, timing)
+            blocks, scene_s = begun.blocks, scene_s_of(begun, done, timing)
         if not (yes or sources):
             left = len(blocks) - len(done)
-            check_affordable(url, pipeline, scene_s, threads, len(blocks), left, child)
-        if unfinished is None:
+            check_affordable(url, pipeline, scene_s, executor.threads, len(blocks), left)
+        if begun is None:
             if overwrite and exists(url):
                 remove_store(url)
-            unfinished = create_store(url, pipeline, blocks.extents)
+            begun = create_store(url, pipeline, blocks.extents)
         retry = Retry()
         if stricter:
-            unfinished = tighten(unfinished, pipeline)
+            begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
-            unfinished, retry = drop_failed(unfinished)
-        limit_s = block_time_limit_s(time_limit_s, scene_s * len(unfinished.blocks[0]))
+            begun, retry = drop_failed(begun)
+        limit_s = block_time_limit_s(time_limit_s, scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
-            computed = _compute_and_close(
-                unfinished, child, connection, sources, limit_s, interrupts, progress
-            )
+            computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
     return summary_of(open_store(url), computed, time.perf_counter() - started, retry)
 
 
@@ -279,21 +274,15 @@ def recompute(
         If blocks failed.
     """
     _check_arguments(workers, None, None, None, time_limit_s)
-    chosen = list(numbers)
-    with contextlib.ExitStack() as stack:
-        interrupts = stack.enter_context(Interrupts())
-        child = stack.enter_context(Child(BLOCK_TASK))
-        connection: Client | None = None
-        each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
-        if workers is not None or each_s * len(chosen) >= SMALL_RUN_S:
-            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
-
-            connection = stack.enter_context(connected(store.pipeline, workers=workers))
-        with _continuable_errors():
-            _compute(
-                store, _waiting(store, chosen), Tally(store), child, connection, (),
-                block_time_limit_s(time_limit_s, each_s), interrupts,
-            )
+    each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
+    waiting = waiting_blocks(store, numbers)
+    with (
+        Interrupts() as interrupts, Child(BLOCK_TASK) as child,
+        Children(child, workers or default_workers(), at_once=workers is not None) as executor,
+        _continuable_errors(),
+    ):
+        limit_s = block_time_limit_s(time_limit_s, each_s)
+        compute(store, waiting, Tally(store, waiting), executor, (), limit_s, interrupts)
 
 
 def _check_arguments(
@@ -354,42 +343,55 @@ def _work_s(
         return (len(blocks) - len(done)) * each_s
     if timing is None:
         return math.inf
-    rule = make_rule(pipeline)
-    share = 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
-    return share * pipeline.size(Stage.scene) * timing.scene_s
+    return least_share(pipeline) * pipeline.size(Stage.scene) * timing.scene_s
 
 
-def _thread_count(client: Client) -> int:
-    from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
-
-    return max(thread_count(client), 1)
-
-
-# In the child, or on the cluster
+# The blocks, and the end
 
 
 def _compute_and_close(
-    store: RunStore, child: Child, client: Client | None, sources: Sequence[str],
-    time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
+    store: RunStore, executor: Executor, sources: Sequence[str], time_limit_s: float,
+    interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
-        tally = Tally(store, progress)
-        left = (number for number in range(len(store.blocks)) if number not in done)
-        waiting: Waiting = AnyOrder(left)
-        if (sampling := make_rule(store.pipeline)) is not None and store.pipeline.stopping:
-            waiting = InWaves(store, store.pipeline.stopping, sampling)
-            done = waiting.current
-            tally.watch(waiting)
-        tally.begin(done)
-        _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
+        waiting = waiting_blocks(
+            store, (number for number in range(len(store.blocks)) if number not in done))
+        tally = Tally(store, waiting, progress)
+        tally.begin(waiting.current if isinstance(waiting, InWaves) else done)
+        compute(store, waiting, tally, executor, sources, time_limit_s, interrupts)
         _check_same_rule(store)
         if not store.finished:  # by another process that wrote it, too
             close(store)
     return tally.computed
+
+
+def compute(
+    store: RunStore, waiting: Waiting, tally: Tally, executor: Executor, sources: Sequence[str],
+    time_limit_s: float, interrupts: Interrupts,
+) -> None:
+    """Compute the blocks that wait, and count them.
+
+    Raises
+    ------
+    RunError
+        If blocks failed, or nothing can be computed any more.
+    StoreReplacedError
+        If the store was moved, deleted or replaced.
+    """
+    url = absolute_url(store.url)
+
+    def task(work: Work) -> tuple[Any, ...]:
+        blocks = [store.blocks[number] for number in work.numbers]
+        return (url, store.run_id, blocks, work.decision, sources, time_limit_s, tally.quota())
+
+    with contextlib.closing(executor.map(waiting, task, time_limit_s, interrupts)) as results:
+        for work, result in results:
+            tally.add(work, result)
+    tally.check()
 
 
 def _check_same_rule(store: RunStore) -> None:
@@ -410,34 +412,6 @@ def _committed_whole(store: RunStore) -> set[int]:
         for number in missing:
             drop_block(store, store.blocks[number])
     return done - missing.keys()
-
-
-def _waiting(store: RunStore, numbers: Sequence[int]) -> Waiting:
-    """Return chosen blocks of a store in the order in which they can be computed."""
-    sampling = make_rule(store.pipeline)
-    if sampling is None or store.pipeline.stopping is None:
-        return AnyOrder(numbers)
-    return InWaves(store, store.pipeline.stopping, sampling, only=set(numbers))
-
-
-def _compute(
-    store: RunStore, waiting: Waiting, tally: Tally, child: Child, client: Client | None,
-    sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
-) -> None:
-    """Compute blocks on a cluster; without one in the child, as long as that is quick."""
-    with contextlib.ExitStack() as stack:
-        if client is None:
-            InChild(store, child, sources, time_limit_s).run(waiting, tally, interrupts)
-            following = waiting.next()
-            if following is None:
-                return
-            waiting.put_back(following)
-            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
-
-            client = stack.enter_context(connected(store.pipeline))
-        from sweep.execution.on_cluster import OnCluster  # noqa: PLC0415  (slow to import)
-
-        OnCluster(store, client, sources, time_limit_s).run(waiting, tally, interrupts)
 
 
 @contextlib.contextmanager

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.evaluation.block import bound_notes
-from sweep.execution.progress import InWaves, condition_count, sampled_conditions
+from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.axes import Axis
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import DetectionStatus, EstimateStatus, looked_for
 from sweep.processor import differing_processors
-from sweep.sampling.rules import make_rule
 from sweep.store.blocks import (
     RunStore,
     check_not_replaced,
@@ -62,10 +61,10 @@ def close(store: RunStore) -> None:
     cells: list[FailedCell] = []
     kept: Counter[str] = Counter()
     counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
-    needed: dict[int, int] = {}
+    needed = 0
     processors: Counter[str] = Counter()
     for number, receipt in receipts(store, done):
-        needed[number] = receipt.scenes_needed
+        needed += receipt.scenes_needed
         processors.update(receipt.processors)
         if receipt.seconds["scene"]:
             blocks.append((number, receipt.seconds))
@@ -77,10 +76,12 @@ def close(store: RunStore) -> None:
             if kept[cell.kind] <= MAX_ROWS:
                 cells.append(cell)
     failures = failure_table(cells, lost(counts["detection"], counts["estimate"]))
-    sampled = sampled_conditions(store, needed)
     recorded: dict[str, Any] = {**counts, "processors": dict(processors)}
-    if sampled is not None:
-        recorded["sampled"] = sampled.to_json()
+    if store.pipeline.stopping is not None:
+        recorded["sampled"] = {
+            "needed": needed, "conditions": condition_count(store.pipeline),
+            "unsettled": unsettled_count(store),
+        }
     finish(store, {"cost": _cost(store, blocks), "failures": failures}, recorded)
 
 
@@ -330,7 +331,7 @@ def summary_of(
 
 
 def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
-    """Return lines on the conditions that would need more than ``max_trials``; often none.
+    """Return a line on the conditions that would need more than ``max_trials``, if there are any.
 
     A search says itself what it does not know.
     """
@@ -338,15 +339,8 @@ def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
     if not count or rule is None or not rule.precision:
         return []
     of = f"{count:,} of {sampled['conditions']:,}"
-    lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]
-    reached = sampled["reached"]
-    lines += [
-        f"  {at or 'all poses together'}{': ' if text else ''}{text}"
-        for at, text in zip(sampled["at"], reached, strict=False)
-    ]
-    if count > len(reached):
-        lines.append(f"  and {count - len(reached):,} more")
-    return lines
+    return [(f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials; "
+             "the report's table of precision names them")]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -491,14 +485,12 @@ def status(url: str) -> Status:
 
 def _settled(store: RunStore) -> int | None:
     """Return how many conditions need no more trials; None of a run of fixed trials."""
-    rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
-    if rule is None or sampling is None:
+    if store.pipeline.stopping is None:
         return None
     count = condition_count(store.pipeline)
     if store.finished and (sampled := store.run_metadata["counts"].get("sampled")):
         return count - int(sampled["unsettled"])
-    waves = InWaves(store, rule, sampling)
-    return int(waves.settled / waves.cells * count)
+    return int(InWaves(store).settled_share * count)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.results import CellsResult, to_dataset_layout
-from sweep.execution.limits import TIME_LIMIT_S
-from sweep.execution.progress import InWaves
+from sweep.execution import TIME_LIMIT_S
+from sweep.execution.waves import InWaves
 from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
@@ -173,7 +173,7 @@ def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport
     numbers = range(len(store.blocks))
     if rule is None or sampling is None or not all(number in sound for number in numbers):
         return
-    current = InWaves(store, rule, sampling).current
+    current = InWaves(store).current
     report.damage += [
         Damage(f"block {store.blocks[number]}", "was computed for other results of earlier trials",
                number)

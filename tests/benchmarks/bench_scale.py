@@ -35,10 +35,11 @@ from distributed import Client, Worker
 
 import sweep
 from sweep.execution import on_cluster
-from sweep.execution.cluster import QUIET_DASK_CONFIG
 from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
+from sweep.execution.runner import compute
 from sweep.execution.status import close, status
+from sweep.execution.waves import AnyOrder
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
@@ -66,7 +67,10 @@ trial = {trials}
 """
 
 MONITORS = {
-    **QUIET_DASK_CONFIG,
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.cycle": "3s",
+    "distributed.scheduler.active-memory-manager.start": False,
     "distributed.admin.system-monitor.interval": "600s",
     "distributed.worker.memory.monitor-interval": "600s",
 }
@@ -199,8 +203,9 @@ def measured(store, client, block_s, interrupts, scheduler):
             halfway.extend([scheduler.memory_info().rss, client_process.memory_info().rss])
 
     begun = time.perf_counter()
-    on_cluster.OnCluster(store, client, (), block_s).run(
-        range(number), Tally(store, report), interrupts)
+    waiting = AnyOrder(range(number))
+    compute(store, waiting, Tally(store, waiting, report), on_cluster.OnCluster(client), (),
+            block_s, interrupts)
     wall = time.perf_counter() - begun
     after = [process.memory_info().rss for process in (scheduler, client_process)]
     found = [receipt for _, receipt in receipts(store, range(number))]
@@ -279,7 +284,7 @@ def stored(count, folder, chunks):
     calls = {
         "open_store": lambda: open_store(url),
         "committed": lambda: committed(store),
-        "continue": lambda: Tally(store).begin(committed(store)),
+        "continue": lambda: Tally(store, AnyOrder(())).begin(committed(store)),
         "status": lambda: status(url),
         "sweep.open": lambda: sweep.open(url),
     }

@@ -5,7 +5,11 @@ import time
 
 import pytest
 
+from support.here import Here
 from sweep.execution.forecast import (
+    BLOCK_S,
+    BLOCKS_PER_S,
+    MAX_BLOCKS,
     block_time_limit_s,
     blocks_of,
     demand_of,
@@ -13,9 +17,8 @@ from sweep.execution.forecast import (
     measure,
     measured_or_assumed,
 )
-from sweep.execution.limits import BLOCK_S, BLOCKS_PER_S, MAX_BLOCKS
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child
+from sweep.isolation.child_process import Child, ChildDiedError
 
 HUGE = """
 [camera]
@@ -34,19 +37,25 @@ trial = 50
 """
 
 
+class Failing(Here):
+    """A child that dies."""
+
+    def call(self, *_, **__):
+        raise ChildDiedError("SIGSEGV")
+
+
 @pytest.mark.long
 def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
     pipeline = Pipeline.from_text(HUGE)
     with Child("sweep.execution.forecast") as child:
         began = time.monotonic()
-        timing = measure(child, pipeline, 0.1, limit_s=0.2)
+        timing = measure(child, pipeline, 0.2)
     assert timing.over
     assert time.monotonic() - began < 30  # half of it if the machine is idle
     assert timing.scene_s >= 0.2
     assert math.prod(blocks_of(pipeline, timing.scene_s, 2).extents) <= max(
         BLOCK_S / timing.scene_s, 1)
-    with Child() as child:
-        child.close()
+    with Failing() as child:
         assumed = measured_or_assumed(child, pipeline, 1.0)
     assert (assumed.sampled, assumed.over) == (0, False)
 

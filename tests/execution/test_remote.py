@@ -22,7 +22,7 @@ from support.blocks import run_block
 from support.commands import complaints
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
-from sweep.execution.cluster import external
+from sweep.execution.on_cluster import connected
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
 from sweep.experiment.grid import Block
@@ -471,20 +471,20 @@ def test_credentials_in_a_store_name_are_refused_and_not_repeated(
 
 
 def test_server_that_never_answers_is_given_up(monkeypatch):
-    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.on_cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(ArgumentError, match="no answer within"), external(
-            address, Pipeline.from_text(SMALL)
+        with pytest.raises(ArgumentError, match="no answer within"), connected(
+            Pipeline.from_text(SMALL), address, None
         ):
             pass
 
 
-@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a", "foo://a:1"])
+@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a"])
 def test_what_is_no_address_is_told(address):
     with pytest.raises(
         ArgumentError, match="expected an address such as tcp://host:8786"
-    ), external(address, Pipeline.from_text(SMALL)):
+    ), connected(Pipeline.from_text(SMALL), address, None):
         pass
 
 

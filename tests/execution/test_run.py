@@ -278,7 +278,7 @@ def test_two_clients_at_once_on_one_store_make_the_same_bits(pipeline, undisturb
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.on_cluster.ANSWER_S", 0.5)
     with pytest.raises(
         ArgumentError, match=r"^scheduler = tcp://127\.0\.0\.1:9: no answer within"
     ):

@@ -2,6 +2,7 @@
 
 import contextlib
 import random
+from unittest import mock
 
 import pytest
 from distributed import Client, LocalCluster
@@ -10,11 +11,13 @@ import sweep
 from support import machine_faults
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
-from sweep.execution import on_cluster as worker_faults
 from sweep.execution.block_task import compute_block
-from sweep.execution.on_cluster import OnCluster, WorkerFaults
+from sweep.execution.executors import Failed
+from sweep.execution.on_cluster import OnCluster
 from sweep.execution.progress import Tally
+from sweep.execution.runner import compute
 from sweep.execution.status import close
+from sweep.execution.waves import AnyOrder
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import committed
@@ -57,11 +60,11 @@ def run_on(client, url):
         str(url), PIPELINE, (1,)
     )
     done = committed(store)
-    waiting = [number for number in range(len(store.blocks)) if number not in done]
+    waiting = AnyOrder(number for number in range(len(store.blocks)) if number not in done)
     with writing(store.url, store.storage), Interrupts() as interrupts:
-        tally = Tally(store)
+        tally = Tally(store, waiting)
         tally.begin(done)
-        OnCluster(store, client).run(waiting, tally, interrupts)
+        compute(store, waiting, tally, OnCluster(client), (), 600.0, interrupts)
         close(store)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
@@ -90,8 +93,7 @@ def test_worker_whose_machine_is_at_fault_is_used_no_more(
     assert same(url, undisturbed)
     told = capfd.readouterr().err
     assert told.count("\n") == 1
-    assert f"worker {faulty} on " in told
-    assert "is used no more: 3 blocks" in told
+    assert f"worker {faulty} is used no more: 3 blocks" in told
     assert "No space left on device" in told
     assert list(two_workers.nthreads()) == [sound]
     # Nobody is left to whom its blocks could be given.
@@ -114,8 +116,9 @@ def test_worker_that_cannot_write_the_store_is_used_no_more(
     assert same(url, undisturbed)
     assert not list(url.glob("commits/receipt/begun/*"))
     (line,) = capfd.readouterr().err.splitlines()
-    assert f"worker {faulty} on " in line
-    assert "the last fault: cannot be written: No space left on device" in line
+    assert f"worker {faulty} is used no more" in line
+    assert "the last fault: machine fault on" in line
+    assert ": cannot be written: No space left on device" in line
     # Nobody is left to whom blocks could be given.
     two_workers.run(machine_faults.inject, "disk", "set", 0, workers=[sound])
     with pytest.raises(RunError) as raised:
@@ -127,32 +130,30 @@ def test_worker_that_cannot_write_the_store_is_used_no_more(
     assert same(tmp_path / "none.zarr", undisturbed)
 
 
-def test_only_a_worker_that_fails_much_of_what_others_compute_is_retired(monkeypatch):
+def test_only_a_worker_that_fails_blocks_in_a_row_is_retired_and_never_the_last(monkeypatch):
+    monkeypatch.setattr(OnCluster, "_look", lambda _: None)
+
     retired = []
-    monkeypatch.setattr(worker_faults, "worker_states", lambda *_: dict.fromkeys("ab", 1))
-    monkeypatch.setattr(worker_faults, "worker_that_failed", lambda _, key: key)
-    monkeypatch.setattr(WorkerFaults, "_retire", lambda _, worker: retired.append(worker))
-    fault = MachineFaultError("full", "here")
-    seldom = WorkerFaults(None)
-    for number in range(300):
-        if number % 10 == 0:
-            assert seldom.others(number, "a", fault) == ["b"]
-        seldom.computed(number, 2)
+    client = mock.Mock()
+    client.retire_workers = lambda workers, close_workers: retired.extend(workers * close_workers)
+    engine = OnCluster(client)
+    engine._states = {"a": {}, "b": {}}
+
+    def computed(worker, failed_on=""):
+        future = type("Future", (), {"status": "finished", "release": lambda _: None,
+                                     "result": lambda _: (worker, [])})()
+        assert engine.result(future, [Failed("full", True, 10, each) for each in failed_on]) == []
+
+    for _ in range(30):
+        computed("b", "a")
+        computed("a")  # a seldom fault is not the worker's alone
     assert retired == []
-    often = WorkerFaults(None)
-    for number in range(30):
-        others = often.others(number, "ab"[number % 2], fault)
-        assert others == ["ba"[number % 2]]
-        often.computed(number, 2 - len(retired))
-        monkeypatch.setattr(worker_faults, "worker_states",
-                            lambda *_: dict.fromkeys(set("ab") - set(retired), 1))
-        if retired:
-            break
+    for _ in range(3):
+        computed("b", "a")
+    for _ in range(9):
+        computed("a", "b")  # the last one stays
     assert retired == ["a"]
-    for number in range(30, 40):  # the last one stays
-        assert often.others(number, "b", fault) == []
-        often.computed(number, 2 - len(retired))
-    assert retired == ["a"]
+    assert list(engine._states) == ["b"]
 
 
 def outcome(client, url):

@@ -11,7 +11,7 @@ import pytest
 import sweep
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
-from sweep.execution.cluster import _worker_identity
+from sweep.execution.on_cluster import worker_identity
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child
@@ -318,12 +318,12 @@ def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
 
 def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
     bad = pipeline("nan")
-    assert _worker_identity(bad)[2] == []
+    assert worker_identity(bad)[2] == []
     (tmp_path / "bad.py").rename(tmp_path / "gone.py")
-    (line,) = _worker_identity(bad)[2]
+    (line,) = worker_identity(bad)[2]
     assert line.startswith(f"detector bad:nan: expected the file bad.py in {tmp_path}")
     (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
-    (line,) = _worker_identity(bad)[2]
+    (line,) = worker_identity(bad)[2]
     assert "bad.py as it was when the run began" in line
 
 

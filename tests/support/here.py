@@ -23,18 +23,21 @@ class Here:
     def close(self):
         pass
 
+    def restart(self):
+        pass
+
 
 @contextlib.contextmanager
 def calls_here():
     """Small runs and measurements of what they take start no process while this is entered.
 
-    A busy machine does not make a small run a large one, which would start a cluster.
+    A busy machine does not make a small run a large one, which would start others.
     """
     with (
         mock.patch("sweep.isolation.child_process.Child", Here),
         mock.patch("sweep.execution.runner.Child", Here),
-        mock.patch("sweep.execution.runner.SMALL_RUN_S", 30.0),
-        mock.patch("sweep.execution.forecast.SMALL_RUN_S", 30.0),
-        mock.patch("sweep.execution.engines.SMALL_RUN_LIMIT_S", 300.0),
+        mock.patch("sweep.execution.runner.SMALL_RUN_S", 300.0),
+        mock.patch("sweep.execution.forecast.SMALL_RUN_S", 300.0),
+        mock.patch("sweep.execution.executors.SMALL_RUN_S", 300.0),
     ):
         yield

@@ -3,7 +3,7 @@
 import xarray as xr
 
 from sweep.execution.block_task import compute_block, compute_blocks
-from sweep.execution.progress import InWaves
+from sweep.execution.waves import InWaves
 from sweep.experiment.axes import TRIAL
 from sweep.sampling.rules import block_unit, make_rule
 from sweep.store.lifecycle import create_store
@@ -24,13 +24,13 @@ def by_hand(url, pipeline, extents=None):
         for block in store.blocks:
             compute_block(url, store.run_id, block)
     else:
-        in_waves(store, pipeline)
+        in_waves(store)
     return store
 
 
-def in_waves(store, pipeline, most=None):
-    """Compute blocks of a store in this process by the pipeline's rule; return how many."""
-    waiting, count = InWaves(store, pipeline.stopping, make_rule(pipeline)), 0
+def in_waves(store, most=None):
+    """Compute blocks of a store in this process by its pipeline's rule; return how many."""
+    waiting, count = InWaves(store), 0
     while (work := waiting.next()) is not None and (most is None or count < most):
         found = compute_blocks(
             store.url, store.run_id, [store.blocks[number] for number in work.numbers],

@@ -1,0 +1,245 @@
+"""Where blocks are computed: the loop over what is out, and the child processes of this machine."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Generator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import Any, Self
+
+from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
+from sweep.evaluation.machine_faults import machine_faults_raised
+from sweep.execution import BLOCK_TASK
+from sweep.execution.block_task import compute_blocks
+from sweep.execution.waves import Waiting, Work
+from sweep.isolation.child_process import (
+    POLL_S,
+    Child,
+    ChildDiedError,
+    ChildRaisedError,
+    Interrupts,
+    last_line,
+)
+from sweep.isolation.machine import explained
+from sweep.store.receipt import Receipt
+
+# --------------------------------------------------------------------------------------------------
+# The loop: blocks are submitted as long as there is room, and what becomes of them is yielded.
+#
+# A bounded number of blocks is out at a time, so that memory does not grow with the grid. Workers
+# write the blocks; only receipts come back.
+
+MAX_ATTEMPTS = 10
+"""How often a block is tried whose worker dies, or fails by a fault of its machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """Why work failed.
+
+    Attributes
+    ----------
+    reason
+        In a line.
+    machine_fault
+        Whether a machine is at fault, and not the work.
+    tries
+        How often it is tried in all, if this comes again.
+    worker
+        The address of the worker that failed, if it is known.
+    """
+
+    reason: str
+    machine_fault: bool = False
+    tries: int = 1
+    worker: str = ""
+
+
+class Executor(ABC):
+    """Computes blocks in other processes.
+
+    Attributes
+    ----------
+    threads
+        How many blocks are computed at once.
+    """
+
+    threads: int
+
+    def map(
+        self, waiting: Waiting, task: Callable[[Work], tuple[Any, ...]], limit_s: float,
+        interrupts: Interrupts,
+    ) -> Generator[tuple[Work, list[Receipt] | Failed]]:
+        """Compute what waits; yield each piece of work with its receipts, or why there are none.
+
+        Parameters
+        ----------
+        waiting
+            The blocks that wait; more may wait after what was yielded is committed.
+        task
+            Gives the arguments of :func:`compute_blocks` for work.
+        limit_s
+            Block timeout in seconds.
+        interrupts
+            Entered; checked meanwhile.
+
+        Raises
+        ------
+        RunError
+            If nothing can be computed any more.
+        StoreReplacedError
+            If the store was moved, deleted or replaced.
+        """
+        finished: SimpleQueue[Any] = SimpleQueue()
+        # What is out, and how it failed before.
+        out: dict[Any, tuple[Work, list[Failed]]] = {}
+
+        def begin(work: Work, failures: list[Failed]) -> None:
+            future = self.submit(task(work), limit_s, failures)
+            out[future] = work, failures
+            future.add_done_callback(finished.put)
+
+        try:
+            while True:
+                while len(out) < self.room() and (work := waiting.next()) is not None:
+                    begin(work, [])
+                if not out:
+                    return
+                interrupts.check()
+                try:
+                    future = finished.get(timeout=POLL_S)
+                except Empty:
+                    self.check(len(out), limit_s)
+                    continue
+                work, failures = out.pop(future)
+                result = self.result(future, failures)
+                if isinstance(result, Failed) and len(failures) + 1 < result.tries:
+                    begin(work, [*failures, result])
+                else:
+                    yield work, result
+        finally:
+            self.cancel(out)
+
+    @abstractmethod
+    def room(self) -> int:
+        """Return how many tasks may be out now."""
+
+    @abstractmethod
+    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+        """Call :func:`compute_blocks`, rather not where it failed; return a future."""
+
+    @abstractmethod
+    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
+        """Return the receipts of a future that is done, or why there are none."""
+
+    def check(self, out: int, limit_s: float) -> None:  # noqa: B027  (few have to)
+        """Look after the work that is out while nothing is finished."""
+
+    @abstractmethod
+    def cancel(self, out: Collection[Any]) -> None:
+        """Take back what is still out."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Child processes of this machine, each called by a thread.
+
+SMALL_RUN_S = 3.0
+"""Work up to which a run needs one process: another takes a second to import its packages."""
+
+
+class Children(Executor):
+    """Computes blocks in child processes.
+
+    Parameters
+    ----------
+    child
+        The first one.
+    count
+        How many there are to be.
+    at_once
+        Whether the others are started now; else they are when the first one has computed for
+        :data:`SMALL_RUN_S`.
+    """
+
+    def __init__(self, child: Child, count: int, *, at_once: bool) -> None:
+        self.threads = count if at_once else 1
+        self._count = count
+        self._children = [child]
+        self._idle: SimpleQueue[Child] = SimpleQueue()
+        self._idle.put(child)
+        self._pool = ThreadPoolExecutor(count)
+        self._began: float | None = None
+        self._closed = False
+        if at_once:
+            self._grow()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes; a thread that waits for one gets its end for an answer."""
+        self._closed = True
+        for child in self._children:
+            child.close()
+        self._pool.shutdown(cancel_futures=True)
+
+    def _grow(self) -> None:
+        with machine_faults_raised():
+            while len(self._children) < self._count:
+                self._children.append(Child(BLOCK_TASK))
+                self._idle.put(self._children[-1])
+
+    def room(self) -> int:
+        """Return the number of processes."""
+        now = time.monotonic()
+        self._began = now if self._began is None else self._began
+        if now > self._began + SMALL_RUN_S:
+            self._grow()
+        return len(self._children)
+
+    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+        """Have a thread call a child that is idle."""
+        del failures
+        return self._pool.submit(self._call, arguments, limit_s)
+
+    def _call(self, arguments: tuple[Any, ...], limit_s: float) -> list[Receipt]:
+        child = self._idle.get()
+        try:
+            # The block keeps its own time limit; this one is for what surrounds it.
+            receipts: list[Receipt] = child.call(compute_blocks, *arguments, limit_s=2 * limit_s)
+        except (ChildDiedError, MachineFaultError):
+            if not self._closed:
+                with machine_faults_raised():
+                    child.restart()
+            raise
+        else:
+            return receipts
+        finally:
+            self._idle.put(child)
+
+    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
+        """Return the receipts; after a death, or a first fault, the block is begun again."""
+        del failures
+        try:
+            receipts: list[Receipt] = future.result()
+        except StoreReplacedError:
+            raise
+        except ChildDiedError as error:
+            # The block is computed in isolation when it is begun again.
+            return Failed(f"its process ended: {explained(error)}", error.from_outside,
+                          tries=MAX_ATTEMPTS)
+        except MachineFaultError as error:
+            return Failed(str(error), machine_fault=True, tries=2)
+        except ChildRaisedError as error:
+            return Failed(last_line(error))
+        except SweepError as error:
+            return Failed(f"{type(error).__name__}: {error}")
+        return receipts
+
+    def cancel(self, out: Collection[Any]) -> None:
+        """End the processes if they still compute."""
+        if out:
+            self.__exit__()

@@ -1,0 +1,279 @@
+"""Processes that compute blocks: children of this machine, and workers of the caller's cluster."""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import threading
+import time
+
+import psutil
+import pytest
+from distributed import Client, LocalCluster
+
+import sweep
+from support.commands import started
+from support.here import Here
+from support.stores import by_hand, same
+from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
+from sweep.execution import executors, on_cluster
+from sweep.execution.executors import Children
+from sweep.execution.on_cluster import OnCluster, WorkerIdentity, connected
+from sweep.execution.progress import Tally
+from sweep.execution.runner import compute, execute, recompute
+from sweep.execution.waves import AnyOrder
+from sweep.experiment.pipeline import Pipeline
+from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
+from sweep.store.blocks import drop_block
+from sweep.store.lifecycle import create_store, open_store
+from sweep.store.lock import writing
+from sweep.store.provenance import fingerprint
+
+PIPELINE = Pipeline.from_text(
+    "seed = 3\npose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }\n"
+    "axes = { side_px = [20, 40], trial = 6 }\n", name="small")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
+    by_hand(url, PIPELINE)
+    return url
+
+
+# Children.
+
+@pytest.mark.long
+def test_small_run_and_small_repair_take_one_process_and_leave_nothing(
+    undisturbed, tmp_path, monkeypatch
+):
+    begun = []
+    start = Child._start
+    monkeypatch.setattr(Child, "_start", lambda child: (begun.append(child), start(child)))
+    me, threads = psutil.Process(), set(threading.enumerate())
+    before = me.children(recursive=True), len(me.net_connections())
+    url = str(tmp_path / "small.zarr")
+    summary = execute(PIPELINE, url, block_s=0.01)
+    assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
+    left = {thread.name.partition("_")[0] for thread in set(threading.enumerate()) - threads}
+    assert left <= {"zarr", "asyncio"}  # Zarr's own
+    assert same(url, undisturbed)
+    store = open_store(url, "r+")
+    with writing(store.url, store.storage):
+        drop_block(store, store.blocks[0])
+        recompute(store, [0])
+    assert same(url, undisturbed)
+    assert len(begun) == 2
+    assert (me.children(recursive=True), len(me.net_connections())) == before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [None, 3])
+def test_what_takes_longer_than_it_was_measured_gets_more_processes(
+    workers, undisturbed, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(executors, "SMALL_RUN_S", 0.0)
+    count = []
+    room = Children.room
+    monkeypatch.setattr(Children, "room", lambda one: count.append(room(one)) or count[-1])
+    monkeypatch.setattr("sweep.execution.runner.default_workers", lambda: 2)
+    url = str(tmp_path / "long.zarr")
+    summary = execute(PIPELINE, url, block_s=1e-6, workers=workers)
+    assert count[-1] == workers or 2
+    assert summary.computed_blocks == summary.blocks == 12
+    assert same(url, undisturbed)
+
+
+def suicide(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Failing(Here):
+    """A child whose calls fail."""
+
+    def __init__(self, error):
+        self._error = error
+
+    def call(self, *_, **__):
+        raise self._error
+
+
+def compute_in(store, child):
+    waiting = AnyOrder(range(len(store.blocks)))
+    with child, Interrupts() as interrupts, Children(child, 1, at_once=True) as executor:
+        compute(store, waiting, Tally(store, waiting), executor, (), 60, interrupts)
+
+
+@pytest.mark.long
+def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
+    monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
+    monkeypatch.setattr(executors, "compute_blocks", suicide)
+    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
+    with pytest.raises(RunError, match=failed):
+        compute_in(open_store(undisturbed), Child())
+
+
+@pytest.mark.parametrize(("raised", "error", "reason"), [
+    (ChildRaisedError("Traceback:\n  ...\nZeroDivisionError: no"), RunError,
+     r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
+    (StoreReplacedError("moved"), StoreReplacedError, "moved"),
+    (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
+])
+def test_block_that_fails_is_named(raised, error, reason, undisturbed):
+    with pytest.raises(error, match=reason):
+        compute_in(open_store(undisturbed), Failing(raised))
+
+
+@pytest.mark.long
+def test_children_end_with_their_client_whatever_ends_it(tmp_path):
+    """Also where Ctrl-C is ignored; and a lost scheduler is told in the last line."""
+    (tmp_path / "long.toml").write_text(
+        "[pose]\njitter_px = 0.5\nside_px = 50\n[axes]\ntrial = 40000\n")
+    for name in ("long", "own"):
+        create_store(str(tmp_path / f"{name}.zarr"), Pipeline.from_toml(tmp_path / "long.toml"),
+                     (500,))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of `nohup`
+    options = {"stderr": subprocess.PIPE, "text": True, "cwd": tmp_path}
+    run = ["-m", "sweep", "run", "long.toml", "--store"]
+    try:
+        with (
+            local_cluster() as cluster,
+            started([*run, "long.zarr", "--scheduler", cluster.scheduler_address],
+                    **options) as lost,
+            started([*run, "own.zarr", "--workers", 2], **options) as own,
+        ):
+            deadline = time.monotonic() + 120
+            while not (any(tmp_path.glob("long.zarr/commits/receipt/c/*"))
+                       and any(tmp_path.glob("own.zarr/commits/receipt/c/*"))):
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            children = psutil.Process(own.pid).children(recursive=True)
+            assert len(children) >= 2
+            own.send_signal(signal.SIGINT)
+            own.kill()
+            own.wait()
+            psutil.wait_procs(children, timeout=30)
+            assert not any(child.is_running() for child in children)
+            cluster.close()
+            assert lost.wait(timeout=60) == 1
+            (*_, line) = lost.stderr.read().splitlines()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert line == "the scheduler went away; run it again to continue"
+
+
+# The caller's cluster.
+
+@contextlib.contextmanager
+def local_cluster(workers=1, **options):
+    with LocalCluster(
+        n_workers=workers, threads_per_worker=1, host="127.0.0.1",
+        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL, **options,
+    ) as cluster:
+        yield cluster
+
+
+def other_in_threads(pipeline):
+    """Return what numbers depend on; in other threads as if in another process, of other versions.
+    """
+    versions = fingerprint(pipeline)
+    if threading.current_thread() is threading.main_thread():
+        return WorkerIdentity(versions, ("here", 1), [], "AVX2")
+    return WorkerIdentity(versions | {"opencv": "0.0"}, ("elsewhere", 1), [], "AVX2")
+
+
+def refusal(client):
+    with pytest.raises(ArgumentError) as raised, connected(PIPELINE, None, client):
+        pass
+    return str(raised.value)
+
+
+def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypatch):
+    monkeypatch.setattr(on_cluster, "WORKERS_S", 0.5)
+    with local_cluster(0) as cluster:
+        assert refusal(cluster) == (
+            f"client = LocalCluster({cluster.scheduler_address}): no workers within 0 s; start some"
+        )
+        client = Client(cluster, set_as_default=False)
+        address = cluster.scheduler_address
+        client.close()
+        assert refusal(client) == "client = Client(None): it is closed"
+    assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
+    for given in (address, 3, object()):
+        assert "expected a distributed.Client or a cluster object" in refusal(given)
+
+
+def test_workers_that_are_threads_of_the_caller_or_have_other_versions_are_refused(
+    tmp_path, monkeypatch
+):
+    # A scene that crashes, and the time limit, end the process of a worker.
+    with local_cluster(1, processes=False, protocol="tcp://") as cluster:
+        assert "its workers are threads of this process" in refusal(cluster)
+        monkeypatch.setattr(on_cluster, "worker_identity", other_in_threads)
+        for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
+            with pytest.raises(ArgumentError, match=r"tcp://.*: opencv 0\.0, here"):
+                execute(PIPELINE, tmp_path / "other.zarr", **given)
+    assert not (tmp_path / "other.zarr").exists()
+
+
+@pytest.mark.long
+def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_path):
+    def stop(progress):
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with local_cluster() as cluster, Client(cluster, set_as_default=False) as client:
+        with pytest.raises(KeyboardInterrupt):
+            execute(
+                PIPELINE, tmp_path / "stopped.zarr", client=client, block_s=1e-6, progress=stop
+            )
+        deadline = time.monotonic() + 30
+        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        results = sweep.run(PIPELINE, store=tmp_path / "stopped.zarr", client=client)
+        assert (results.detection != 0).all()
+
+
+@pytest.mark.parametrize(("states", "line"), [
+    (("running", "running"), "4 are with 2 workers; a block ends after at most 7 s"),
+    (("paused", "running"), "4 are with 2 workers, 1 of them paused by Dask"),
+])
+def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch, capsys):
+    monkeypatch.setattr(on_cluster, "SILENCE_S", 0.1)
+    monkeypatch.setattr(OnCluster, "_look", lambda _: None)
+    engine = OnCluster(None)
+    engine._states = {str(k): {"nthreads": 1, "status": name} for k, name in enumerate(states)}
+    deadline = time.monotonic() + 0.35
+    while time.monotonic() < deadline:
+        engine.check(4, 7)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2  # after 0.1 s, and after 0.2 s
+    assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
+
+
+@pytest.mark.long
+def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_path, capfd):
+    pipeline = Pipeline.from_text(
+        '[pose]\nside_px = 60\n[detector]\ncornerRefinementMethod = "subpix"\n[axes]\ntrial = 4\n'
+        "tilt_deg = [0, 20]\n[scene]\nnoise_grey = 1\n")
+    older = os.environ | {"OPENCV_CPU_DISABLE": "AVX2,AVX512-SKX", "OPENCV_IPP": "disabled"}
+    with (
+        local_cluster() as cluster,
+        started(["-m", "distributed.cli.dask_worker", cluster.scheduler_address, "--nthreads", "1",
+                 "--no-dashboard"], env=older, stderr=subprocess.DEVNULL),
+        Client(cluster, set_as_default=False) as client,
+    ):
+        client.wait_for_workers(2, timeout=60)
+        capfd.readouterr()
+        store = create_store(str(tmp_path / "mixed.zarr"), pipeline, (1, 1))
+        summary = execute(pipeline, store.url, client=client)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("warning: processors with 2 different sets of features: last digits ")
+    assert "(1 workers: " in line
+    assert line.count("no IPP") == 1
+    counts = open_store(store.url).run_metadata["counts"]["processors"]
+    assert (len(counts), sum(counts.values())) == (2, len(open_store(store.url).blocks))
+    assert sum("no IPP" in name for name in counts) == 1
+    assert any(warning.startswith("processors with 2") for warning in summary.warnings)

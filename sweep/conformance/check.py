@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, PipelineError, PluginError, SweepError
-from sweep.evaluation.block import detections_for, run_cells, scenes_at, search_batch
+from sweep.evaluation.block import detections_for, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult
+from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES
@@ -548,21 +549,23 @@ class SolverTrial:
 
     def results(self, rows: Sequence[int]) -> CellsResult:
         """Return results of scenes that are solved together."""
-        return run_cells(self.pipeline, [np.array(rows, dtype=np.intp)])
+        return run_cells(self.pipeline.experiment, [np.array(rows, dtype=np.intp)])
 
     def column(self, name: str) -> NDArray[Any]:
         """Return a variable of all scenes."""
-        return self.first.columns[name][0]
+        column: NDArray[Any] = self.first.columns[name][0]
+        return column
 
     def _faults_of_all(self) -> list[str]:
         """Return what is raised if all detected targets are solved in one call.
 
         A run solves them one by one then, which takes long and hides it.
         """
-        batch = scenes_at(self.pipeline, [np.arange(SCENES)])
-        (searched,), _, _ = search_batch(
-            self.pipeline, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
-        (setting,) = self.pipeline.experiment.estimators
+        experiment = self.pipeline.experiment
+        batch = scenes_at(experiment, [np.arange(SCENES)])
+        (searched,), _, _ = detections_of(
+            experiment, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
+        (setting,) = experiment.estimators
         rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
         try:
             build(setting)(detections_for(setting, batch.values, batch.scenes, searched, rows))
@@ -605,7 +608,7 @@ class SolverTrial:
 
     def odd(self) -> list[str]:
         """Solve markers that are seen nearly from the side; return what is raised."""
-        return _raised(run_cells(self.steep, [np.arange(SCENES)]))
+        return _raised(run_cells(self.steep.experiment, [np.arange(SCENES)]))
 
 
 def _raised(result: CellsResult) -> list[str]:

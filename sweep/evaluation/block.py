@@ -1,67 +1,62 @@
-"""A block of cells, computed: scenes, images, detections, estimates, variables."""
+"""A block of cells, computed: scenes, images, detections, estimates, variables.
+
+The paper's eleven steps (Poroykov et al., 2020) are found by name::
+
+    steps 1-6   scenes       sweep.evaluation.search.scenes_at: camera, pose, what is printed
+                             (sweep.model.scene.build_scenes)
+    steps 7-8   images       sweep.evaluation.search.images_of (sweep.model.renderers)
+    step 9      detections   sweep.evaluation.search.detections_of (sweep.measure.detectors)
+                estimates    estimates_of (sweep.measure.solver)
+    step 10     errors       sweep.evaluation.variables, sweep.measure.estimation
+    step 11     the loop over cells: run_cells, compute_block
+
+A scene is rendered once for all detector settings, and a detection is shared by all estimators.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import MachineFaultError
-from sweep.evaluation.machine_faults import (
-    exception_line,
-    local_fault,
-    machine_faults_raised,
-    raise_machine_fault,
-)
+from sweep.evaluation.machine_faults import exception_line, local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import (
     CellsResult,
     Failure,
-    concatenate,
-    exception_text,
+    all_or_each,
+    note_failure,
     to_dataset_layout,
 )
-from sweep.evaluation.search import (
-    SearchResult,
-    is_recorded,
-    search,
-    visibility_flags,
-    whole_frames,
-)
+from sweep.evaluation.search import SearchResult, detections_of, scenes_at
 from sweep.evaluation.variables import (
     DETECTION,
+    ESTIMATION,
     SCENE,
+    WITHOUT_DETECTION,
     SceneResults,
     compared,
-    compute,
-    compute_estimation,
+    write,
 )
 from sweep.experiment.draws import CALIBRATED
-from sweep.experiment.grid import (
-    Block,
-    block_indices,
-)
+from sweep.experiment.grid import Block, Experiment, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.bound import Bounds, bounds, outside_model
-from sweep.measure.classify import TargetScenes, target_scenes
+from sweep.measure.bound import bounds, outside_model
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus
 from sweep.model.calibration import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras, Column
-from sweep.model.derivatives import POSE
-from sweep.model.extent import marker_boxes
 from sweep.model.lens import pack, pack_once
 from sweep.model.renderers import beside_pixels
-from sweep.model.scene import Scenes, build_scenes
+from sweep.model.scene import Scenes
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -75,50 +70,34 @@ def assumed_cameras(
     Those of the scenes, but for the ``believed_`` parameters: of ``values`` if they are drawn,
     else of the estimator. A believed calibration is drawn.
     """
-    view, size = scenes.cameras.view, scenes.size_m
-    lenses, distorted = scenes.cameras.lenses, scenes.cameras.distorted
+    truth, calibrated = scenes.cameras, estimator.believed == "calibration"
+    view, size, lenses, distorted = truth.view, scenes.size_m, truth.lenses, truth.distorted
 
     def assumed(name: str) -> Any:
-        drawn = name in values and not values[name].constant
-        return values[name].values if drawn else getattr(estimator, name)
+        if calibrated and CALIBRATED + name in values:
+            return values[CALIBRATED + name].values
+        drawn = values.get(f"believed_{name}")
+        if drawn is None or drawn.constant:
+            return getattr(estimator, f"believed_{name}", None)
+        return drawn.values
 
-    if assumed("believed_focal_scale") is not None:
+    scale, focal_and_centre = assumed("focal_scale"), [assumed(name) for name in VIEW]
+    if scale is not None or any(value is not None for value in focal_and_centre):
         view = view.copy()
-        view[:, :2] *= np.reshape(assumed("believed_focal_scale"), (-1, 1))
-    calibrated = estimator.believed == "calibration"
-    for k, name in enumerate(VIEW):
-        value = (
-            values[CALIBRATED + name].values if calibrated else assumed(f"believed_{name}")
-        )
-        if value is not None:
-            view = view.copy() if view is scenes.cameras.view else view
-            view[:, k] = value
-    if assumed("believed_size_m") is not None:
-        size = np.array(np.broadcast_to(assumed("believed_size_m"), size.shape), dtype=np.float64)
-    coefficients = [CALIBRATED + name for name in COEFFICIENTS if CALIBRATED + name in values]
-    if calibrated and coefficients:
-        each = np.stack([values[name].values for name in coefficients], axis=1)
-        lenses = np.array([pack_once(tuple(row)) for row in each.tolist()])
+        view[:, :2] *= 1.0 if scale is None else np.reshape(scale, (-1, 1))
+        for k, value in enumerate(focal_and_centre):
+            view[:, k] = view[:, k] if value is None else value
+    if (side := assumed("size_m")) is not None:
+        size = np.full(len(scenes), side, dtype=np.float64)
+    packed: Any = None
+    if (coefficients := estimator.believed_distortion) is not None:
+        packed = [pack(coefficients)] * len(scenes)
+    elif drawn := [each for name in COEFFICIENTS if (each := assumed(name)) is not None]:
+        packed = [pack_once(tuple(row)) for row in np.stack(drawn, axis=1).tolist()]
+    if packed is not None:
+        lenses = np.array(packed)
         distorted = np.asarray(lenses[:, :14].any(axis=1))
-    if estimator.believed_distortion is not None:
-        packed = pack(estimator.believed_distortion)
-        lenses = np.repeat(packed[None], len(scenes), axis=0)
-        distorted = np.full(len(scenes), bool(packed[:14].any()))
     return Cameras(view, lenses, distorted), size
-
-
-def _assumed_noise_and_blur(
-    estimator: EstimatorSetting, scenes: Scenes
-) -> tuple[Floats, Floats]:
-    """Return the noise of a pixel in grey levels and the point spread in px, (N,) each."""
-    truth = scenes.effects
-    noise, blur = (
-        np.broadcast_to(truth[name] if assumed is None else assumed, len(scenes))
-        for name, assumed in (
-            ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
-        )
-    )
-    return noise, blur
 
 
 def detections_for(
@@ -127,7 +106,12 @@ def detections_for(
 ) -> Detections:
     """Return what was found in scenes ``rows`` (n,), with what an estimator assumes of them."""
     cameras, size = assumed_cameras(estimator, values, scenes)
-    noise, blur = _assumed_noise_and_blur(estimator, scenes)
+    noise, blur = (
+        np.broadcast_to(scenes.effects[name] if believed is None else believed, len(scenes))
+        for name, believed in (
+            ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
+        )
+    )
     found, targets = result.found, result.targets.targets
     on_board = values["on_board"].values if "on_board" in values else None
     images = [result.images[row] for row in rows.tolist()] if result.images else []
@@ -147,117 +131,51 @@ def detections_for(
     return dataclasses.replace(everything.take(rows), images=images, beside=beside)
 
 
-def estimate_poses(
-    detections: Detections, estimator: PoseEstimator, failures: int
-) -> tuple[Estimates, list[tuple[int, str]]]:
-    """Return estimates of n targets, and the numbers and exceptions of those that raise.
+def estimates_of(
+    seen: Detections, estimator: PoseEstimator, rows: NDArray[np.intp],
+    failures: list[Failure], setting: int, number: int,
+) -> Estimates:
+    """Return estimates of the targets of scenes ``rows`` (n,); one by one if the batch raises.
 
-    One by one if the batch raises; ``failures`` are those that are known already, by whose number
-    texts get shorter.
+    ``setting`` and ``number`` are the detector's and the estimator's, for the failures.
     """
-    try:
-        return estimator(detections), []
-    except Exception as batch_error:
-        raise_machine_fault(batch_error)
-        parts: list[Estimates] = []
-        failed: list[tuple[int, str]] = []
-        for i in range(len(detections)):
-            try:
-                parts.append(estimator(detections.take(np.array([i]))))
-            except Exception as error:
-                raise_machine_fault(error)
-                failed.append((i, exception_text(failures + len(failed))))
-                parts.append(Estimates.none(1, EstimateStatus.failed))
-        return Estimates.concatenate(parts), failed
+    parts = all_or_each(
+        lambda some: estimator(seen if len(some) == len(rows) else seen.take(some)),
+        np.arange(len(rows)),
+        lambda i: note_failure(failures, int(rows[i]), "estimation", setting, number),
+    )
+    return Estimates.concatenate([
+        Estimates.none(1, EstimateStatus.failed) if part is None else part for part in parts
+    ])
 
 
 # --------------------------------------------------------------------------------------------------
-# Scene cells of the grid: scenes -> images -> detections -> estimates.
-#
-# The paper's eleven steps (Poroykov et al., 2020) are found by name:
-#
-#   steps 1-6   scenes       :func:`scenes_at`: camera, pose, what is printed
-#                            (:func:`sweep.model.scene.build_scenes`)
-#   steps 7-8   images       :func:`sweep.evaluation.search.rendered`
-#                            (:mod:`sweep.model.renderers`)
-#   step 9      detections   :func:`sweep.evaluation.search.search` (:mod:`sweep.measure.detectors`)
-#               estimates    :func:`estimate_poses` (:mod:`sweep.measure.solver`)
-#   step 10     errors       :mod:`sweep.evaluation.variables`, :mod:`sweep.measure.estimation`
-#   step 11     the loop over cells: :func:`run_cells`
-#
-# A scene is rendered once for all detector settings, and a detection is shared by all estimators.
+# Scene cells of the grid: scenes -> images -> detections -> estimates -> variables.
 
 KEPT_PX = 1 << 26
 """Pixels of images that are kept for the estimators, if all were whole frames: 67 MB of memory."""
 
 
-@dataclass(frozen=True, slots=True)
-class SceneBatch:
-    """N scenes that are in memory together.
-
-    Attributes
-    ----------
-    values, scenes
-        Parameters and geometry.
-    visibility
-        (N,) why the scenes are not searched; ``not_run`` for those that are.
-    targets
-        What the scenes show.
-    """
-
-    values: dict[str, Column]
-    scenes: Scenes
-    visibility: NDArray[np.uint8]
-    targets: TargetScenes
-
-
-def scenes_at(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> SceneBatch:
-    """Return the scenes at indices (N,) along each scene axis."""
-    count = len(indices[0]) if indices else 1
-    values = pipeline.experiment.scene_values(indices)
-    scenes = build_scenes(values, count, pipeline.experiment.scene_plugins)
-    visibility = visibility_flags(scenes)
-    boards = values["board"].listed(count) if "board" in values else None
-    targets = target_scenes(
-        scenes, visibility, boards, (1, 0) if boards is None else pipeline.experiment.largest_board
-    )
-    return SceneBatch(values, scenes, visibility, targets)
-
-
-def search_batch(
-    pipeline: Pipeline, batch: SceneBatch, wanted: Masks, failures: list[Failure], *, keep: bool,
-    keys: NDArray[np.uint64] | None = None,
-) -> tuple[list[SearchResult], float, Floats]:
-    """Render scenes once and search them with each detector setting of an experiment.
-
-    All else as `sweep.evaluation.search.search`.
-    """
-    return search(
-        batch.scenes, wanted, pipeline.experiment.detectors,
-        whole_frames(batch.values, len(batch.scenes)), failures, keep=keep, keys=keys,
-        targets=batch.targets, board_settings=pipeline.experiment.board_settings,
-    )
-
-
-def compute_block(pipeline: Pipeline, block: Block) -> dict[str, NDArray[Any]]:
+def compute_block(experiment: Experiment, block: Block) -> dict[str, NDArray[Any]]:
     """Return every variable of a block in the dataset's dimensions: a function of cells and seed.
 
     Examples
     --------
     >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 0.5, "tilt_deg": 20}})
-    >>> int(compute_block(pipeline, Block((), ()))["detection"])
+    >>> int(compute_block(pipeline.experiment, Block((), ()))["detection"])
     1
     """
-    cells = run_cells(pipeline, block_indices(block))
+    cells = run_cells(experiment, block_indices(block))
     return {
-        variable.name: to_dataset_layout(variable, pipeline, block, cells.columns[variable.name])
-        for variable in pipeline.experiment.variables
+        variable.name: to_dataset_layout(
+            variable, experiment.grid, block, cells.columns[variable.name])
+        for variable in experiment.variables
     }
 
 
 @machine_faults_raised()
 def run_cells(
-    pipeline: Pipeline,
+    experiment: Experiment,
     indices: Sequence[NDArray[np.intp]],
     need: Masks | None = None,
     search_too: Masks | None = None,
@@ -266,8 +184,8 @@ def run_cells(
 
     Parameters
     ----------
-    pipeline
-        The experiment.
+    experiment
+        What is computed.
     indices
         Indices (N,) along each scene axis.
     need
@@ -287,111 +205,82 @@ def run_cells(
     MachineFaultError
         If an exception is raised that no scene's data can cause.
     """
-    count = len(indices[0]) if indices else 1
-    configurations = pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
+    grid, count = experiment.grid, len(indices[0]) if indices else 1
     if need is None:
-        need = np.ones((count, *configurations), dtype=bool)
+        need = np.ones((count, grid.size(Stage.detection), grid.size(Stage.estimation)), dtype=bool)
     searched: Masks = np.asarray(need.any(axis=2))
     if search_too is not None:
         searched |= search_too
-    settings = pipeline.experiment.estimators
-    # Fewer scenes at a time if their images must be kept.
-    size = sys.maxsize
-    if any(build(setting).needs_images for setting in settings):
-        frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
+    builds = [build(setting) for setting in experiment.estimators]
+    size = max(count, 1)
+    if any(each.needs_images for each in builds):
+        # Fewer scenes at a time, since their images must be kept.
+        frame = max(grid.values_of("width_px")) * max(grid.values_of("height_px"))
         size = max(KEPT_PX // frame, 1)
+    result = CellsResult.not_run(experiment, count)
     with single_threaded():
-        parts = [
+        for at in range(0, max(count, 1), size):
+            part = slice(at, at + size)
             _run_batch(
-                pipeline, [index[at : at + size] for index in indices], need[at : at + size],
-                searched[at : at + size],
+                experiment, builds, [index[part] for index in indices], need[part],
+                searched[part], part, result,
             )
-            for at in range(0, max(count, 1), min(size, max(count, 1)))
-        ]
-    return parts[0] if len(parts) == 1 else concatenate(parts)
+    return result
 
 
 def _run_batch(
-    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks, searched: Masks
-) -> CellsResult:
-    """Return the results of scenes that are in memory together, as :func:`run_cells`.
+    experiment: Experiment, builds: Sequence[PoseEstimator],
+    indices: Sequence[NDArray[np.intp]], need: Masks, searched: Masks, part: slice,
+    result: CellsResult,
+) -> None:
+    """Write the results of scenes that are in memory together to ``part`` of a result's scenes.
 
-    ``searched`` (N, detector settings) are the searches that are made.
+    ``need`` and ``searched`` are as in :func:`run_cells`, of these scenes.
     """
     failures: list[Failure] = []
-    settings, estimating = pipeline.experiment.detectors, pipeline.experiment.estimators
-    columns: dict[str, list[NDArray[Any]]] = {
-        variable.name: [] for variable in pipeline.experiment.variables
-    }
-    drawn = {variable.name: variable.drawn_as for variable in pipeline.experiment.drawn}
-
-    def add(computed: Mapping[str, NDArray[Any]]) -> None:
-        for name, column in computed.items():
-            columns[name].append(column)
+    columns = {name: column[:, part] for name, column in result.columns.items()}
+    drawn = {variable.name: variable.drawn_as for variable in experiment.drawn}
 
     start = time.perf_counter()
-    batch = scenes_at(pipeline, indices)
-    visible: Masks = np.asarray(batch.visibility == DetectionStatus.not_run)
+    batch = scenes_at(experiment, indices)
+    asked = batch.values["bound"].broadcast(len(need), np.str_)
     geometry_s = time.perf_counter() - start
 
-    builds = [build(estimator) for estimator in estimating]
-    results, render_s, row_s = search_batch(
-        pipeline, batch, searched & visible[:, None], failures,
+    found, render_s, result.row_seconds[part] = detections_of(
+        experiment, batch, searched & batch.visible[:, None], failures,
         keep=any(each.needs_images for each in builds),
-        keys=pipeline.experiment.image_keys(indices) if any(map(is_recorded, settings)) else None,
     )
 
     start = time.perf_counter()
-    of_scenes = SceneResults(batch.scenes, batch.values, batch.targets, _bounds(batch))
-    add(compute(SCENE, of_scenes, columns.keys() - drawn.keys()))
-    add({name: batch.values[key].broadcast(len(need)) for name, key in drawn.items()})
-    seconds = {
-        "scene": [geometry_s + render_s + time.perf_counter() - start],
-        "detection": [result.seconds for result in results],
-        "estimation": [],
-    }
-    for k, result in enumerate(results):
-        flags = np.where(visible, result.flags, batch.visibility)
-        flags[~searched[:, k]] = DetectionStatus.not_run
-        result.flags = flags
-        add(compute(DETECTION, result, columns))
-        for j, estimator in enumerate(estimating):
-            rows = np.flatnonzero((result.flags == DetectionStatus.detected) & need[:, k, j])
+    of_scenes = SceneResults(batch, bounds(batch.scenes, batch.boxes, asked, batch.visible))
+    computed = {name: column for name, column in columns.items() if name not in drawn}
+    write(computed, SCENE, of_scenes, 0)
+    for name, key in drawn.items():
+        columns[name][0] = batch.values[key].broadcast(len(need))
+    result.seconds["scene"][0] += geometry_s + render_s + time.perf_counter() - start
+
+    for k, each in enumerate(found):
+        each.flags = np.where(batch.visible, each.flags, batch.visibility)
+        each.flags[~searched[:, k]] = DetectionStatus.not_run
+        write(columns, DETECTION, each, k)
+        result.seconds["detection"][k] += each.seconds
+        for j, setting in enumerate(experiment.estimators):
             start = time.perf_counter()
-            detections = detections_for(estimator, batch.values, batch.scenes, result, rows)
-            estimates, failed = estimate_poses(detections, builds[j], len(failures))
-            failures += [
-                Failure(int(rows[i]), "estimation", text, setting=k, estimator=j)
-                for i, text in failed
-            ]
-            add(compute_estimation(
-                compared(estimates, batch.scenes, rows), rows, need[:, k, j], columns
-            ))
-            seconds["estimation"].append(time.perf_counter() - start)
-    return CellsResult(columns, seconds, row_s, failures)
+            rows = np.flatnonzero((each.flags == DetectionStatus.detected) & need[:, k, j])
+            seen = detections_for(setting, batch.values, batch.scenes, each, rows)
+            poses = estimates_of(seen, builds[j], rows, failures, k, j)
+            number = k * len(builds) + j
+            for name, flag in WITHOUT_DETECTION.items():
+                columns[name][number, need[:, k, j]] = flag
+            write(columns, ESTIMATION, compared(poses, batch.scenes, rows), number, rows)
+            result.seconds["estimation"][number] += time.perf_counter() - start
+    result.failures += [
+        dataclasses.replace(failure, scene=failure.scene + part.start) for failure in failures
+    ]
 
 
-def _bounds(batch: SceneBatch) -> Bounds:
-    """Return the accuracy bounds of the scenes that ask for one."""
-    count = len(batch.scenes)
-    asked = batch.values["bound"].broadcast(count, np.str_)
-    status = np.full(count, BoundStatus.not_visible, dtype=np.uint8)
-    status[asked == "none"] = BoundStatus.not_run
-    result = Bounds(
-        status, np.full((count, POSE), np.nan), np.full(count, np.nan), np.full(count, np.nan)
-    )
-    visible = batch.visibility == DetectionStatus.not_run
-    boxes = None
-    for choice in ("known_blur", "unknown_blur"):
-        rows = np.flatnonzero((asked == choice) & visible)
-        if not len(rows):
-            continue
-        boxes = marker_boxes(batch.scenes) if boxes is None else boxes
-        part = bounds(batch.scenes, rows, boxes[rows], choice == "unknown_blur")
-        for field in dataclasses.fields(Bounds):
-            getattr(result, field.name)[rows] = getattr(part, field.name)
-    return result
-
+# --------------------------------------------------------------------------------------------------
+# What is said of bounds before a run: whether any scene can have one.
 
 NOTED_SCENES = 64
 """Scenes, spread over the grid, by which it is told whether any has a bound."""
@@ -408,12 +297,13 @@ def bound_notes(pipeline: Pipeline) -> list[str]:
     """Return a line if a pipeline asks for the accuracy bound and no scene can have one."""
     if set(pipeline.values_of("bound")) <= {"none"}:
         return []
-    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
+    experiment = pipeline.experiment
+    lengths = [len(axis) for axis in experiment.scene_axes]
     total = math.prod(lengths)
     numbers = np.unique(np.linspace(0, total - 1, min(total, NOTED_SCENES)).astype(np.int64))
     indices = [np.asarray(index, dtype=np.intp) for index in np.unravel_index(numbers, lengths)] \
         if lengths else []
-    batch = scenes_at(pipeline, indices)
+    batch = scenes_at(experiment, indices)
     asked = np.flatnonzero(batch.values["bound"].broadcast(len(numbers), np.str_) != "none")
     found = {outside_model(batch.scenes, row) for row in asked.tolist()}
     if not found or BoundStatus.given in found:
@@ -462,15 +352,13 @@ def warm_up(pipeline: Pipeline) -> None:
             "solver": solvers or [SOLVERS[0]],
         },
     })
-    lengths = [len(axis) for axis in standard.experiment.scene_axes]
-    indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+    lengths = tuple(len(axis) for axis in standard.experiment.scene_axes)
     try:
-        cells = run_cells(standard, indices)
+        values = compute_block(standard.experiment, Block((0,) * len(lengths), lengths))
     except MachineFaultError:
         raise
     except Exception as error:
         raise local_fault(f"a standard scene raises {exception_line(error)}") from None
-    for k in range(standard.size(Stage.detection, Stage.estimation)):
-        error_rad = np.linalg.norm(cells.columns["rotation_error_rad"][k], axis=1)
-        if not (error_rad < MAX_ERROR_RAD).all():  # NaN without a pose
-            raise local_fault("the pose of a standard scene is computed wrongly")
+    error_rad = np.linalg.norm(values["rotation_error_rad"], axis=-1)
+    if not (error_rad < MAX_ERROR_RAD).all():  # NaN without a pose
+        raise local_fault("the pose of a standard scene is computed wrongly")

@@ -10,19 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import PluginError, RunError
-from sweep.evaluation.block import SceneBatch, assumed_cameras, run_cells, scenes_at
+from sweep.evaluation.block import assumed_cameras, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import (
-    detection_source,
-    is_recorded,
+    SceneBatch,
+    detection_sources,
+    scenes_at,
     search_windows,
     whole_frames,
 )
+from sweep.experiment.grid import Experiment
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.typing import Floats, Grey
@@ -71,36 +72,33 @@ class SceneInspection:
     values: dict[str, NDArray[Any]]
 
 
-def _searched_window(pipeline: Pipeline, batch: SceneBatch) -> list[int]:
+def _single_scene(experiment: Experiment) -> list[NDArray[np.intp]]:
+    return [np.zeros(1, dtype=np.intp) for _ in experiment.scene_axes]
+
+
+def _searched_window(experiment: Experiment, batch: SceneBatch) -> list[int]:
     """Return the window that is searched in a run; the whole frame if the target is not seen."""
-    full = whole_frames(batch.values, 1) | (batch.visibility != DetectionStatus.not_run)
-    boxes, setting = marker_boxes(batch.scenes), pipeline.experiment.detectors[0]
-    window: list[int] = search_windows(batch.scenes, boxes, setting, full)[0].tolist()
+    full = whole_frames(batch) | ~batch.visible
+    setting = experiment.detectors[0]
+    window: list[int] = search_windows(batch.scenes, batch.boxes, setting, full)[0].tolist()
     return window
 
 
-def _drawn(
-    pipeline: Pipeline, batch: SceneBatch, *, whole_frame: bool
-) -> tuple[Grey, tuple[int, int, int, int]]:
+def _drawn(batch: SceneBatch, window: list[int], *, whole_frame: bool) -> tuple[Grey, list[int]]:
     """Return the image (h, w) of a single scene, and its window in the frame."""
-    left, top, right, bottom = _searched_window(pipeline, batch)
+    left, top, right, bottom = window
     if whole_frame:
         left, top, (right, bottom) = 0, 0, batch.scenes.frame[0].tolist()
-    box = marker_boxes(batch.scenes)[0]
-    if batch.visibility[0] != DetectionStatus.not_run:
-        box = np.zeros_like(box)
-    return render(batch.scenes, 0, box, (left, top, right, bottom)), (left, top, right, bottom)
-
-
-def _single_scene(pipeline: Pipeline) -> list[NDArray[np.intp]]:
-    return [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    box = batch.boxes[0] if batch.visible[0] else np.zeros_like(batch.boxes[0])
+    return render(batch.scenes, 0, box, (left, top, right, bottom)), [left, top, right, bottom]
 
 
 @single_threaded()
 def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> Grey:
     """Return the image (h, w) of a pipeline's single scene; it is not searched."""
-    batch = scenes_at(pipeline, _single_scene(pipeline))
-    return _drawn(pipeline, batch, whole_frame=whole_frame)[0]
+    experiment = pipeline.experiment
+    batch = scenes_at(experiment, _single_scene(experiment))
+    return _drawn(batch, _searched_window(experiment, batch), whole_frame=whole_frame)[0]
 
 
 @single_threaded()
@@ -120,53 +118,49 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     RunError
         If the scene's computation raises.
     """
-    indices = _single_scene(pipeline)
-    result = run_cells(pipeline, indices)
+    experiment = pipeline.experiment
+    indices = _single_scene(experiment)
+    result = run_cells(experiment, indices)
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
-    batch = scenes_at(pipeline, indices)
+    columns = {name: column[0, 0] for name, column in result.columns.items()}
+    batch = scenes_at(experiment, indices)
     scenes, targets = batch.scenes, batch.targets
-    image, window = _drawn(pipeline, batch, whole_frame=whole_frame)
     # Searched in its own window, as in a run, even if the whole frame is shown.
-    (left, top), (x0, y0, x1, y1) = window[:2], _searched_window(pipeline, batch)
-    setting, estimator = pipeline.experiment.detectors[0], pipeline.experiment.estimators[0]
-    keys = pipeline.experiment.image_keys(indices) if is_recorded(setting) else None
-    source = detection_source(setting, scenes, targets, keys, pipeline.experiment.board_settings[0])
+    x0, y0, x1, y1 = searched = _searched_window(experiment, batch)
+    image, window = _drawn(batch, searched, whole_frame=whole_frame)
+    left, top, _, _ = window
+    source = detection_sources(experiment, batch)[0]
     output = SearchOutput([], None, [])
     origin = np.array([x0, y0] if source.needs_images else [0, 0], dtype=np.float64)
     with suppress(PluginError):  # flagged "failed" by the run
         output = source(0, image[y0 - top : y1 - top, x0 - left : x1 - left])
-    columns = {name: parts[0][0] for name, parts in result.columns.items()}
-    chessboard, length = np.zeros((0, 2)), float(scenes.size_m[0])
-    true_markers = targets.corners_px[0]
-    if targets.are_markers:
-        markers = true_markers + columns["corner_error_px"]
-    else:
-        markers = true_markers + columns["marker_corner_error_px"]
+    ids = () if output.ids is None else output.ids.ravel()
+    true_markers, length = targets.corners_px[0], float(scenes.size_m[0])
+    error = "corner_error_px" if targets.are_markers else "marker_corner_error_px"
+    chessboard = np.zeros((0, 2))
+    if not targets.are_markers:
+        length = float(np.ptp(targets.targets[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
         if "chessboard_corner_error_px" in columns:
             chessboard = targets.chessboard_px[0] + columns["chessboard_corner_error_px"]
-        length = float(np.ptp(targets.targets[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
-        cameras, _ = assumed_cameras(estimator, batch.values, scenes)
-        vector = columns["rotation_error_rad"]
-        rotation = rotation_of_vector(vector) @ scenes.rotation[0]
+        cameras, _ = assumed_cameras(experiment.estimators[0], batch.values, scenes)
+        rotation = rotation_of_vector(columns["rotation_error_rad"]) @ scenes.rotation[0]
         position = scenes.translation[0] + columns["translation_error_m"]
         ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * length / 2
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
-        window=window,
+        window=(window[0], window[1], window[2], window[3]),
         true_corners=scenes.corners_px[0],
         true_markers=true_markers,
-        markers=markers,
+        markers=true_markers + columns[error],
         chessboard=chessboard,
         area_px=float(columns["marker_area_px"]),
         decoded=[
-            (int(marker_id), quad[0] + origin)
-            for marker_id, quad in zip(
-                () if output.ids is None else output.ids.ravel(), output.corners, strict=True
-            )
+            (int(number), quad[0] + origin)
+            for number, quad in zip(ids, output.corners, strict=True)
         ],
         rejected=[quad[0] + origin for quad in output.rejected],
         detection=DetectionStatus(int(columns["detection"])),
@@ -174,11 +168,8 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px=axes_px,
         errors={
             v.name: float(np.linalg.norm(columns[v.name]))
-            for v in pipeline.experiment.variables
+            for v in experiment.variables
             if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
         },
-        values={
-            v.name: np.asarray(columns[v.name], dtype=v.dtype)
-            for v in pipeline.experiment.variables
-        },
+        values={v.name: np.asarray(columns[v.name], dtype=v.dtype) for v in experiment.variables},
     )

@@ -7,14 +7,15 @@ import itertools
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.grid import Block
+from sweep.evaluation.machine_faults import raise_machine_fault
+from sweep.experiment.experiment import Grid
+from sweep.experiment.grid import Block, Experiment
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import Variable
 from sweep.typing import Floats
 
@@ -49,10 +50,45 @@ MAX_TRACEBACKS = 1000
 """Failures whose traceback is kept; of the others only the last line is."""
 
 
-def exception_text(failures: int) -> str:
-    """Return the text of the exception that is being handled, the next after ``failures``."""
+def note_failure(
+    failures: list[Failure], scene: int, stage: str, setting: int | None = None,
+    estimator: int | None = None,
+) -> None:
+    """Append the exception that is being handled to the failures of a batch of scenes."""
     text = traceback.format_exc()
-    return text if failures < MAX_TRACEBACKS else text.strip().rpartition("\n")[2]
+    if len(failures) >= MAX_TRACEBACKS:
+        text = text.strip().rpartition("\n")[2]
+    failures.append(Failure(scene, stage, text, setting, estimator))
+
+
+Part = TypeVar("Part")
+
+
+def all_or_each(
+    compute: Callable[[NDArray[np.intp]], Part], rows: NDArray[np.intp], note: Callable[[int], None]
+) -> list[Part | None]:
+    """Return the result for all scenes ``rows`` together; if that raises, those for each alone.
+
+    None for a scene that raises alone, too: ``note`` gets its row while the exception is handled.
+
+    Raises
+    ------
+    MachineFaultError
+        If an exception tells of a fault of this machine.
+    """
+    try:
+        return [compute(rows)]
+    except Exception as error:
+        raise_machine_fault(error)
+    parts: list[Part | None] = []
+    for row in rows:
+        try:
+            parts.append(compute(np.array([row])))
+        except Exception as error:
+            raise_machine_fault(error)
+            note(int(row))
+            parts.append(None)
+    return parts
 
 
 @dataclass(slots=True)
@@ -62,7 +98,7 @@ class CellsResult:
     Attributes
     ----------
     columns
-        Variable -> one array (N, ...) per configuration of its stage, the last axis fastest.
+        Variable -> (configurations of its stage, N, ...), the last axis of configurations fastest.
     seconds
         Time spent: "scene", then "detection" and "estimation" per configuration.
     row_seconds
@@ -71,26 +107,27 @@ class CellsResult:
         The exceptions that were raised; their cells are flagged ``failed``.
     """
 
-    columns: dict[str, list[NDArray[Any]]]
+    columns: dict[str, NDArray[Any]]
     seconds: dict[str, list[float]]
     row_seconds: Floats
     failures: list[Failure] = field(default_factory=list)
 
     @staticmethod
-    def not_run(pipeline: Pipeline, count: int) -> CellsResult:
+    def not_run(experiment: Experiment, count: int) -> CellsResult:
         """Return the result of ``count`` cells of which nothing was computed."""
+        grid = experiment.grid
         return CellsResult(
             {
-                variable.name: [
-                    np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
-                    for _ in range(variable.configurations(pipeline))
-                ]
-                for variable in pipeline.experiment.variables
+                variable.name: np.full(
+                    (variable.configurations(grid), count, *variable.inner_shape), variable.fill,
+                    dtype=np.float64 if variable.flags is None else variable.dtype,
+                )
+                for variable in experiment.variables
             },
             {
                 "scene": [0.0],
-                "detection": [0.0] * pipeline.size(Stage.detection),
-                "estimation": [0.0] * pipeline.size(Stage.detection, Stage.estimation),
+                "detection": [0.0] * grid.size(Stage.detection),
+                "estimation": [0.0] * grid.size(Stage.detection, Stage.estimation),
             },
             np.zeros(count),
         )
@@ -99,16 +136,11 @@ class CellsResult:
 def concatenate(parts: Sequence[CellsResult]) -> CellsResult:
     """Return the results of several groups of scenes as those of one group."""
     starts = np.cumsum([0, *(len(part.row_seconds) for part in parts)]).tolist()
-
-    def merge(pieces: Sequence[Any], join: Callable[[Sequence[Any]], Any]) -> dict[str, list[Any]]:
-        return {
-            name: [join(column) for column in zip(*(piece[name] for piece in pieces), strict=True)]
-            for name in pieces[0]
-        }
-
+    columns, seconds = parts[0].columns, parts[0].seconds
     return CellsResult(
-        merge([part.columns for part in parts], np.concatenate),
-        merge([part.seconds for part in parts], sum),
+        {name: np.concatenate([part.columns[name] for part in parts], axis=1) for name in columns},
+        {stage: np.sum([part.seconds[stage] for part in parts], axis=0).tolist()
+         for stage in seconds},
         np.concatenate([part.row_seconds for part in parts]),
         [
             dataclasses.replace(failure, scene=failure.scene + start)
@@ -118,24 +150,23 @@ def concatenate(parts: Sequence[CellsResult]) -> CellsResult:
 
 
 def to_dataset_layout(
-    variable: Variable, pipeline: Pipeline, block: Block, columns: Sequence[NDArray[Any]]
+    variable: Variable, grid: Grid, block: Block, columns: NDArray[Any]
 ) -> NDArray[Any]:
     """Return a block of a variable in the dataset's dimensions and type.
 
     Parameters
     ----------
-    variable, pipeline, block
+    variable, grid, block
         Which variable of which block of the grid.
     columns
-        One array (N, ...) per configuration of the variable's stage; N scenes, the last scene
-        axis fastest.
+        (configurations of the variable's stage, N, ...); N scenes, the last scene axis fastest.
     """
-    inner_axes = variable.configuration_axes(pipeline)
-    stacked = np.stack(columns, axis=1).astype(variable.dtype)
-    spread = stacked.reshape(
-        (*block.shape, *(len(axis) for axis in inner_axes), *variable.inner_shape)
+    inner_axes = variable.configuration_axes(grid)
+    lengths = [len(axis) for axis in inner_axes]
+    spread = columns.astype(variable.dtype).reshape(
+        (*lengths, *block.shape, *variable.inner_shape)
     )
-    axes = itertools.chain(pipeline.axes_of(Stage.scene), inner_axes)
+    axes = itertools.chain(inner_axes, grid.axes_of(Stage.scene))
     names = [*(axis.name for axis in axes), *variable.inner]
-    order = [names.index(name) for name in variable.dimensions(pipeline)]
+    order = [names.index(name) for name in variable.dimensions(grid)]
     return spread.transpose(order).copy(order="C")

@@ -1,24 +1,23 @@
-"""Search: from a scene's image to its detections, by detectors or of recordings."""
+"""From scenes to images and detections: their sources, and the loop that renders and searches."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.machine_faults import raise_machine_fault
-from sweep.evaluation.results import Failure, exception_text
+from sweep.evaluation.results import Failure, all_or_each, note_failure
+from sweep.experiment.grid import Experiment
 from sweep.measure.classify import Findings, TargetScenes, classify, target_scenes
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,
     AnyDetectorSetting,
     BoardDetector,
-    BoardDetectorSetting,
     FindFunction,
     SearchOutput,
     full_frame_reason,
@@ -33,10 +32,80 @@ from sweep.model.camera import Column, map_columns
 from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
 from sweep.model.pose import transform_points
 from sweep.model.renderers import render_all
-from sweep.model.scene import Scenes
+from sweep.model.scene import Scenes, build_scenes
+from sweep.plugins import Poses
 from sweep.plugins.declared import PluginSetting
 from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# Scenes that are in memory together.
+
+@dataclass(frozen=True, slots=True)
+class SceneBatch:
+    """N scenes that are in memory together.
+
+    Attributes
+    ----------
+    indices
+        (N,) along each scene axis of the grid.
+    values, scenes
+        Parameters and geometry.
+    visibility
+        (N,) why the scenes are not searched; ``not_run`` for those that are.
+    targets
+        What the scenes show.
+    boxes
+        (N, 4) left, top, right, bottom of what the targets can influence, px of the frame.
+    """
+
+    indices: Sequence[NDArray[np.intp]]
+    values: Mapping[str, Column]
+    scenes: Scenes
+    visibility: NDArray[np.uint8]
+    targets: TargetScenes
+    boxes: Integers
+
+    @property
+    def visible(self) -> Masks:
+        """(N,) the scenes that are searched."""
+        return np.asarray(self.visibility == DetectionStatus.not_run)
+
+
+def scenes_at(experiment: Experiment, indices: Sequence[NDArray[np.intp]]) -> SceneBatch:
+    """Return the scenes at indices (N,) along each scene axis."""
+    count = len(indices[0]) if indices else 1
+    values = experiment.scene_values(indices)
+    scenes = build_scenes(values, count, experiment.scene_plugins)
+    visibility = visibility_flags(scenes)
+    boards = values["board"].listed(count) if "board" in values else None
+    targets = target_scenes(scenes, visibility, boards, experiment.largest_board)
+    return SceneBatch(indices, values, scenes, visibility, targets, marker_boxes(scenes))
+
+
+# --------------------------------------------------------------------------------------------------
+# Where images come from: a renderer, or a photograph.
+
+ImageSource = Callable[[Scenes, NDArray[np.intp], Integers, Integers], Sequence[Grey]]
+"""A function from N scenes, the rows (n,) of some, the boxes (n, 4) that their targets can touch,
+and their windows (n, 4) in the frame, to n images of these windows.
+
+It is :func:`sweep.model.renderers.render_all`, which draws a scene or cuts it out of a photograph,
+as the scene's renderer says.
+"""
+
+
+def images_of(
+    source: ImageSource, batch: SceneBatch, rows: NDArray[np.intp], windows: Integers,
+    failures: list[Failure],
+) -> list[Grey | None]:
+    """Return the images of ``rows`` (n,) in their ``windows`` (N, 4); None where that raises."""
+    parts = all_or_each(
+        lambda some: source(batch.scenes, some, batch.boxes[some], windows[some]), rows,
+        lambda row: note_failure(failures, row, "scene"),
+    )
+    return [image for part in parts for image in ([None] if part is None else part)]
+
 
 # --------------------------------------------------------------------------------------------------
 # Where detections come from: a detector that searches images, or what another program found.
@@ -57,15 +126,11 @@ class DetectionSource(Protocol):
         ...
 
     def poses(self, found: Findings) -> Poses | None:
-        """Return the poses that come with what was found; None if there never are any."""
+        """Return the poses (N, 3, 3), (N, 3) in metres that come with what was found.
+
+        NaN where none does; None if there never are any.
+        """
         ...
-
-
-class Poses(NamedTuple):
-    """Poses of N detected targets: (N, 3, 3) and (N, 3) in metres; NaN where none was given."""
-
-    rotation: Floats
-    translation: Floats
 
 
 @dataclass(slots=True)
@@ -160,49 +225,43 @@ class RecordedSearch:
         if the image has no corners.
         """
         part, target = self.recording.rows(self.keys[row]), self.targets.targets[row]
-        given, ids = self.recording.corners[part], self.recording.marker_id[part]
-        missing = np.isnan(given).any(axis=(1, 2))
+        given, ids = self.recording.corners[part], self.recording.marker_id[part].tolist()
+        missing = np.asarray(np.isnan(given).any(axis=(1, 2)))
         numbers = {marker_id: k for k, marker_id in enumerate(target.marker_ids)}
         objects = target.corners_m * (self.scenes.size_m[row] if target.is_marker else 1.0)
-        quads, known, rows = [given[~missing]], ids[~missing].tolist(), np.flatnonzero(~missing)
-        at = rows.tolist()
-        for i in np.flatnonzero(missing).tolist():
-            if ids[i] != OF_TARGET:
-                shown = {int(ids[i]): numbers.get(int(ids[i]), 0)}
+        camera = self.scenes.cameras.take(np.array([row]))
+        quads, found, rows = [np.empty((0, 4, 2))], list[int](), list[int]()
+        for i, marker_id in enumerate(ids):
+            shown = {marker_id: numbers.get(marker_id, 0)}
+            if not missing[i]:
+                quads.append(given[[i]])
             else:
-                shown = numbers if missing.all() else {}
-            points = transform_points(
-                objects[list(shown.values())].reshape(1, -1, 3),
-                self.recording.rotation[part][[i]], self.recording.translation[part][[i]],
-            )
-            pixels = self.scenes.cameras.take(np.array([row])).project(points)
-            quads.append(pixels.reshape(-1, 4, 2))
-            known += shown
-            at += [i] * len(shown)
-        order = np.argsort(at, kind="stable")
+                if marker_id == OF_TARGET:
+                    shown = numbers if missing.all() else {}
+                points = transform_points(
+                    objects[list(shown.values())].reshape(1, -1, 3),
+                    self.recording.rotation[part][[i]], self.recording.translation[part][[i]],
+                )
+                quads.append(camera.project(points).reshape(-1, 4, 2))
+            found += shown
+            rows += [part.start + i] * len(shown)
         return (
-            np.concatenate(quads)[order], np.array(known, dtype=np.int64)[order],
-            part.start + np.array(at, dtype=np.int64)[order],
+            np.concatenate(quads), np.array(found, dtype=np.int64), np.array(rows, dtype=np.int64)
         )
 
 
-def detection_source(
-    setting: AnyDetectorSetting, scenes: Scenes, targets: TargetScenes,
-    keys: NDArray[np.uint64] | None, board_setting: BoardDetectorSetting,
-) -> DetectionSource:
-    """Return where a setting's detections of scenes come from; ``keys`` are for recordings."""
-    if isinstance(setting, PluginSetting) and is_recorded(setting):
-        if keys is None:
-            raise TypeError("recorded detections need keys")
-        return RecordedSearch(setting.record().recording, scenes, targets, keys)
-    return ImageSearch(
-        make_detector(setting), make_board_detector(setting, board_setting), scenes, targets
-    )
-
-
-def is_recorded(setting: AnyDetectorSetting) -> bool:
-    """Return whether a setting takes its detections from a file."""
-    return isinstance(setting, PluginSetting) and is_recording(setting.plugin.name)
+def detection_sources(experiment: Experiment, batch: SceneBatch) -> list[DetectionSource]:
+    """Return where the detections of a batch come from, by detector setting."""
+    scenes, targets = batch.scenes, batch.targets
+    return [
+        RecordedSearch(
+            setting.record().recording, scenes, targets, experiment.image_keys(batch.indices)
+        ) if isinstance(setting, PluginSetting) and is_recording(setting.plugin.name)
+        else ImageSearch(
+            make_detector(setting), make_board_detector(setting, on_board), scenes, targets
+        )
+        for setting, on_board in zip(experiment.detectors, experiment.board_settings, strict=True)
+    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -237,13 +296,13 @@ class SearchResult:
     poses: Poses | None = None
 
 
-def whole_frames(values: Mapping[str, Column], count: int) -> Masks:
+def whole_frames(batch: SceneBatch) -> Masks:
     """Return (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
     whole = map_columns(
         lambda window, background: window == "full" or isinstance(background, str),
-        [values["window"], values["background"]],
+        [batch.values["window"], batch.values["background"]],
     )
-    return whole.broadcast(count, np.bool_)
+    return whole.broadcast(len(batch.scenes), np.bool_)
 
 
 def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
@@ -298,80 +357,75 @@ def common_windows(windows: Sequence[Integers]) -> Integers:
     ], axis=1)
 
 
+def detections_of(
+    experiment: Experiment, batch: SceneBatch, wanted: Masks, failures: list[Failure], *,
+    keep: bool = False,
+) -> tuple[list[SearchResult], float, Floats]:
+    """Render scenes once and search them with each detector setting, as :func:`search` does."""
+    full = whole_frames(batch)
+    cuts = [
+        search_windows(batch.scenes, batch.boxes, setting, full) for setting in experiment.detectors
+    ]
+    return search(batch, wanted, detection_sources(experiment, batch), cuts, failures, keep=keep)
+
+
 def search(
-    scenes: Scenes,
+    batch: SceneBatch,
     wanted: Masks,
-    settings: Sequence[AnyDetectorSetting],
-    full: Masks,
+    sources: Sequence[DetectionSource],
+    cuts: Sequence[Integers],
     failures: list[Failure],
     *,
     keep: bool = False,
-    keys: NDArray[np.uint64] | None = None,
-    targets: TargetScenes | None = None,
-    board_settings: Sequence[BoardDetectorSetting] = (),
 ) -> tuple[list[SearchResult], float, Floats]:
-    """Render each scene once and search it with detector settings.
+    """Render each scene once and search it with each source of detections.
 
     Parameters
     ----------
-    scenes
+    batch
         N scenes.
     wanted
-        (N, settings) which scene is searched with which setting.
-    settings
-        The detector settings.
-    full
-        (N,) scenes that are rendered and searched as whole frames.
+        (N, sources) which scene is searched by which source.
+    sources
+        Where the detections come from: one for each detector setting.
+    cuts
+        Of each source the windows (N, 4) that it searches, as :func:`search_windows` returns them.
     failures
         The exceptions of single scenes are appended.
     keep
         Whether the results keep the images.
-    keys
-        (N,) keys of the images, by which recorded detections are found.
-    targets
-        What the scenes show; by default markers, all of them visible.
-    board_settings
-        What each detector setting does with boards; by default OpenCV's.
 
     Returns
     -------
     results : list of SearchResult
-        One for each setting.
+        One for each source.
     render_s : float
         Seconds spent on rendering.
     row_s : ndarray
         (N,) seconds spent on each scene.
     """
-    if targets is None:
-        targets = target_scenes(scenes, np.full(len(scenes), DetectionStatus.not_run, np.uint8))
-    boxes = marker_boxes(scenes)
-    on_boards = board_settings or [BoardDetectorSetting()] * len(settings)
+    scenes, widest = batch.scenes, common_windows(cuts)
     passes = [
-        _Pass(
-            detection_source(setting, scenes, targets, keys, on_board), k,
-            search_windows(scenes, boxes, setting, full), keep, failures, np.zeros(len(scenes)),
-        )
-        for k, (setting, on_board) in enumerate(zip(settings, on_boards, strict=True))
+        _Pass(source, k, cut.tolist(), widest.tolist(), keep, failures, np.zeros(len(scenes)))
+        for k, (source, cut) in enumerate(zip(sources, cuts, strict=True))
     ]
-    widest = common_windows([each.windows for each in passes])
-    for each in passes:
-        each.cut_from(widest)
-    imaged = wanted & np.array([keep or each.source.needs_images for each in passes])
-    render_s, render_row_s = 0.0, np.zeros(len(scenes))
+    imaged = wanted & np.array([keep or source.needs_images for source in sources])
+    render_s = np.zeros(len(scenes))
     for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
         begun = time.perf_counter()
-        images = rendered(scenes, rows, boxes, widest, failures)
-        spent = time.perf_counter() - begun
-        render_s += spent
-        render_row_s[rows] = spent / len(rows)
+        images = images_of(render_all, batch, rows, widest, failures)
+        render_s[rows] = (time.perf_counter() - begun) / len(rows)
         for each in passes:
-            asked = imaged[rows, each.number]
-            each.search(rows[asked].tolist(), list(compress(images, asked)))
+            for row, image in zip(rows.tolist(), images, strict=True):
+                if imaged[row, each.number]:
+                    each.search(row, image)
     for each in passes:
-        unseen = np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number])
-        each.search(unseen.tolist(), [_UNSEEN] * len(unseen))
-    results = [each.result(targets) for each in passes]
-    return results, render_s, render_row_s + np.sum([each.row_s for each in passes], axis=0)
+        for row in np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number]).tolist():
+            each.search(row, _UNSEEN)
+    return (
+        [each.result(batch.targets, cut[:, :2]) for each, cut in zip(passes, cuts, strict=True)],
+        float(render_s.sum()), render_s + np.sum([each.row_s for each in passes], axis=0),
+    )
 
 
 _UNSEEN = np.empty((0, 0), dtype=np.uint8)
@@ -380,64 +434,51 @@ _UNSEEN = np.empty((0, 0), dtype=np.uint8)
 
 @dataclass(slots=True)
 class _Pass:
-    """The search with one setting, its windows (N, 4) and its outputs by row.
+    """The search by one source: its windows, those that are rendered, and its outputs by row.
 
-    ``crops`` are the windows in the rendered images, if these are larger; ``failed`` are the rows
-    for which it raised, ``row_s`` (N,) the seconds spent on each.
+    ``row_s`` (N,) are the seconds spent on each scene, ``failed`` the rows that raised.
     """
 
     source: DetectionSource
     number: int
-    windows: Integers
+    cuts: list[list[int]]
+    rendered: list[list[int]]
     keep: bool
     failures: list[Failure]
     row_s: Floats
-    crops: list[list[int]] | None = None
     outputs: dict[int, SearchOutput] = field(default_factory=dict)
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
-    seconds: float = 0.0
 
-    def cut_from(self, rendered: Integers) -> None:
-        """Take the windows' images from those of windows (N, 4), which hold them."""
-        if not (self.windows == rendered).all():
-            self.crops = (self.windows - np.tile(rendered[:, :2], 2)).tolist()
+    def search(self, row: int, image: Grey | None) -> None:
+        """Search the rendered image of a scene; None is one that was not rendered."""
+        begun = time.perf_counter()
+        if image is None:
+            self.failed.append(row)
+            return
+        if image is not _UNSEEN and self.cuts[row] != self.rendered[row]:
+            (x0, y0, x1, y1), (left, top, _, _) = self.cuts[row], self.rendered[row]
+            image = image[y0 - top : y1 - top, x0 - left : x1 - left]
+        if self.keep:
+            self.images[row] = image
+        try:
+            self.outputs[row] = self.source(row, image)
+        except Exception as error:
+            if self.source.needs_images:
+                raise_machine_fault(error)
+            note_failure(self.failures, row, "detection", self.number)
+            self.failed.append(row)
+        self.row_s[row] = time.perf_counter() - begun
 
-    def search(self, rows: Sequence[int], images: Sequence[Grey | None]) -> None:
-        """Search the rendered images of scenes ``rows``; None are those that were not rendered."""
-        begun = now = time.perf_counter()
-        for row, image in zip(rows, images, strict=True):
-            start = now
-            if image is None:
-                self.failed.append(row)
-                continue
-            searched = image
-            if self.crops is not None:
-                x0, y0, x1, y1 = self.crops[row]
-                searched = image[y0:y1, x0:x1]
-            if self.keep:
-                self.images[row] = searched
-            try:
-                self.outputs[row] = self.source(row, searched)
-            except Exception as error:
-                if self.source.needs_images:
-                    raise_machine_fault(error)
-                text = exception_text(len(self.failures))
-                self.failures.append(Failure(row, "detection", text, self.number))
-                self.failed.append(row)
-            now = time.perf_counter()
-            self.row_s[row] += now - start
-        self.seconds += now - begun
-
-    def result(self, targets: TargetScenes) -> SearchResult:
-        """Return what was found."""
-        start, origins = time.perf_counter(), self.windows[:, :2]
+    def result(self, targets: TargetScenes, origins: Integers) -> SearchResult:
+        """Return what was found in windows whose first pixels are ``origins`` (N, 2)."""
+        begun = time.perf_counter()
         offset = origins if self.source.needs_images else np.zeros_like(origins)
         found = classify(targets, self.outputs, offset.astype(np.float64))
         flags = found.flags.copy()
         flags[self.failed] = DetectionStatus.failed
         poses = self.source.poses(found)
-        seconds = self.seconds + time.perf_counter() - start
+        seconds = float(self.row_s.sum()) + time.perf_counter() - begun
         return SearchResult(targets, found, flags, seconds, self.images, origins, poses)
 
 
@@ -459,24 +500,3 @@ def _groups(
     alone = ~plain[rows]
     cuts = (np.diff(number) != 0) | alone[1:] | alone[:-1]
     yield from np.split(rows, np.flatnonzero(cuts) + 1)
-
-
-def rendered(
-    scenes: Scenes, rows: NDArray[np.intp], boxes: Integers, windows: Integers,
-    failures: list[Failure],
-) -> Sequence[Grey | None]:
-    """Return the images of ``rows`` in their windows; None for those whose rendering raised."""
-    try:
-        return render_all(scenes, rows, boxes[rows], windows[rows])
-    except Exception as batch_error:
-        raise_machine_fault(batch_error)
-        images: list[Grey | None] = []
-        for row in rows.tolist():
-            alone = np.array([row])
-            try:
-                images += render_all(scenes, alone, boxes[alone], windows[alone])
-            except Exception as error:
-                raise_machine_fault(error)
-                failures.append(Failure(row, "scene", exception_text(len(failures))))
-                images.append(None)
-        return images

@@ -6,16 +6,16 @@ the table of its stage below; a variable with one but not the other is refused o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.search import SearchResult
+from sweep.evaluation.search import SceneBatch, SearchResult
 from sweep.experiment.parameters import Stage
-from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA, VARIABLES
+from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA
 from sweep.measure.bound import Bounds
 from sweep.measure.classify import TargetScenes
 from sweep.measure.estimation import (
@@ -26,21 +26,18 @@ from sweep.measure.estimation import (
     squared_deviations,
 )
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.model.camera import Column
 from sweep.model.extent import areas_px
 from sweep.model.polygon import signed_areas
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)
 class SceneResults:
-    """N scenes, their parameters, their targets and their accuracy bounds."""
+    """N scenes with their parameters and targets, and their accuracy bounds."""
 
-    scenes: Scenes
-    values: Mapping[str, Column]
-    targets: TargetScenes
+    batch: SceneBatch
     bounds: Bounds
 
 
@@ -90,11 +87,6 @@ def target_areas_px(scenes: Scenes, targets: TargetScenes) -> Floats:
     return np.where(unseen.all(axis=1), np.nan, total)
 
 
-def _centre_px(results: SceneResults) -> Floats:
-    scenes = results.scenes
-    return np.asarray(scenes.cameras.project(scenes.translation[:, None])[:, 0])
-
-
 def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
     solved = results.estimates.status == EstimateStatus.solved
     flipped = np.where(results.error.flipped, Flipped.flipped, Flipped.not_flipped)
@@ -135,32 +127,38 @@ GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
 """Variable that follows from camera and pose -> its values (N, ...)."""
 
 
-def _of_geometry(
-    function: Callable[[Scenes], NDArray[Any]]
-) -> Callable[[SceneResults], NDArray[Any]]:
-    return lambda results: function(results.scenes)
+def _centre_px(scenes: Scenes) -> Floats:
+    return np.asarray(scenes.cameras.project(scenes.translation[:, None])[:, 0])
 
+
+OF_PHOTOGRAPHS: dict[str, Callable[[Scenes], NDArray[Any]]] = {
+    "side_px": lambda scenes: (
+        scenes.cameras.view[:, 0] * scenes.size_m / scenes.translation[:, 2]
+    ),
+    "distance_m": lambda scenes: scenes.translation[:, 2],
+    "image_x_px": lambda scenes: _centre_px(scenes)[:, 0],
+    "image_y_px": lambda scenes: _centre_px(scenes)[:, 1],
+}
+"""Variable of photographs, whose poses are not drawn but found -> its values (N,)."""
 
 SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
-    **{name: _of_geometry(function) for name, function in GEOMETRY.items()},
-    "marker_area_px": lambda results: target_areas_px(results.scenes, results.targets),
+    **{
+        name: lambda results, function=function: function(results.batch.scenes)  # type: ignore[misc]
+        for name, function in (GEOMETRY | OF_PHOTOGRAPHS).items()
+    },
+    "marker_area_px": lambda results: target_areas_px(
+        results.batch.scenes, results.batch.targets
+    ),
     "board_marker_id": lambda results: np.where(
-        results.targets.marker_id < 0, np.nan, results.targets.marker_id
+        results.batch.targets.marker_id < 0, np.nan, results.batch.targets.marker_id
     ),
     "bound": lambda results: results.bounds.status,
     "bound_std": lambda results: results.bounds.std,
     "bound_kappa": lambda results: results.bounds.kappa,
     "mirror_distance": lambda results: results.bounds.mirror_distance,
-    # Of photographs, whose poses are not drawn but found.
-    "side_px": lambda results: (
-        results.scenes.cameras.view[:, 0] * results.scenes.size_m / results.scenes.translation[:, 2]
-    ),
-    "distance_m": lambda results: results.scenes.translation[:, 2],
-    "tilt_deg": lambda results: results.values["resolved_tilt_deg"].values,
-    "image_x_px": lambda results: _centre_px(results)[:, 0],
-    "image_y_px": lambda results: _centre_px(results)[:, 1],
-    "truth": lambda results: results.values["truth"].values,
-    "truth_std": lambda results: results.values["truth_std"].values,
+    "tilt_deg": lambda results: results.batch.values["resolved_tilt_deg"].values,
+    "truth": lambda results: results.batch.values["truth"].values,
+    "truth_std": lambda results: results.batch.values["truth_std"].values,
 }
 """Variable of the scene -> its values (N, ...)."""
 
@@ -199,6 +197,9 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
 }
 """Variable of the estimation -> its values (n, ...) for the scenes with a detection."""
 
+ALL = slice(None)
+"""All scenes."""
+
 WITHOUT_DETECTION: dict[str, int] = {
     "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
 }
@@ -222,37 +223,13 @@ check_complete({Stage.scene: SCENE, Stage.detection: DETECTION, Stage.estimation
 Results = TypeVar("Results")
 
 
-def compute(
-    table: Mapping[str, Callable[[Results], NDArray[Any]]], results: Results,
-    names: Collection[str],
-) -> dict[str, NDArray[Any]]:
-    """Return every variable of a table that is among ``names``."""
-    return {name: function(results) for name, function in table.items() if name in names}
+def write(
+    columns: Mapping[str, NDArray[Any]], table: Mapping[str, Callable[[Results], NDArray[Any]]],
+    results: Results, configuration: int, rows: NDArray[np.intp] | slice = ALL,
+) -> None:
+    """Write the variables of a table to those columns (configurations, N, ...) that exist.
 
-
-def compute_estimation(
-    results: EstimationResults, rows: NDArray[np.intp], needed: Masks, names: Collection[str]
-) -> dict[str, NDArray[Any]]:
-    """Return the estimation variables (N, ...) over all scenes.
-
-    Parameters
-    ----------
-    results
-        Results of the n scenes with a detection.
-    rows
-        (n,) their numbers among the N scenes.
-    needed
-        (N,) scenes whose estimate was asked for; the flags of the others are ``not_run``.
-    names
-        The variables that are wanted.
+    ``rows`` (n,) are the scenes whose ``results`` they are computed from.
     """
-    columns = {}
-    for name, values in compute(ESTIMATION, results, names).items():
-        variable = VARIABLES[name]
-        fill = WITHOUT_DETECTION.get(name, variable.fill)
-        column = np.full((len(needed), *values.shape[1:]), fill, dtype=values.dtype)
-        column[rows] = values
-        if variable.flags is not None:
-            column[~needed] = variable.fill
-        columns[name] = column
-    return columns
+    for name in table.keys() & columns.keys():
+        columns[name][configuration, rows] = table[name](results)

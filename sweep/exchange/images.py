@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.block import scenes_at
-from sweep.evaluation.search import common_windows, search_windows, whole_frames
+from sweep.evaluation.search import common_windows, scenes_at, search_windows, whole_frames
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS, VARIABLES, Variable
@@ -26,7 +25,6 @@ from sweep.measure.classify import TargetScenes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.camera import Column
-from sweep.model.extent import marker_boxes
 from sweep.model.polygon import signed_areas
 from sweep.model.scene import Scenes
 from sweep.store.files import write_whole
@@ -63,7 +61,7 @@ class ImageBatch:
     keys: NDArray[np.uint64]
     scenes: Scenes
     targets: TargetScenes
-    values: dict[str, Column]
+    values: Mapping[str, Column]
     visible: Masks
     boxes: Integers
     windows: Integers
@@ -99,11 +97,11 @@ def image_batch(
     A window is the smallest that holds those of all detector settings of the experiment.
     """
     indices = scene_indices(pipeline, numbers)
-    batch = scenes_at(pipeline, indices)
-    scenes, boxes = batch.scenes, marker_boxes(batch.scenes)
+    batch = scenes_at(pipeline.experiment, indices)
+    scenes, boxes = batch.scenes, batch.boxes
     windows = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     if windowed:
-        full = whole_frames(batch.values, len(numbers))
+        full = whole_frames(batch)
         windows = common_windows([
             search_windows(scenes, boxes, setting, full)
             for setting in pipeline.experiment.detectors
@@ -111,7 +109,7 @@ def image_batch(
     return ImageBatch(
         np.asarray(numbers), pipeline.experiment.image_keys(indices), scenes, batch.targets,
         batch.values,
-        batch.visibility == DetectionStatus.not_run, boxes, windows,
+        batch.visible, boxes, windows,
     )
 
 

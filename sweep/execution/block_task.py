@@ -289,7 +289,7 @@ def _computed_here(
     """Compute cells in this process; None if that raises as a whole, as single scenes may."""
     try:
         with ending_after(WHOLE * time_limit_s):
-            return run_cells(pipeline, indices, need)
+            return run_cells(pipeline.experiment, indices, need)
     except MachineFaultError:
         raise
     except Exception:
@@ -316,16 +316,14 @@ def _summed(
 def _columns(
     variable: Variable, cells: CellsResult | None, rows: NDArray[np.intp], pipeline: Pipeline,
     count: int,
-) -> list[NDArray[Any]]:
-    """Return a variable's columns (N, ...) by configuration: computed in ``rows``, else fill."""
-    if cells is not None and len(rows) == count:
-        return cells.columns[variable.name]
-    columns = []
-    for k in range(variable.configurations(pipeline)):
-        whole = np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
-        if cells is not None:
-            whole[rows] = cells.columns[variable.name][k]
-        columns.append(whole)
+) -> NDArray[Any]:
+    """Return a variable (configurations, N, ...): computed in ``rows``, else its fill value."""
+    columns = np.full(
+        (variable.configurations(pipeline), count, *variable.inner_shape), variable.fill,
+        dtype=variable.dtype,
+    )
+    if cells is not None:
+        columns[:, rows] = cells.columns[variable.name]
     return columns
 
 

@@ -101,7 +101,7 @@ def seconds_of(pipelines: Sequence[Pipeline], count: int) -> tuple[list[float], 
         spent.append([])
         for pipeline in pipelines:
             begun, compiled = time.thread_time(), compilation_s()
-            run_cells(pipeline, indices)
+            run_cells(pipeline.experiment, indices)
             took_s = time.thread_time() - begun - (compilation_s() - compiled)
             spent[-1].append(max(took_s, 1e-9))
     number = len(indices[0]) if indices else 1

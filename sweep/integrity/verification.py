@@ -277,8 +277,7 @@ def _compared(
     for row, (scene, stored) in enumerate(scenes.items()):
         values = {
             variable.name: to_dataset_layout(
-                variable, pipeline, one,
-                [column[row : row + 1] for column in computed.columns[variable.name]])
+                variable, pipeline, one, computed.columns[variable.name][:, row : row + 1])
             for variable in store.variables
         }
         same_processor = tuple(sound[scene[0]].processors) == (processor(),)

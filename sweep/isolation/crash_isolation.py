@@ -70,7 +70,7 @@ def _hold(pipeline: Pipeline) -> None:
 
 
 def _run_held(*arguments: Any) -> CellsResult:
-    return run_cells(_held[0], *arguments)
+    return run_cells(_held[0].experiment, *arguments)
 
 
 class _IsolatedCells:
@@ -227,7 +227,7 @@ class _Scene:
         self._need = need
         self._share = PART
         self._failures: list[Failure] = []
-        self._result = CellsResult.not_run(pipeline, 1)
+        self._result = CellsResult.not_run(pipeline.experiment, 1)
 
     def compute(self) -> CellsResult:
         """Return the scene's cells; those that do not work are flagged."""

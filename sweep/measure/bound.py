@@ -35,15 +35,12 @@ from sweep.measure.likelihood import (
 )
 from sweep.model import coverage
 from sweep.model.board import side_m
-from sweep.model.derivatives import (
-    POSE,
-    work_space,
-)
+from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND
 from sweep.model.polygon import Projection
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # The Cramér-Rao bound of the exact image's pixels: the least error of any unbiased estimate.
@@ -180,9 +177,12 @@ def outside_model(scenes: Scenes, row: int) -> BoundStatus:
 
 
 def bounds(
-    scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], unknown_blur: bool
+    scenes: Scenes, boxes: NDArray[np.int64], asked: NDArray[np.str_], visible: Masks
 ) -> Bounds:
-    """Return the bounds of visible scenes ``rows`` (n,) with the prints' ``boxes`` (n, 4).
+    """Return the bounds of N scenes with the prints' ``boxes`` (N, 4).
+
+    ``asked`` (N,) are values of :class:`BoundSetting`, ``visible`` (N,) the scenes that can have
+    one.
 
     The bound is that of the exact image, after its gain, whichever renderer draws it: of the pixels
     in ``boxes`` and of up to :data:`~sweep.measure.likelihood.BACKGROUND_MARGIN_PX` around them, as
@@ -198,44 +198,43 @@ def bounds(
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
     section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
     """
-    count = len(rows)
-    status = np.full(count, BoundStatus.given, dtype=np.uint8)
+    count = len(scenes)
+    status = np.where(asked == "none", BoundStatus.not_run, BoundStatus.not_visible)
+    status = status.astype(np.uint8)
     std, kappa, mirror = np.full((count, POSE), np.nan), *np.full((2, count), np.nan)
-    frames = scenes.frame[rows]
     low = np.maximum(boxes[:, :2] - BACKGROUND_MARGIN_PX, 0)
-    high = np.minimum(boxes[:, 2:] + BACKGROUND_MARGIN_PX, frames)
-    for i, row in enumerate(rows.tolist()):
-        noise, gain, blur = (
-            scenes.effects.of(row)[name]
-            for name in ("noise_grey", "gain", "blur_px")
-        )
-        levels = scenes.levels[row] * gain
-        status[i] = outside_model(scenes, row)
-        if status[i] != BoundStatus.given:
+    high = np.minimum(boxes[:, 2:] + BACKGROUND_MARGIN_PX, scenes.frame)
+    for row in np.flatnonzero(visible & (asked != "none")).tolist():
+        status[row] = outside_model(scenes, row)
+        if status[row] != BoundStatus.given:
             continue
+        effects, rotation = scenes.effects.of(row), scenes.rotation[row]
         target, translation = scenes.target(row), scenes.translation[row]
         view = marker_view(
-            target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row), low[i],
-            noise_variance(noise), (scenes.rotation[row], translation),
+            target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row),
+            low[row], noise_variance(effects["noise_grey"]), (rotation, translation),
         )
-        arm = scenes.rotation[row] @ middle_m(target)
-        state = state_of(scenes.rotation[row], translation + arm, blur, levels)
-        width, height = (high[i] - low[i]).tolist()
+        arm = rotation @ middle_m(target)
+        state = state_of(
+            rotation, translation + arm, effects["blur_px"], scenes.levels[row] * effects["gain"]
+        )
+        width, height = (high[row] - low[row]).tolist()
+        unknown_blur = bool(asked[row] == "unknown_blur")
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
         image = np.zeros((height, width))
         if target.distractors:
-            left, top = low[i].tolist()
+            left, top = low[row].tolist()
             box = left, top, left + width, top + height
             image[beside_pixels(scenes, row, box)] = np.nan
-        covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
+        covariance, exists, kappa[row], mirror_chi_square = bound_of_scene(
             state, view, image, unknown_blur
         )
         if not exists:
-            status[i] = BoundStatus.no_contrast
+            status[row] = BoundStatus.no_contrast
             continue
         if arm.any():
             covariance = covariance_elsewhere(covariance, -arm)
-        std[i] = np.sqrt(np.diag(covariance))
-        mirror[i] = math.sqrt(mirror_chi_square)
+        std[row] = np.sqrt(np.diag(covariance))
+        mirror[row] = math.sqrt(mirror_chi_square)
     return Bounds(status, std, kappa, mirror)

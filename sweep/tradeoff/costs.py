@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sweep.evaluation.block import SceneBatch, detections_for, scenes_at, search_batch
+from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import DetectionSource, SearchResult, detection_source
+from sweep.evaluation.search import (
+    DetectionSource,
+    SceneBatch,
+    SearchResult,
+    detection_sources,
+    detections_of,
+    scenes_at,
+)
 from sweep.experiment.axes import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
@@ -24,7 +31,6 @@ from sweep.measure.detectors import AnyDetectorSetting, DetectorSetting, full_fr
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.typing import Floats, Grey
 
@@ -385,22 +391,17 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
     count = len(indices[0]) if indices else 1
-    batch = scenes_at(pipeline, indices)
-    rows = np.flatnonzero(batch.visibility == DetectionStatus.not_run)
+    experiment = pipeline.experiment
+    batch = scenes_at(experiment, indices)
+    rows = np.flatnonzero(batch.visible)
     if 0 < len(rows) < count:
         return _prepare(pipeline, [index[rows] for index in indices], most)
     if count > most:
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
         return _prepare(pipeline, [index[chosen] for index in indices], most)
-    experiment = pipeline.experiment
     wanted = np.full((count, len(experiment.detectors)), len(rows) > 0)
-    searches, _, _ = search_batch(pipeline, batch, wanted, [], keep=True)
-    sources = [
-        detection_source(setting, batch.scenes, batch.targets, None, on_board)
-        for setting, on_board in zip(
-            experiment.detectors, experiment.board_settings, strict=True)
-    ]
-    return _Condition(batch, searches, sources)
+    searches, _, _ = detections_of(experiment, batch, wanted, [], keep=True)
+    return _Condition(batch, searches, detection_sources(experiment, batch))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -444,10 +445,10 @@ def measure_renderers(
     interrupts
         Checked between two measurements.
     """
-    batches = [scenes_at(pipeline, indices) for indices in samples]
+    batches = [scenes_at(pipeline.experiment, indices) for indices in samples]
     scenes = [batch.scenes for batch in batches]
-    rows = np.flatnonzero(batches[reference].visibility == DetectionStatus.not_run)
-    boxes = [marker_boxes(each)[rows] for each in scenes]
+    rows = np.flatnonzero(batches[reference].visible)
+    boxes = [batch.boxes[rows] for batch in batches]
     windows = np.concatenate(
         [np.min([box[:, :2] for box in boxes], axis=0),
          np.max([box[:, 2:] for box in boxes], axis=0)],

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from support.blocks import run_cells
 from sweep.errors import PipelineError
-from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from tests.adapters.test_adapters import MODULES

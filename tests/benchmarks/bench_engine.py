@@ -77,7 +77,7 @@ def bare(text, start, stop, seconds, at):
     """Run the kernel alone on a part of the trials; report scenes and time."""
     pipeline = Pipeline.from_text(text)
     axes = pipeline.experiment.scene_axes
-    run_cells(pipeline, [np.zeros(1, dtype=np.intp) for _ in axes])
+    run_cells(pipeline.experiment, [np.zeros(1, dtype=np.intp) for _ in axes])
     while time.time() < at:
         time.sleep(0.001)
     begun = time.perf_counter()
@@ -85,7 +85,7 @@ def bare(text, start, stop, seconds, at):
     for trial in range(start, stop):
         lengths = tuple(len(axis) for axis in axes)
         block = Block((0, 0, 0, trial), (*lengths[:3], trial + 1))
-        run_cells(pipeline, block_indices(block))
+        run_cells(pipeline.experiment, block_indices(block))
         done += len(block)
     seconds.put((done, time.perf_counter() - begun))
 
@@ -149,7 +149,7 @@ def shared_work():
     ratios = []
     for _ in range(REPEATS):
         begun = time.perf_counter()
-        one = run_cells(together, indices)
+        one = run_cells(together.experiment, indices)
         joint = time.perf_counter() - begun
         apart = 0.0
         for k, refinement in enumerate(("none", "subpix", "contour", "apriltag")):
@@ -158,7 +158,7 @@ def shared_work():
                     text, [f"cornerRefinementMethod={refinement}", f"solver={solver}"]
                 )
                 begun = time.perf_counter()
-                other = run_cells(single, indices)
+                other = run_cells(single.experiment, indices)
                 apart += time.perf_counter() - begun
                 for name in ("estimate", "rotation_error_rad", "reprojection_error_px"):
                     np.testing.assert_array_equal(
@@ -222,7 +222,7 @@ def one(i):
     """One pose by number, as a user's function would compute it."""
     pipeline, shape = setup()
     indices = [np.array([k], dtype=np.intp) for k in np.unravel_index(i, shape)]
-    columns = run_cells(pipeline, indices).columns
+    columns = run_cells(pipeline.experiment, indices).columns
     return {name: parts[0][0] for name, parts in columns.items()}
 
 

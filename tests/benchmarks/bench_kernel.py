@@ -17,13 +17,10 @@ from tables import header, row
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
+from sweep.evaluation.search import scenes_at, search_windows, whole_frames
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import Detector, charuco_board
-from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
-from sweep.model.scene import build_scenes
 
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}
@@ -98,13 +95,11 @@ class Block:
         self.pipeline = Pipeline.from_text(text.format(
             width=width, height=height, focal=4 / 4.8 * width, poses=poses, **given))
         self.poses, self.indices = poses, [np.arange(poses)]
-        self.values = self.pipeline.experiment.scene_values(self.indices)
-        self.scenes = build_scenes(self.values, poses)
-        self.boxes = marker_boxes(self.scenes)
-        self.rows = np.flatnonzero(visibility_flags(self.scenes) == DetectionStatus.not_run)
+        batch = scenes_at(self.pipeline.experiment, self.indices)
+        self.values, self.scenes, self.boxes = batch.values, batch.scenes, batch.boxes
+        self.rows = np.flatnonzero(batch.visible)
         self.setting = self.pipeline.experiment.detectors[0]
-        self.cut = search_windows(
-            self.scenes, self.boxes, self.setting, whole_frames(self.values, poses))
+        self.cut = search_windows(self.scenes, self.boxes, self.setting, whole_frames(batch))
         self.camera = self.scenes.cameras.matrix(0)
         self.posed = [
             (cv2.Rodrigues(self.scenes.rotation[k])[0], self.scenes.translation[k])
@@ -112,7 +107,7 @@ class Block:
         ]
 
     def run(self):
-        return run_cells(self.pipeline, self.indices)
+        return run_cells(self.pipeline.experiment, self.indices)
 
     def images(self, windows, a_time=100):
         """Yield the images of the visible scenes."""

@@ -22,7 +22,7 @@ from support.board_scenes import board_scene
 from support.photographs import drawn_pose, photograph
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import search, whole_frames
+from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bound_of_scene
 from sweep.measure.estimation import Detections
@@ -32,8 +32,6 @@ from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco
-from sweep.model.extent import marker_boxes
-from sweep.model.scene import build_scenes
 
 SCENES = 120
 SIDES = (20, 50, 100, 150)
@@ -74,19 +72,17 @@ def measured(side, tilt):
     """Return ms of the bound, of two starts and of four, a scene."""
     pipeline = Pipeline.from_text(
         TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)).replace("SCENES", str(SCENES)))
-    values = pipeline.experiment.scene_values([np.arange(SCENES)])
-    scenes = build_scenes(values, SCENES)
-    box = marker_boxes(scenes)[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
+    batch = scenes_at(pipeline.experiment, [np.arange(SCENES)])
+    scenes, values = batch.scenes, batch.values
+    box = batch.boxes[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
     view = marker_view(
         scenes.target(0), scenes.size_m[0], scenes.cameras.optics(0), box[:2], noise_variance(2.0)
     )
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()
     image = np.zeros((height, width))
-    found, _, _ = search(
-        scenes, np.ones((SCENES, 1), dtype=bool), pipeline.experiment.detectors,
-        whole_frames(values, SCENES), [], keep=True,
-    )
+    found, _, _ = detections_of(
+        pipeline.experiment, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = detections_for(pipeline.experiment.estimators[0], values, scenes, found[0], rows)
     return (

@@ -35,7 +35,7 @@ EXTENTS = (1, 200, 50)
 ROUNDS = 7
 
 
-def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
+def noisy_cells(experiment, indices, need=None):  # noqa: ARG001
     """Return random results of the scenes at ``indices``, nine in ten of them solved."""
     count = len(indices[0])
     generator = np.random.default_rng([int(index[0]) for index in indices])
@@ -48,7 +48,7 @@ def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
     }
     absent = ("bound_", "mirror", "predicted", "nees", "residual")
     columns = {}
-    for variable in pipeline.experiment.variables:
+    for variable in experiment.variables:
         if variable.flags is not None:
             values = flags[variable.name]
         else:
@@ -57,7 +57,7 @@ def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
                 values[:] = np.nan
             elif variable.stage is not Stage.scene:
                 values[~solved] = np.nan
-        columns[variable.name] = [values.astype(variable.dtype)]
+        columns[variable.name] = values.astype(variable.dtype)[None]
     seconds = {"scene": [1e-6], "detection": [1e-6], "estimation": [1e-6]}
     return CellsResult(columns, seconds, np.full(count, 1e-7))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import sweep
+from support.blocks import run_cells
 from sweep.errors import PipelineError, StoreError
-from sweep.evaluation.block import run_cells
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
 from sweep.experiment.parameters import Stage

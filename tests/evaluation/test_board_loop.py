@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.blocks import run_block
+from support.blocks import run_block, run_cells
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
-from sweep.evaluation.block import run_cells
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes

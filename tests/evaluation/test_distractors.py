@@ -4,13 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
+from support import searching
+from support.blocks import run_cells
 from support.lengths import lengths
-from sweep.evaluation.block import run_cells
-from sweep.evaluation.search import search, search_windows, visibility_flags
+from sweep.evaluation.search import search_windows, visibility_flags
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
-from sweep.measure.detectors import BoardDetectorSetting, DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
@@ -52,15 +53,11 @@ def searched(chosen, count, window):
     shape = tuple(len(axis) for axis in chosen.experiment.scene_axes)
     values = chosen.experiment.scene_values(block_indices(Block((0,) * len(shape), shape)))
     scenes = build_scenes(values, count)
-    flags = visibility_flags(scenes)
-    boards = target_scenes(
-        scenes, flags, values["board"].listed(count), chosen.experiment.largest_board)
-    results, _, _ = search(
-        scenes, (flags == DetectionStatus.not_run)[:, None], [DetectorSetting()],
-        np.full(count, window == "full"), [], targets=boards,
-        board_settings=[BoardDetectorSetting()],
-    )
-    return scenes, results[0].found
+    visible = visibility_flags(scenes) == DetectionStatus.not_run
+    boards = values["board"].listed(count), chosen.experiment.largest_board
+    full = window == "full"
+    return scenes, searching.searched(
+        scenes, DetectorSetting(), full=full, wanted=visible, boards=boards).found
 
 
 @lengths(4, 80)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, DetectionStatus
 
@@ -41,7 +41,7 @@ RAISED = "z_m = 0.01\n"
 def test_listed_ids_and_sides_are_printed_whatever_the_default_side(default, listed):
     result = run_cells(Pipeline.from_text(TEXT.format(default=default) + listed), [])
     assert not result.failures
-    columns = {name: parts[0][0] for name, parts in result.columns.items() if parts}
+    columns = {name: parts[0][0] for name, parts in result.columns.items()}
     assert (columns["marker_detection"] == DetectionStatus.detected).all()
     # Of markers 40 and 50 px wide; drawn by another side they would be 5 px off.
     assert np.abs(columns["marker_corner_error_px"]).max() < 1

@@ -10,8 +10,9 @@ from numba.core.errors import TypingError
 
 import sweep
 from support import machine_faults
+from support.blocks import run_cells
 from sweep.errors import MachineFaultError, StoreError
-from sweep.evaluation.block import run_cells, warm_up
+from sweep.evaluation.block import warm_up
 from sweep.evaluation.machine_faults import machine_fault
 
 PIPELINE = sweep.Pipeline.from_dict(

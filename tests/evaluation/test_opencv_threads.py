@@ -5,7 +5,7 @@ import threading
 import cv2
 import pytest
 
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.evaluation.inspection import inspect_scene
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.experiment.pipeline import Pipeline

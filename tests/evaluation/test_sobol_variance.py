@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import sweep
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.experiment.draws import REPLICATES
 
 PIPELINE = {

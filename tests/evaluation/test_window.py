@@ -6,10 +6,11 @@ import pytest
 
 from support.blocks import run_block
 from support.lengths import lengths
+from support.searching import searched
 from support.windows import corners_of, outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import search, search_windows, visibility_flags
+from sweep.evaluation.search import search_windows, visibility_flags
 from sweep.experiment.grid import (
     Block,
     block_indices,
@@ -62,14 +63,7 @@ def visible_scenes(count, width=640, height=480, settings=()):
 @single_threaded()
 def both_searches(scenes, setting):
     """Return what a setting finds in the windows, and in the whole frames."""
-    everything = np.ones((len(scenes), 1), dtype=bool)
-    failures = []
-    windowed, framed = (
-        search(scenes, everything, [setting], np.full(len(scenes), full), failures)[0][0]
-        for full in (False, True)
-    )
-    assert not failures
-    return windowed, framed
+    return searched(scenes, setting), searched(scenes, setting, full=True)
 
 
 def compare(count, width, height, refinement, claim):
@@ -242,12 +236,10 @@ def test_deglitching_is_refused_or_does_not_depend_on_the_order_of_scenes(count)
         return
     setting = DetectorSetting(cornerRefinementMethod="apriltag", aprilTagDeglitch=1)
     scenes = visible_scenes(count)
-    full = np.zeros(count, dtype=bool)
-    forth = search(scenes, np.ones((count, 1), dtype=bool), [setting], full, [])[0][0].flags
+    forth = searched(scenes, setting).flags
     back = np.empty_like(forth)
     for row in reversed(range(count)):
-        only = (np.arange(count) == row)[:, None]
-        back[row] = search(scenes, only, [setting], full, [])[0][0].flags[row]
+        back[row] = searched(scenes, setting, wanted=np.arange(count) == row).flags[row]
     np.testing.assert_array_equal(back, forth)
 
 

@@ -68,7 +68,7 @@ tilt_deg = -30
 
 def results_of(pipeline):
     lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return compute_block(pipeline, Block((0,) * len(lengths), lengths))
+    return compute_block(pipeline.experiment, Block((0,) * len(lengths), lengths))
 
 
 def rows_of(path):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from support.blocks import run_cells
 from sweep import cli
 from sweep.errors import ArgumentError, StoreError
-from sweep.evaluation.block import run_cells
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.exchange.images import scene_indices

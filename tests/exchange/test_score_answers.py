@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import sweep
+from support.blocks import run_cells
 from support.here import calls_here
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import ArgumentError, PipelineError, StoreError
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import inspect_scene
 from sweep.exchange.answers import Conventions
 from sweep.exchange.export import export

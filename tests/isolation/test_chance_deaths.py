@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from support.blocks import run_cells
 from support.commands import command
 from sweep.errors import MachineFaultError
-from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus

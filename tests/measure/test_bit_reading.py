@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import sweep
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.experiment.grid import Block, block_indices
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus

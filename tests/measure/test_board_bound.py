@@ -16,6 +16,7 @@ from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+ASKED = {False: np.array(["known_blur"]), True: np.array(["unknown_blur"])}
 LEVELS = np.array([120.0, 40.0, 200.0])
 NOISE = 2.0
 
@@ -97,7 +98,7 @@ def scene(board, **given):
 
 def found_of(scenes, unknown_blur=False, boxes=None):
     boxes = marker_boxes(scenes) if boxes is None else boxes
-    found = bounds(scenes, np.array([0]), boxes, unknown_blur)
+    found = bounds(scenes, boxes, ASKED[unknown_blur], np.array([True]))
     assert found.status[0] == BoundStatus.given
     return found
 

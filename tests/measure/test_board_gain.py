@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import EstimateStatus
 
@@ -26,7 +26,7 @@ def board_of(rows):
         "estimator": {"solver": "iterative"},
         "axes": {"trial": POSES},
     }), [np.arange(POSES)])
-    columns = {name: parts[0] for name, parts in result.columns.items() if parts}
+    columns = {name: parts[0] for name, parts in result.columns.items()}
     assert (columns["estimate"] == EstimateStatus.solved).all()
     middles = (np.arange(rows) - (rows - 1) / 2) * pitch
     half = SIDE_M / 2

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from support.blocks import run_cells
 from support.solving import BOARD_METHODS, BoardPoints, detected
-from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import PointSolver
@@ -105,7 +105,7 @@ solver = "sqpnp"
 """
     pipeline = Pipeline.from_text(text, [f"tilt_deg={tilt_deg}", f"solver={solver!r}"])
     result = run_cells(pipeline, [])
-    columns = {name: parts[0] for name, parts in result.columns.items() if parts}
+    columns = {name: parts[0] for name, parts in result.columns.items()}
     assert columns["detection"][0] == DetectionStatus.detected
     assert columns["estimate"][0] == EstimateStatus.solved
     assert np.linalg.norm(columns["rotation_error_rad"][0]) < 0.1

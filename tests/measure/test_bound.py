@@ -20,9 +20,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
+from support.blocks import run_cells
 from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 from support.lengths import lengths
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
@@ -33,6 +33,7 @@ from sweep.model.extent import marker_boxes
 from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import build_scenes
 
+ASKED = {False: np.array(["known_blur"]), True: np.array(["unknown_blur"])}
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 LENS_BY_COUNT = {len(lens): lens for lens in LENSES}
 
@@ -164,7 +165,7 @@ class Drawing:
         return pose * np.outer(unit, unit)
 
     def found(self):
-        return bounds(self.scenes, np.array([0]), self.boxes, self.unknown_blur)
+        return bounds(self.scenes, self.boxes, ASKED[self.unknown_blur], np.array([True]))
 
 
 def sharp_area(ends, low, high):
@@ -487,7 +488,7 @@ def checked(found):
 
 def asked(value, unknown_blur=False):
     scenes = build_scenes(value, 1)
-    return bounds(scenes, np.array([0]), marker_boxes(scenes), unknown_blur)
+    return bounds(scenes, marker_boxes(scenes), ASKED[unknown_blur], np.array([True]))
 
 
 TOLD = """

@@ -21,9 +21,10 @@ import pytest
 import sweep
 from support.blocks import run_block
 from support.lengths import lengths
+from support.searching import searched
 from support.solving import estimate
 from sweep.evaluation import search as search_module
-from sweep.evaluation.search import search, visibility_flags
+from sweep.evaluation.search import visibility_flags
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, margin_px
@@ -276,17 +277,6 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens, solve
 
 # Sub-pixel refinement is what is measured, so it is not guarded; what is said of it is held.
 
-def searched(scenes, full=False, **setting):
-    """Return what a detector setting finds in all scenes."""
-    count, failures = len(scenes), []
-    found = search(
-        scenes, np.ones((count, 1), dtype=bool), [DetectorSetting(**setting)],
-        np.full(count, full), failures,
-    )[0][0]
-    assert not failures
-    return found
-
-
 WIDE_REFINEMENT = {
     "cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
     "relativeCornerRefinmentWinSize": 100.0,
@@ -310,14 +300,8 @@ def check_margin(scenes, framed, margin, monkeypatch):
     """Hold a wide refinement to work in the windows of a margin as it does in the frame."""
     with monkeypatch.context() as patched:
         patched.setattr(search_module, "margin_px", margin)
-        failures = []
-        found = search(
-            scenes, np.ones((len(scenes), 1), dtype=bool), [DetectorSetting(**WIDE_REFINEMENT)],
-            np.zeros(len(scenes), dtype=bool), failures,
-        )[0][0]
-    print(f"\n{len(failures)} of {len(scenes)} searches raised, "
-          f"{(found.flags != framed.flags).sum()} flags differ from the frame's")
-    assert not failures
+        found = searched(scenes, DetectorSetting(**WIDE_REFINEMENT))
+    print(f"\n{(found.flags != framed.flags).sum()} flags differ from the frame's")
     np.testing.assert_array_equal(found.flags, framed.flags)
 
 
@@ -325,7 +309,7 @@ def check_margin(scenes, framed, margin, monkeypatch):
 def test_window_leaves_room_for_the_refinement(count, monkeypatch):
     """cornerSubPix refuses images narrower than its window: with the usual 16 px, for 40 %."""
     scenes = scenes_of(Pipeline.from_text(MARGINS.format(count=count)))
-    framed = searched(scenes, full=True, **WIDE_REFINEMENT)
+    framed = searched(scenes, DetectorSetting(**WIDE_REFINEMENT), full=True)
     check_margin(scenes, framed, margin_px, monkeypatch)
     with pytest.raises(AssertionError):
         check_margin(scenes, framed, lambda _: 16, monkeypatch)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, norm
 
 import sweep.evaluation.block
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped

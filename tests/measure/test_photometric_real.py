@@ -8,8 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
+from support.blocks import run_cells
 from support.board_scenes import BoardPose, board_scene, levels_of
-from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus

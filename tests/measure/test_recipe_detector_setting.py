@@ -42,7 +42,7 @@ def read(values):
 
 pipeline, message = read([40.0, 5.0])
 detection = [] if pipeline is None else [
-    column.tolist() for column in run_cells(pipeline, []).columns["detection"]
+    column.tolist() for column in run_cells(pipeline.experiment, []).columns["detection"]
 ]
 print(json.dumps({
     "message": message, "out_of_range": read([-1.0])[1], "detection": detection,

@@ -29,7 +29,7 @@ from sweep.experiment.schema import SCHEMA, VARIABLES
 
 pipeline = Pipeline.from_text("[marker]\\nsize_m = 0.05\\n[axes]\\ndistance_m = [0.3, 0.5, 1e3]")
 block = Block((0,), (3,))
-columns = run_cells(pipeline, block_indices(block)).columns
+columns = run_cells(pipeline.experiment, block_indices(block)).columns
 values = {v.name: to_dataset_layout(v, pipeline, block, columns[v.name]) for v in SCHEMA}
 
 def judged(**changed):

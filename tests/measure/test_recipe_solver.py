@@ -58,7 +58,7 @@ solver = ["{solver}", "ippe_square"]
 roll_deg = [0, 90]
 """
 pipeline = Pipeline.from_text(TEXT.format(solver="frontal"))
-columns = run_cells(pipeline, [np.arange(2)]).columns
+columns = run_cells(pipeline.experiment, [np.arange(2)]).columns
 try:
     Pipeline.from_text(TEXT.format(solver="frontale"))
 except PipelineError as error:

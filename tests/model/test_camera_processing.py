@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from support.blocks import run_cells
 from support.exact_image import clipped_image, values
 from support.lengths import lengths
 from support.small_scenes import SMALL, image_of, scenes_of
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search_windows
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting

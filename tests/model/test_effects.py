@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
+from support.blocks import run_cells
 from support.exact_image import (
     LENSES,
     add_part,
@@ -25,7 +26,6 @@ from support.exact_image import (
     visible,
 )
 from support.lengths import first_of, lengths
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from support.searching import searched
 from support.windows import corners_of, outcomes_elsewhere
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import search, visibility_flags
+from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
@@ -59,12 +60,8 @@ def test_window_finds_what_the_frame_holds(name, refinement):
     count = 200
     seen = np.flatnonzero(visibility_flags(built(order)) == DetectionStatus.not_run)[:count]
     scenes = built(order[seen])
-    setting, failures = DetectorSetting(cornerRefinementMethod=refinement), []
-    windowed, framed = (
-        search(scenes, np.ones((count, 1), dtype=bool), [setting], np.full(count, full), failures)
-        [0][0] for full in (False, True)
-    )
-    assert not failures
+    setting = DetectorSetting(cornerRefinementMethod=refinement)
+    windowed, framed = searched(scenes, setting), searched(scenes, setting, full=True)
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))

@@ -31,7 +31,7 @@ import json
 import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
-from sweep.evaluation.search import search, search_windows, whole_frames
+from sweep.evaluation.search import detections_of, scenes_at, search_windows
 from sweep.execution.forecast import seconds_of, without_effect
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
@@ -69,16 +69,14 @@ def broken(scene):
 
 pipeline = Pipeline.from_text(TEXT.format(scene="column_period_px = 3"))
 indices = [index.ravel() for index in np.indices((2, 2, 2))]
-values = pipeline.experiment.scene_values(indices)
-scenes = build_scenes(values, 8)
-settings = pipeline.experiment.detectors
-(result,), _, _ = search(
-    scenes, np.ones((8, 1), dtype=bool), settings, whole_frames(values, 8), [], keep=True
+batch = scenes_at(pipeline.experiment, indices)
+scenes, boxes, settings = batch.scenes, batch.boxes, pipeline.experiment.detectors
+(result,), _, _ = detections_of(
+    pipeline.experiment, batch, np.ones((8, 1), dtype=bool), [], keep=True
 )
-boxes = marker_boxes(scenes)
 box = tuple(boxes[0].tolist())
 mean, share = marker_levels(scenes, 0, box)
-cells = run_cells(pipeline, indices)
+cells = run_cells(pipeline.experiment, indices)
 margins = search_windows(scenes, boxes, settings[0], np.zeros(8, dtype=bool))
 print(json.dumps({
     "box": box, "levels": (mean + (1 - share) * 90).tolist(),

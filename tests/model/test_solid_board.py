@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
+from support.blocks import run_cells
 from sweep.errors import PipelineError
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes

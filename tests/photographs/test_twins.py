@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from support.blocks import run_cells
 from support.board_photographs import POSES, SIZE, VIEW, board, write_set
 from support.board_scenes import BoardPose, board_scene, levels_of
 from support.here import calls_here
 from sweep.errors import SweepError
-from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.runner import execute
 from sweep.experiment.cell_selection import cell

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import sweep
+from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.block import run_cells
 from sweep.execution.on_cluster import worker_identity
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.block import run_cells
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import use

@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
+from support.blocks import run_cells
 from sweep.cli import main
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.block import run_cells
 from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
 from sweep.plugins import loading

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.evaluation.block import run_cells
+from support.blocks import run_cells
 from sweep.evaluation.inspection import scene_image
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections

@@ -3,9 +3,14 @@
 from dataclasses import dataclass
 from typing import Any
 
-from sweep.evaluation.block import run_cells
+from sweep.evaluation import block as cells_of_blocks
 from sweep.evaluation.results import Failure, to_dataset_layout
 from sweep.experiment.grid import block_indices
+
+
+def run_cells(pipeline, indices, *needs):
+    """Render, detect and estimate scene cells of a pipeline."""
+    return cells_of_blocks.run_cells(pipeline.experiment, indices, *needs)
 
 
 @dataclass

@@ -39,7 +39,7 @@ ERRORS = {
 }
 
 PLACES = {
-    "build_scenes": cells, "detections_for": cells, "build": cells, "render_all": search,
+    "build_scenes": search, "detections_for": cells, "build": cells, "render_all": search,
     "classify": search,
     "set": LocalStore,
 }

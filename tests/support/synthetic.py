@@ -8,18 +8,18 @@ import numpy as np
 from sweep.evaluation.results import CellsResult
 
 
-def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
+def synthetic_cells(experiment, indices, need=None):  # noqa: ARG001
     """Return plausible columns for the scenes at ``indices``: their linear index, all solved."""
     count = len(indices[0])
     ramp = np.zeros(count)
-    for axis, index in zip(pipeline.axes, indices, strict=True):
+    for axis, index in zip(experiment.grid.axes, indices, strict=True):
         ramp = ramp * len(axis) + index
     columns = {}
-    for variable in pipeline.experiment.variables:
+    for variable in experiment.variables:
         values = np.ones((count, *variable.inner_shape), dtype=variable.dtype)
         if variable.flags is None:
             values *= (ramp % 1000).reshape(-1, *[1] * len(variable.inner_shape))
-        columns[variable.name] = [values.astype(variable.dtype)]
+        columns[variable.name] = values.astype(variable.dtype)[None]
     seconds = {"scene": [1e-6], "detection": [1e-6], "estimation": [1e-6]}
     return CellsResult(columns, seconds, np.full(count, 1e-7))
 

@@ -94,7 +94,7 @@ def main():
     if work is block:
         # Compiled code is loaded once, here.
         store = open_store(url)
-        run_cells(store.pipeline, block_indices(store.blocks[0]))
+        run_cells(store.pipeline.experiment, block_indices(store.blocks[0]))
     told, stopped = [], []
     for number, at in json.loads(instants):
         pid, pipe = fork(work, (url, file), number, at, signal.Signals[signal_name])

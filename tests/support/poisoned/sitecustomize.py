@@ -87,7 +87,7 @@ class _Poison:
         self._made = collections.deque(maxlen=4)
         self._images = {}
         homes = {
-            "build_scenes": cells, "detections_for": cells, "build": cells,
+            "build_scenes": search, "detections_for": cells, "build": cells,
             "render_all": search,
         }
         self._real = {name: getattr(home, name) for name, home in homes.items()}

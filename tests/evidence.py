@@ -71,6 +71,15 @@ def commit() -> str:
     return head + ("+" if changed else "")
 
 
+def circumstances() -> dict[str, Any]:
+    """Return version and commit of the project, date, processor, and versions of libraries."""
+    return {
+        "version": __version__, "commit": commit(),
+        "date": dt.datetime.now(dt.UTC).date().isoformat(), "processor": processor(),
+        "python": platform.python_version(),
+        "libraries": {name: version(name) for name in LIBRARIES}}
+
+
 def run(file: str, *arguments: str) -> int:
     """Run a shard; return pytest's exit status."""
     shard, shards = 1, 1
@@ -82,10 +91,7 @@ def run(file: str, *arguments: str) -> int:
     recorder = Recorder(shard, shards)
     status = pytest.main(["-m", "long", *others], plugins=[recorder])
     Path(file).write_text(json.dumps({
-        "version": __version__, "commit": commit(), "shard": shard, "shards": shards,
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "processor": processor(), "python": platform.python_version(),
-        "libraries": {name: version(name) for name in LIBRARIES},
+        **circumstances(), "shard": shard, "shards": shards,
         "seconds": {name: round(spent, 1) for name, spent in recorder.seconds.items()},
         "outcomes": recorder.outcomes, "claims": recorder.claims,
     }, indent=1) + "\n", encoding="utf-8")

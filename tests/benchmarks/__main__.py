@@ -1,10 +1,15 @@
 """Run benchmarks by name: ``python -m tests.benchmarks [NAME ...] [--quick]``.
 
 ``--quick`` runs the smallest size, which shows that a benchmark still runs and no figure; without
-names all are run, each in a process of its own. Other arguments go to the one benchmark named.
+names all are run, each in a process of its own. Other arguments go to the one benchmark named. What
+it prints at its full size is appended to history.jsonl beside this file, with version, commit,
+processor and date.
 """
 
+import contextlib
 import importlib
+import io
+import json
 import os
 import subprocess
 import sys
@@ -12,8 +17,11 @@ import tempfile
 import time
 from pathlib import Path
 
+from tests.evidence import circumstances
+
 HERE = Path(__file__).parent
 TOP = HERE.parents[1]
+HISTORY = HERE / "history.jsonl"
 
 QUICK = {
     "analysis": (["1e4", "60"], ["CALLS = dict(list(CALLS.items())[:2])"]),
@@ -65,7 +73,25 @@ def run(name: str, arguments: list[str], quick: bool) -> None:
     sys.argv[:] = [str(file_of(name)), *arguments]
     module = importlib.import_module(file_of(name).stem)
     exec("\n".join(statements), vars(module))  # noqa: S102  (the table above)
-    sys.exit(module.main())
+    if quick:
+        sys.exit(module.main())
+    printed = Printed()
+    with contextlib.redirect_stdout(printed):
+        status = module.main()
+    with HISTORY.open("a", encoding="utf-8") as history:
+        history.write(json.dumps({
+            "benchmark": name, "arguments": arguments, **circumstances(),
+            "printed": printed.getvalue().splitlines()}) + "\n")
+    sys.exit(status)
+
+
+class Printed(io.StringIO):
+    """Keeps what is printed, and prints it."""
+
+    def write(self, text: str) -> int:
+        """Print a text, and keep it."""
+        sys.__stdout__.write(text)
+        return super().write(text)
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
 """The client, a Dask scheduler and a store under many simulated workers.
 
     python tests/benchmarks/bench_scale.py [--workers 64 256 1000] [--waves 4] [--stored 100000]
-        [--chunks] [--block-s 2.0] [--record]
+        [--chunks] [--block-s 2.0]
 
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
@@ -9,14 +9,11 @@ The second table is of stores of ``--stored`` committed blocks, of which only re
 with ``--chunks`` also chunks, many names of few files: processor seconds, and most memory in MB.
 Efficiency is the workers' busy share between their first and their last block; start and end count
 in the other figure, so more with few ``--waves`` (blocks a worker).
-``--record`` appends the figures to ``scale_history.csv``, which later changes are held against.
 """
 
 import argparse
 import asyncio
-import csv
 import dataclasses
-import importlib.metadata
 import json
 import math
 import os
@@ -52,7 +49,6 @@ from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.receipt import Receipt
 
-HISTORY = Path(__file__).with_name("scale_history.csv")
 PROCESSES = 2
 SCENES = 1000
 """Poses of a block."""
@@ -309,20 +305,6 @@ def check(sound):
         raise AssertionError
 
 
-def record(rows):
-    """Append figures to the history."""
-    new = not HISTORY.exists()
-    with HISTORY.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(["date", "sweep", "distributed", "figure", "value"])
-        for name, value in rows:
-            writer.writerow([
-                time.strftime("%Y-%m-%d"), sweep.__version__,
-                importlib.metadata.version("distributed"), name, json.dumps(value),
-            ])
-
-
 def main():
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -331,7 +313,6 @@ def main():
     parser.add_argument("--block-s", type=float)
     parser.add_argument("--stored", type=int, nargs="*", default=[])
     parser.add_argument("--chunks", action="store_true")
-    parser.add_argument("--record", action="store_true")
     parser.add_argument("--live", nargs=2)
     options = parser.parse_args()
     if options.live:
@@ -341,20 +322,15 @@ def main():
     import bench_scale  # noqa: PLC0415  (tasks name their function by its module)
 
     on_cluster.compute_blocks = bench_scale.simulated_blocks
-    rows = []
     with tempfile.TemporaryDirectory() as folder:
         many_files()
         for count in options.workers:
             figures = simulated(count, options.waves, options.block_s, folder)
             print(json.dumps(figures), flush=True)
-            rows.append((f"{count} workers", figures))
     for count in options.stored:
         with tempfile.TemporaryDirectory() as folder:
             figures = stored(count, folder, options.chunks)
         print(json.dumps(figures), flush=True)
-        rows.append((f"store of {count} blocks{', with chunks' * options.chunks}", figures))
-    if options.record:
-        record(rows)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -23,8 +23,6 @@ from sweep.model.board import (
     own_sheets,
     rectangles_print,
     sheets_m,
-    sheets_of,
-    sheets_overlap,
     solid_print,
 )
 from sweep.model.coverage import MarkerEdges
@@ -38,7 +36,6 @@ from sweep.model.marker import (
     module_count,
     overhang,
 )
-from sweep.model.marker import Marker as SingleMarker
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -47,7 +44,7 @@ from sweep.typing import Floats, Integers
 MAX_MARKERS = 4000
 """The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
 
-_DICTIONARY = SingleMarker.__dataclass_fields__["dictionary"].metadata["declaration"]
+_DICTIONARY = declared_fields(Marker)["dictionary"].declaration
 
 
 class Fault(NamedTuple):
@@ -63,12 +60,16 @@ def required(meaning: str, **declared: Any) -> Any:
     return parameter(dataclasses.MISSING, meaning, **declared)
 
 
+def count_of(meaning: str, low: int = 1) -> Any:
+    """Return the declared field of a number of things in a row or column."""
+    return required(meaning, low=low, high=1000)
+
+
 def dictionary_of_all() -> Any:
     """Return the declared field of the dictionary of all markers."""
-    return required(
-        "the dictionary of all markers, as of a single marker", choices=_DICTIONARY.choices,
-        prefix=_DICTIONARY.prefix,
-        numbers=_DICTIONARY.numbers,
+    meaning = "the dictionary of all markers, as of a single marker"
+    return dataclasses.field(
+        metadata={"declaration": dataclasses.replace(_DICTIONARY, meaning=meaning)}
     )
 
 
@@ -82,17 +83,30 @@ def margin(meaning: str) -> Any:
     return parameter(None, meaning, unit="m", low=0, high=1e6)
 
 
-def refuse(faults: Sequence[Fault]) -> None:
-    """Raise ValueError with a line for each fault, if there are any."""
-    if faults:
-        raise ValueError(
-            "\n".join(f"{key} = {value}: expected {expected}" for key, value, expected in faults)
-        )
+def place(meaning: str, default: Any = dataclasses.MISSING) -> Any:
+    """Return the declared field of a coordinate."""
+    return parameter(default, meaning, unit="m", low=-1e6, high=1e6)
 
 
-def id_faults(
-    key: str, ids: list[int], dictionary: str, written: Any = None
-) -> list[Fault]:
+def turn(meaning: str, most: float = 360) -> Any:
+    """Return the declared field of an angle, 0 by default."""
+    return parameter(0.0, meaning, unit="degree", low=-most, high=most)
+
+
+def table_reader(
+    declared: Mapping[str, Declared], owner: str, expected: str = ""
+) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
+    """Return what reads tables as tuples of the values of ``declared``, in its order.
+
+    It raises ValueError or TablesError if they are not such tables.
+    """
+    expected = expected or f"tables with {', '.join(declared)}"
+    return lambda value: tuple(
+        tuple(row.values()) for row in check_tables(declared, value, owner, expected)
+    )
+
+
+def id_faults(key: str, ids: list[int], dictionary: str, written: Any = None) -> list[Fault]:
     """Return the faults of markers' IDs; ``written`` is what the key has if not these."""
     missing = missing_package(dictionary)
     if missing is not None:
@@ -115,30 +129,44 @@ def id_faults(
     return faults
 
 
+class _Kind:
+    """What all kinds of boards can do: a subclass says how many it has, its faults and layout."""
+
+    __slots__ = ()
+
+    def faults(self) -> list[Fault]:
+        """Return what keeps the values from being a board."""
+        raise NotImplementedError
+
+    def _layout(self) -> Board:
+        raise NotImplementedError
+
+    def board(self) -> Board:
+        """Return the board; ValueError with its faults, a line each."""
+        lines = [f"{key} = {value}: expected {expected}" for key, value, expected in self.faults()]
+        if lines:
+            raise ValueError("\n".join(lines))
+        return self._layout()
+
+
 # --------------------------------------------------------------------------------------------------
 # A target that a table of markers declares: each has a size and a pose of its own.
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class BoardMarker:
     """One of a table of markers."""
 
     marker_id: int = required("the marker's ID in its dictionary", low=0, high=10**6)
-    x_m: float = required("its centre, right of the origin", unit="m", low=-1e6, high=1e6)
-    y_m: float = required("its centre, above the origin", unit="m", low=-1e6, high=1e6)
+    x_m: float = place("its centre, right of the origin")
+    y_m: float = place("its centre, above the origin")
     size_m: float = length("side of its black square")
-    roll_deg: float = parameter(
-        0.0, "its turn in its plane, from x to y", unit="degree", low=-360, high=360
+    roll_deg: float = turn("its turn in its plane, from x to y")
+    z_m: float = place(
+        "height of its centre over the board's plane, positive towards who looks at it", 0.0
     )
-    z_m: float = parameter(
-        0.0, "height of its centre over the board's plane, positive towards who looks at it",
-        unit="m", low=-1e6, high=1e6,
-    )
-    tilt_deg: float = parameter(
-        0.0, "angle between its plane and the board's", unit="degree", low=-180, high=180
-    )
-    azimuth_deg: float = parameter(
-        0.0, "direction of the axis of this tilt in the board's plane, from x to y", unit="degree",
-        low=-360, high=360,
+    tilt_deg: float = turn("angle between its plane and the board's", 180)
+    azimuth_deg: float = turn(
+        "direction of the axis of this tilt in the board's plane, from x to y"
     )
 
     @property
@@ -146,17 +174,30 @@ class BoardMarker:
         """Whether it is in the board's plane."""
         return self.z_m == self.tilt_deg == 0.0
 
+    def placed(
+        self, dictionary: str, quiet_modules: float | None, solid: bool
+    ) -> tuple[Print, Floats]:
+        """Return its print and the corners (4, 3) of its square.
+
+        ``solid``: on a plane of its own. ``quiet_modules`` is as of :func:`marker_print`.
+        """
+        where = self.x_m, self.y_m, self.roll_deg
+        printed = marker_print(dictionary, self.marker_id, self.size_m, quiet_modules, *where)
+        if solid:
+            return solid_print(printed, self.z_m, self.tilt_deg, self.azimuth_deg)
+        return printed, corners_of(self.size_m, *where)
+
 
 _TABLES = "tables [[markers]]"
 
 
 def _read_markers(value: Any) -> tuple[BoardMarker, ...]:
-    rows = check_tables(declared_fields(BoardMarker), value, "a marker", _TABLES)
-    return tuple(BoardMarker(**row) for row in rows)
+    rows = table_reader(declared_fields(BoardMarker), "a marker", _TABLES)(value)
+    return tuple(BoardMarker(*row) for row in rows)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Markers:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Markers(_Kind):
     """A table of markers, each on a sheet of its own or, in one plane, all on one."""
 
     dictionary: str = dictionary_of_all()
@@ -176,6 +217,11 @@ class Markers:
         """How many markers and chessboard corners it has."""
         return len(self.markers), 0
 
+    @property
+    def is_flat(self) -> bool:
+        """Whether all markers are in the board's plane."""
+        return all(each.is_flat for each in self.markers)
+
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
         faults = []
@@ -187,7 +233,7 @@ class Markers:
             ))
         ids = [each.marker_id for each in self.markers]
         faults += id_faults("markers", ids, self.dictionary)
-        if self.margin_m is not None and not all(each.is_flat for each in self.markers):
+        if self.margin_m is not None and not self.is_flat:
             faults.append(Fault(
                 "margin_m", self.margin_m, "no one sheet for markers in several planes; delete it"
             ))
@@ -203,22 +249,12 @@ class Markers:
 
     def _placed(self) -> tuple[list[Print], Floats]:
         """Return the prints of the markers, and the corners (n, 4, 3) of their squares."""
-        prints = [
-            marker_print(
-                self.dictionary, each.marker_id, each.size_m, self._quiet, each.x_m, each.y_m,
-                each.roll_deg,
-            )
-            for each in self.markers
-        ]
-        corners = np.array([
-            corners_of(each.size_m, each.x_m, each.y_m, each.roll_deg) for each in self.markers
-        ])
-        if not all(each.is_flat for each in self.markers):
-            for k, each in enumerate(self.markers):
-                prints[k], corners[k] = solid_print(
-                    prints[k], each.z_m, each.tilt_deg, each.azimuth_deg
-                )
-        return prints, corners
+        solid = not self.is_flat
+        prints, corners = zip(
+            *(each.placed(self.dictionary, self._quiet, solid) for each in self.markers),
+            strict=True,
+        )
+        return list(prints), np.array(corners)
 
     def _printed(self, corners: Floats) -> Floats:
         """Return the corners (n, 4, 3) of all that is printed of each marker, its white included.
@@ -237,9 +273,7 @@ class Markers:
             return None
         return 1.0 if self.quiet_zone_modules is None else self.quiet_zone_modules
 
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        refuse(self.faults())
+    def _layout(self) -> Board:
         prints, corners = self._placed()
         if self.margin_m is not None:
             printed = self._printed(corners)[..., :2].reshape(-1, 2) * [1.0, -1.0]
@@ -257,55 +291,37 @@ class Markers:
 # Each is printed on a sheet of its own, with a quiet zone as wide in its modules as that of
 # ``[marker]``, in the target's frame and mostly in its plane.
 
-_DICTIONARY_DISTRACTORS = Marker.__dataclass_fields__["dictionary"].metadata["declaration"]
+_MARKER = declared_fields(BoardMarker)
 
-_KEYS = {
-    **{name: dataclasses.replace(each, default=None) if name in ("marker_id", "size_m") else each
-       for name, each in declared_fields(BoardMarker).items()},
-    "dictionary": Declared("dictionary", (str,), None, _DICTIONARY_DISTRACTORS),
+_LISTED = _MARKER | {"size_m": dataclasses.replace(_MARKER["size_m"], default=None)}
+"""Keys of a table [[board.markers]]."""
+
+_BESIDE = _LISTED | {
+    "marker_id": dataclasses.replace(_MARKER["marker_id"], default=None),
+    "dictionary": Declared("dictionary", (str,), None, _DICTIONARY),
 }
-"""Keys of a table [[board.distractors]]: those of a marker, none of whose IDs and sizes is needed,
-and a dictionary."""
-
-
-def listed_distractors(value: Any) -> tuple[tuple[Any, ...], ...]:
-    """Return tables of distractors as tuples: as markers', without ID or size None; dictionary.
-
-    ValueError or TablesError if they are not such tables.
-    """
-    expected = f"tables with {', '.join(_KEYS)}"
-    return tuple(
-        tuple(row.values()) for row in check_tables(_KEYS, value, "a distractor", expected)
-    )
+"""Keys of a table [[board.distractors]]: none of their IDs and sizes is needed."""
 
 
 def with_distractors(
     board: Board, listed: Sequence[Sequence[Any]] | None, size_m: float, quiet_modules: float
 ) -> Board:
-    """Return a board with what is ``listed`` beside it.
+    """Return a board with what is ``listed`` beside it, rows of the values of a table's keys.
 
     ``size_m`` is the side of those that have no size, ``quiet_modules`` the width of the white
     around each, in its modules.
     """
-    if not listed:
-        return board
-    prints = tuple(_print(row, board.dictionary, size_m, quiet_modules) for row in listed)
-    return dataclasses.replace(board, distractors=prints)
-
-
-def _print(row: Sequence[Any], dictionary: str, size_m: float, quiet_modules: float) -> Print:
-    marker_id, x_m, y_m, own_size_m, roll_deg, z_m, tilt_deg, azimuth_deg, own = row
-    dictionary = own or dictionary
-    printed = marker_print(
-        dictionary, marker_id or 0, size_m if own_size_m is None else own_size_m, quiet_modules,
-        x_m, y_m, roll_deg,
-    )
-    if marker_id is None:
-        square = _black_square(float(module_count(dictionary)), quiet_modules)
-        printed = printed._replace(edges=square)
-    if z_m == tilt_deg == 0.0:
-        return printed
-    return solid_print(printed, z_m, tilt_deg, azimuth_deg)[0]
+    prints = []
+    for marker_id, x_m, y_m, own_size_m, *pose, own in listed or ():
+        dictionary = own or board.dictionary
+        size = size_m if own_size_m is None else own_size_m
+        each = BoardMarker(marker_id or 0, x_m, y_m, size, *pose)
+        printed, _ = each.placed(dictionary, quiet_modules, not each.is_flat)
+        if marker_id is None:
+            square = _black_square(float(module_count(dictionary)), quiet_modules)
+            printed = printed._replace(edges=square)
+        prints.append(printed)
+    return dataclasses.replace(board, distractors=tuple(prints)) if prints else board
 
 
 def _black_square(modules: float, quiet_modules: float) -> MarkerEdges:
@@ -338,47 +354,24 @@ def listing_faults(
 
 def overlap_faults(board: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]:
     """Return the first overlap of a distractor with its board, or with another distractor."""
-    sheets = sheets_of(board)
-    corners = sheets_m(board)
-    own = own_sheets(board)
-    for number in range(len(sheets) - own):
-        before = corners[: own + number]
-        overlapping = np.flatnonzero(
-            sheets_overlap(np.broadcast_to(corners[own + number], before.shape), before)
-        )
-        if len(overlapping):
-            other = int(overlapping[0]) - own
-            name = f"distractors[{other}]" if other >= 0 else "the board"
-            return [Fault(
-                f"distractors[{number}].x_m", listed[number][1],
-                f"no overlap with {name}, white quiet zones included; move it",
-            )]
-    return []
+    pair = first_overlap(sheets_m(board))
+    if pair is None:
+        return []
+    other, number = (sheet - own_sheets(board) for sheet in pair)
+    name = f"distractors[{other}]" if other >= 0 else "the board"
+    return [Fault(
+        f"distractors[{number}].x_m", listed[number][1],
+        f"no overlap with {name}, white quiet zones included; move it",
+    )]
 
 
 # --------------------------------------------------------------------------------------------------
-# The kinds of boards: what a user writes of each, what it must fulfil, and its layout.
+# The kinds of boards on one sheet: what a user writes of each, what it must fulfil, its layout.
 #
 # The layouts are those of ``cv2.aruco.CharucoBoard`` (today's and the legacy pattern),
 # ``cv2.aruco.GridBoard``, with black squares at the markers' corners if wanted, and Kalibr's
 # AprilGrid. The board's origin is the middle of the chessboard or of the grid; of a table of
 # markers it is the table's own.
-
-def _first_id() -> Any:
-    return parameter(
-        None, "ID of the first marker, from which they count in reading order (default: 0)",
-        low=0, high=10**6,
-    )
-
-
-def list_of_ids(meaning: str) -> Any:
-    """Return the declared field of a list of IDs, none by default."""
-    return parameter(None, meaning, list_text=_LIST_OF_IDS, reads=_read_ids)
-
-
-def _ids() -> Any:
-    return list_of_ids("IDs of all markers in reading order, in place of first_id")
-
 
 _LIST_OF_IDS = "a list of whole numbers from 0 on"
 
@@ -392,33 +385,89 @@ def _read_ids(value: Any) -> tuple[int, ...]:
     return tuple(value)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Charuco:
-    """A chessboard with markers in its white squares."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _OnSheet(_Kind):
+    """A board of markers of one size and roll on one white sheet."""
 
     dictionary: str = dictionary_of_all()
-    squares_x: int = required("squares in a row", low=2, high=1000)
-    squares_y: int = required("squares in a column", low=2, high=1000)
-    square_m: float = length("side of a square")
-    marker_m: float = length("side of a marker's black square")
-    first_id: int | None = _first_id()
-    ids: tuple[int, ...] | None = _ids()
-    legacy_pattern: bool = parameter(
-        False, "the pattern before OpenCV 4.6: an even number of squares_y begins with white at "
-        "the top left",
+    first_id: int | None = parameter(
+        None, "ID of the first marker (of an aprilgrid at the bottom left), from which they count "
+        "(default: 0)", low=0, high=10**6,
+    )
+    ids: tuple[int, ...] | None = parameter(
+        None, "IDs of all markers in reading order, of an aprilgrid from the bottom left to the "
+        "right, then upwards; without it they count from the first on",
+        list_text=_LIST_OF_IDS, reads=_read_ids,
     )
     margin_m: float | None = margin(
-        "width of the white sheet beyond the chessboard (default: one module of a marker)"
+        "width of the white sheet beyond all that is black (default: one module of a marker)"
     )
 
     @property
-    def _begins_white(self) -> bool:
-        return self.legacy_pattern and self.squares_y % 2 == 0
+    def counts(self) -> tuple[int, int]:
+        """How many markers and chessboard corners it has."""
+        raise NotImplementedError
+
+    def _id_faults(self, sized_by: str, order: str = "in reading order") -> list[Fault]:
+        """Return the faults of the IDs; ``sized_by`` is a key on which their number depends."""
+        count = self.counts[0]
+        if self.ids is not None and self.first_id is not None:
+            expected = "ids or first_id, not both; delete one of them"
+            return [Fault("first_id", self.first_id, expected)]
+        if count > MAX_MARKERS:
+            expected = f"a board of at most {MAX_MARKERS} markers; it has {count}"
+            return [Fault(sized_by, getattr(self, sized_by), expected)]
+        if self.ids is None:
+            key = "first_id" if self.first_id is not None else "dictionary"
+            return id_faults(key, list(self._ids), self.dictionary, getattr(self, key))
+        if len(self.ids) != count:
+            return [Fault("ids", list(self.ids), f"{count} IDs, one for each marker {order}")]
+        return id_faults("ids", list(self.ids), self.dictionary)
+
+    @property
+    def _ids(self) -> tuple[int, ...]:
+        first = self.first_id or 0
+        return tuple(range(first, first + self.counts[0])) if self.ids is None else self.ids
+
+    def _on_sheet(
+        self, centres_m: Floats, marker_m: float, others: Sequence[Print], half_m: Floats,
+        roll_deg: float = 0.0,
+    ) -> Board:
+        """Return markers at ``centres_m`` (n, 2) with other prints.
+
+        The sheet extends ``half_m`` (2,) and the margin from the origin.
+        """
+        module_m = marker_m / module_count(self.dictionary)
+        beyond = half_m + (module_m if self.margin_m is None else self.margin_m)
+        prints, corners = zip(
+            *(BoardMarker(marker_id, x, y, marker_m, roll_deg).placed(self.dictionary, None, False)
+              for marker_id, (x, y) in zip(self._ids, centres_m.tolist(), strict=True)),
+            strict=True,
+        )
+        sheet = rectangles_print(np.array([[*-beyond, *beyond]]), OUTSIDE, WHITE)
+        return Board(
+            self.dictionary, self._ids, np.array(corners), (*prints, *others, sheet),
+            np.empty((0, 3)),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Charuco(_OnSheet):
+    """A chessboard with markers in its white squares."""
+
+    squares_x: int = count_of("squares in a row of a charuco", 2)
+    squares_y: int = count_of("squares in a column of a charuco", 2)
+    square_m: float = length("side of a square of a charuco or diamond")
+    marker_m: float = length("side of a marker's black square")
+    legacy_pattern: bool = parameter(
+        False, "charuco: the pattern before OpenCV 4.6; with an even number of squares_y it begins "
+        "with white at the top left",
+    )
 
     def _codes(self) -> Integers:
         row, column = np.indices((self.squares_y, self.squares_x))
-        black = (row + column + self._begins_white) % 2 == 0
-        return np.where(black, BLACK, WHITE).astype(np.int64)
+        begins_white = self.legacy_pattern and self.squares_y % 2 == 0
+        return np.where((row + column + begins_white) % 2 == 0, BLACK, WHITE).astype(np.int64)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -427,52 +476,44 @@ class Charuco:
 
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
-        whole = _printed_side(self.dictionary, self.marker_m)
+        whole, beyond = _printed_side(self.dictionary, self.marker_m)
         faults = []
         if whole >= self.square_m:
-            faults.append(Fault(
-                "marker_m", self.marker_m,
-                f"below square_m = {self.square_m:g}{_with_overhang(self.dictionary, whole)}",
-            ))
-        return faults + _id_faults(self, self.counts[0])
+            expected = f"below square_m = {self.square_m:g}{beyond}"
+            faults.append(Fault("marker_m", self.marker_m, expected))
+        return faults + self._id_faults("squares_x")
 
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        refuse(self.faults())
+    def _layout(self) -> Board:
         codes = self._codes()
         rows, columns = np.nonzero(codes == WHITE)
         middle = np.array([self.squares_x, self.squares_y]) / 2 * self.square_m
         centres = (np.stack([columns, rows], axis=1) + 0.5) * self.square_m - middle
         inner = np.indices((self.squares_y - 1, self.squares_x - 1)).reshape(2, -1)[::-1].T + 1
         chessboard = (inner * self.square_m - middle) * [1.0, -1.0]
-        board = _on_sheet(
-            self.dictionary, _ids_of(self, len(rows)), centres * [1.0, -1.0], self.marker_m,
-            [cells_print(codes, self.square_m)], middle, self.margin_m, chessboard,
+        board = self._on_sheet(
+            centres * [1.0, -1.0], self.marker_m, [cells_print(codes, self.square_m)], middle
         )
-        return dataclasses.replace(board, chessboard=Chessboard(
-            self.squares_x, self.squares_y, self.square_m, self.marker_m, self.legacy_pattern
-        ))
+        return dataclasses.replace(
+            board, chessboard_m=np.column_stack([chessboard, np.zeros(len(chessboard))]),
+            chessboard=Chessboard(
+                self.squares_x, self.squares_y, self.square_m, self.marker_m, self.legacy_pattern
+            ),
+        )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Grid:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid(_OnSheet):
     """Markers in rows and columns: ArUco's GridBoard, Kalibr's AprilGrid."""
 
-    dictionary: str = dictionary_of_all()
-    rows: int = required("rows of markers", low=1, high=1000)
-    columns: int = required("markers in a row", low=1, high=1000)
+    rows: int = count_of("rows of markers of a grid")
+    columns: int = count_of("markers in a row of a grid")
     marker_m: float = length("side of a marker's black square")
     gap_m: float = required(
-        "distance between the black squares of neighbours", unit="m", low=0, high=1e6
+        "distance between the black squares of a grid's neighbours", unit="m", low=0, high=1e6
     )
-    first_id: int | None = _first_id()
-    ids: tuple[int, ...] | None = _ids()
     corner_squares: bool = parameter(
-        False, "black squares of the gap's size at the corners of every marker, as an AprilGrid "
-        "has them (kind = \"aprilgrid\": also in Kalibr's order)",
-    )
-    margin_m: float | None = margin(
-        "width of the white sheet beyond the markers and squares (default: one module of a marker)"
+        False, "black squares of the gap's size at the corners of a grid's markers, as an "
+        "aprilgrid has them",
     )
 
     @property
@@ -482,13 +523,11 @@ class Grid:
 
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
-        whole = _printed_side(self.dictionary, self.marker_m)
+        whole, beyond = _printed_side(self.dictionary, self.marker_m)
         faults = []
         if self.marker_m + self.gap_m < whole:
-            faults.append(Fault(
-                "gap_m", self.gap_m,
-                f"at least {whole - self.marker_m:g}{_with_overhang(self.dictionary, whole)}",
-            ))
+            expected = f"at least {whole - self.marker_m:g}{beyond}"
+            faults.append(Fault("gap_m", self.gap_m, expected))
         if self.corner_squares and self.gap_m == 0:
             faults.append(Fault("gap_m", self.gap_m, "above 0 beside corner_squares = true"))
         if self.corner_squares and whole > self.marker_m:
@@ -496,40 +535,28 @@ class Grid:
                 "corner_squares", self.corner_squares,
                 f"false: the markers of {self.dictionary} have modules where the squares are",
             ))
-        return faults + _id_faults(self, self.counts[0])
+        return faults + self._id_faults("rows")
 
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        refuse(self.faults())
+    def _layout(self) -> Board:
         return _grid_board(
             self, (self.rows, self.columns), self.marker_m, self.gap_m, self.corner_squares
         )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class AprilGrid:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AprilGrid(_OnSheet):
     """Kalibr's AprilGrid, in the words of its target files, and in its order.
 
     IDs count from the bottom left to the right, then upwards. Kalibr prints each tag turned by
     180 degrees against OpenCV's dictionary, so that a marker's first corner is its lower right one.
     """
 
-    dictionary: str = dictionary_of_all()
-    tagCols: int = required("tags in a row", low=1, high=1000)
-    tagRows: int = required("tags in a column", low=1, high=1000)
+    tagCols: int = count_of("tags in a row of an aprilgrid")
+    tagRows: int = count_of("tags in a column of an aprilgrid")
     tagSize: float = length("side of a tag's black square")
     tagSpacing: float = required(
-        "distance between the black squares of neighbours, relative to tagSize", low=0, high=1,
-        open_low=True,
-    )
-    first_id: int | None = parameter(
-        None, "ID of the tag at the bottom left (default: 0)", low=0, high=10**6
-    )
-    ids: tuple[int, ...] | None = list_of_ids(
-        "IDs of all tags from the bottom left to the right, then upwards, in place of first_id"
-    )
-    margin_m: float | None = margin(
-        "width of the white sheet beyond the corner squares (default: one module of a tag)"
+        "distance between the black squares of an aprilgrid's neighbours, relative to their side "
+        "(Kalibr's tagSize, in pipelines size_m of [marker])", low=0, high=1, open_low=True,
     )
 
     @property
@@ -544,11 +571,9 @@ class AprilGrid:
                 "dictionary", self.dictionary,
                 "another one: its markers have modules where an AprilGrid has squares",
             )]
-        return _id_faults(self, self.counts[0])
+        return self._id_faults("tagRows", "from the bottom left")
 
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        refuse(self.faults())
+    def _layout(self) -> Board:
         gap_m = self.tagSize * self.tagSpacing
         return _grid_board(self, (self.tagRows, self.tagCols), self.tagSize, gap_m, True)
 
@@ -571,11 +596,17 @@ def _grid_board(
         low = np.stack([column, row], axis=1) * step - gap_m - middle
         others = [rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
         half = middle + gap_m
-    return _on_sheet(
-        kind.dictionary, _ids_of(kind, len(centres)),
-        centres if kalibr else centres * [1.0, -1.0], marker_m, others, half, kind.margin_m,
-        np.empty((0, 2)), 180.0 if kalibr else 0.0,
+    return kind._on_sheet(  # noqa: SLF001
+        centres if kalibr else centres * [1.0, -1.0], marker_m, others, half,
+        180.0 if kalibr else 0.0,
     )
+
+
+def _printed_side(dictionary: str, marker_m: float) -> tuple[float, str]:
+    """Return the side of all modules of a marker, and a note if some are beyond its square."""
+    whole = marker_m * (1 + 2 * overhang(dictionary) / module_count(dictionary))
+    note = f": markers of {dictionary} have modules beyond their square, {whole:g} m in all"
+    return whole, note if overhang(dictionary) else ""
 
 
 Kind = Charuco | Grid | AprilGrid | Markers
@@ -586,137 +617,11 @@ KINDS: dict[str, type[Kind]] = {
 """The kinds of boards by the names that files have for them."""
 
 
-def _printed_side(dictionary: str, marker_m: float) -> float:
-    """Return the side of all modules of a marker, those beyond its square included."""
-    return marker_m * (1 + 2 * overhang(dictionary) / module_count(dictionary))
-
-
-def _with_overhang(dictionary: str, whole_m: float) -> str:
-    if not overhang(dictionary):
-        return ""
-    return f": markers of {dictionary} have modules beyond their square, {whole_m:g} m in all"
-
-
-def _id_faults(kind: Charuco | Grid | AprilGrid, count: int) -> list[Fault]:
-    """Return the faults of IDs in the kind's order, of which ``count`` are needed."""
-    if kind.ids is not None and kind.first_id is not None:
-        return [Fault("first_id", kind.first_id, "ids or first_id, not both; delete one of them")]
-    if count > MAX_MARKERS:
-        key = {Charuco: "squares_x", Grid: "rows", AprilGrid: "tagRows"}[type(kind)]
-        return [Fault(
-            key, getattr(kind, key), f"a board of at most {MAX_MARKERS} markers; it has {count}"
-        )]
-    if kind.ids is None:
-        first = kind.first_id or 0
-        key = "first_id" if kind.first_id is not None else "dictionary"
-        return id_faults(
-            key, list(range(first, first + count)), kind.dictionary, getattr(kind, key)
-        )
-    if len(kind.ids) != count:
-        order = "from the bottom left" if isinstance(kind, AprilGrid) else "in reading order"
-        return [Fault("ids", list(kind.ids), f"{count} IDs, one for each marker {order}")]
-    return id_faults("ids", list(kind.ids), kind.dictionary)
-
-
-def _ids_of(kind: Charuco | Grid | AprilGrid, count: int) -> tuple[int, ...]:
-    first = kind.first_id or 0
-    return kind.ids if kind.ids is not None else tuple(range(first, first + count))
-
-
-def _on_sheet(
-    dictionary: str, ids: tuple[int, ...], centres_m: Floats, marker_m: float,
-    others: list[Print], half_m: Floats, margin_m: float | None, chessboard_m: Floats,
-    roll_deg: float = 0.0,
-) -> Board:
-    """Return markers of one size and roll at ``centres_m`` (n, 2) with other prints on one sheet.
-
-    The sheet extends ``half_m`` (2,) and the margin from the origin.
-    """
-    margin = marker_m / module_count(dictionary) if margin_m is None else margin_m
-    prints = [
-        marker_print(dictionary, marker_id, marker_m, None, x, y, roll_deg)
-        for marker_id, (x, y) in zip(ids, centres_m.tolist(), strict=True)
-    ]
-    sheet = rectangles_print(np.array([[*(-half_m - margin), *(half_m + margin)]]), OUTSIDE, WHITE)
-    corners = np.array([corners_of(marker_m, x, y, roll_deg) for x, y in centres_m.tolist()])
-    return Board(
-        dictionary, ids, corners, (*prints, *others, sheet),
-        np.column_stack([chessboard_m, np.zeros(len(chessboard_m))]),
-    )
-
-
 # --------------------------------------------------------------------------------------------------
 # A board as a pipeline declares it: how the markers of [marker] are arranged.
 
 SINGLE = "none"
 """The kind of a marker without a board."""
-
-
-_LISTED = {name: each if name != "size_m" else dataclasses.replace(each, default=None)
-           for name, each in declared_fields(BoardMarker).items()}
-"""Keys of a table [[board.markers]]."""
-
-
-def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
-    """Return tables of markers as tuples: ID, x, y, size or None, roll, z, tilt, azimuth.
-
-    ValueError or TablesError if they are not such tables.
-    """
-    expected = f"tables with {', '.join(_LISTED)}"
-    return tuple(tuple(row.values()) for row in check_tables(_LISTED, value, "a marker", expected))
-
-
-@dataclass(frozen=True, slots=True)
-class BoardValues:
-    """The board's parameters, beside those of [marker]: dictionary, first ID, size, quiet zone."""
-
-    kind: str = parameter(
-        SINGLE, "none: one marker; grid: rows and columns of markers (GridBoard); aprilgrid: "
-        "Kalibr's, marker_id at the bottom left; "
-        "charuco: a chessboard with markers in its white squares; diamond: a ChArUco diamond of "
-        "3 x 3 squares; markers: those that [[board.markers]] lists",
-        choices=(SINGLE, "grid", "aprilgrid", "charuco", "diamond", "markers"),
-    )
-    ids: tuple[int, ...] | None = list_of_ids(
-        "IDs of all markers of a grid, charuco or diamond in reading order, of an aprilgrid from "
-        "the bottom left; without it they count from marker_id on"
-    )
-    tagCols: int | None = parameter(None, "tags in a row of an aprilgrid", low=1, high=1000)
-    tagRows: int | None = parameter(None, "tags in a column of an aprilgrid", low=1, high=1000)
-    tagSpacing: float | None = parameter(
-        None, "distance between the black squares of an aprilgrid's neighbours, relative to their "
-        "side (Kalibr's tagSize, here size_m of [marker])", low=0, high=1, open_low=True,
-    )
-    rows: int | None = parameter(None, "rows of markers of a grid", low=1, high=1000)
-    columns: int | None = parameter(None, "markers in a row of a grid", low=1, high=1000)
-    gap_m: float | None = parameter(
-        None, "distance between the black squares of a grid's neighbours", unit="m", low=0,
-        high=1e6,
-    )
-    corner_squares: bool = parameter(
-        False, "black squares of the gap's size at the corners of a grid's markers, as an "
-        "aprilgrid has them",
-    )
-    squares_x: int | None = parameter(None, "squares in a row of a charuco", low=2, high=1000)
-    squares_y: int | None = parameter(None, "squares in a column of a charuco", low=2, high=1000)
-    square_m: float | None = parameter(
-        None, "side of a square of a charuco or diamond", unit="m", low=0, high=1e6, open_low=True
-    )
-    legacy_pattern: bool = parameter(
-        False, "charuco: the pattern before OpenCV 4.6; with an even number of squares_y it begins "
-        "with white at the top left",
-    )
-    markers: tuple[tuple[float, ...], ...] | None = parameter(
-        None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m, "
-        "roll_deg, z_m, and tilt_deg about an axis at azimuth_deg",
-        list_text="tables [[board.markers]]", reads=listed_markers,
-    )
-    distractors: tuple[tuple[Any, ...], ...] | None = parameter(
-        None, "what stands beside the board, or beside the marker, and is no part of it: the same "
-        "keys as of markers; without marker_id a black square; dictionary if it is another one",
-        list_text="tables [[board.distractors]]", reads=listed_distractors,
-    )
-
 
 FROM_MARKER = ("dictionary", "marker_id", "size_m", "quiet_zone_modules")
 """Parameters of [marker] that a board takes."""
@@ -727,29 +632,75 @@ PIPELINE_NAMES = {
 }
 """Key of a board's file -> the parameter of a pipeline that says the same."""
 
-_DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
-
 DIAMOND = {"squares_x": 3, "squares_y": 3, "legacy_pattern": False}
 """What makes a ChArUco diamond of a charuco."""
 
+_DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
 
-def _own_keys(kind: str, needed: bool) -> tuple[str, ...]:
-    """Return the keys of a kind of board that [board] has, those that it needs or the others."""
-    declared = _DECLARED["charuco" if kind == "diamond" else kind].items()
-    return tuple(
-        name for name, each in declared if (each.default is dataclasses.MISSING) == needed
-        and PIPELINE_NAMES.get(name, name) not in FROM_MARKER
-        and not (kind == "diamond" and name in DIAMOND)
+_OWN = {
+    kind: {
+        name: each for name, each in _DECLARED[kind].items()
+        if PIPELINE_NAMES.get(name, name) not in FROM_MARKER
+    }
+    for kind in ("grid", "aprilgrid", "charuco", "markers")
+}
+_OWN["diamond"] = {name: each for name, each in _OWN["charuco"].items() if name not in DIAMOND}
+"""Kind -> the keys of its file that [board] has, too."""
+
+
+def _own_keys(needed: bool) -> dict[str, tuple[str, ...]]:
+    """Return of each kind the keys that [board] needs, or those that it may have."""
+    return {
+        kind: tuple(name for name, each in keys.items()
+                    if (each.default is dataclasses.MISSING) == needed)
+        for kind, keys in _OWN.items()
+    }
+
+
+NEEDED = {SINGLE: (), **_own_keys(needed=True)}
+"""Kind -> the parameters that it must have."""
+
+OPTIONAL = _own_keys(needed=False)
+"""Kind -> the parameters that it may have."""
+
+
+@dataclass(frozen=True)
+class _Arrangement:
+    kind: str = parameter(
+        SINGLE, "none: one marker; grid: rows and columns of markers (GridBoard); aprilgrid: "
+        "Kalibr's, marker_id at the bottom left; "
+        "charuco: a chessboard with markers in its white squares; diamond: a ChArUco diamond of "
+        "3 x 3 squares; markers: those that [[board.markers]] lists",
+        choices=(SINGLE, "grid", "aprilgrid", "charuco", "diamond", "markers"),
+    )
+    markers: tuple[tuple[float, ...], ...] | None = parameter(
+        None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m, "
+        "roll_deg, z_m, and tilt_deg about an axis at azimuth_deg",
+        list_text="tables [[board.markers]]", reads=table_reader(_LISTED, "a marker"),
+    )
+    distractors: tuple[tuple[Any, ...], ...] | None = parameter(
+        None, "what stands beside the board, or beside the marker, and is no part of it: the same "
+        "keys as of markers; without marker_id a black square; dictionary if it is another one",
+        list_text="tables [[board.distractors]]", reads=table_reader(_BESIDE, "a distractor"),
     )
 
 
-_ARRANGED = ("grid", "aprilgrid", "charuco", "diamond", "markers")
+BoardValues: type = dataclasses.make_dataclass(
+    "BoardValues",
+    [
+        (each.name, each.types[0], dataclasses.field(
+            default=None if each.default is dataclasses.MISSING else each.default,
+            metadata={"declaration": each.declaration},
+        ))
+        for each in {name: each for keys in _OWN.values() for name, each in keys.items()}.values()
+        if each.name != "markers"
+    ],
+    bases=(_Arrangement,), frozen=True,
+)
+"""The board's parameters, beside those of [marker]: dictionary, first ID, size, quiet zone."""
 
-NEEDED = {SINGLE: (), **{kind: _own_keys(kind, needed=True) for kind in _ARRANGED}}
-"""Kind -> the parameters that it must have."""
-
-OPTIONAL = {kind: _own_keys(kind, needed=False) for kind in _ARRANGED}
-"""Kind -> the parameters that it may have."""
+ARRANGING = (*FROM_MARKER, *(field.name for field in dataclasses.fields(BoardValues)))
+"""The parameters that :func:`arranged_board` takes, in its order."""
 
 
 def arranged(values: Sequence[Any]) -> Kind:
@@ -758,16 +709,12 @@ def arranged(values: Sequence[Any]) -> Kind:
     kind, ids, size_m = given["kind"], given["ids"], given["size_m"]
     cell = given["rows"], given["columns"], given["corner_squares"], ids
     if kind in (SINGLE, "markers") or (kind == "grid" and cell == (1, 1, False, None)):
-        alone = ((given["marker_id"], 0.0, 0.0, None, 0.0, 0.0, 0.0, 0.0),)
+        alone = ((given["marker_id"], 0.0, 0.0, None),)
         return Markers(
             dictionary=given["dictionary"], quiet_zone_modules=given["quiet_zone_modules"],
             markers=tuple(
-                BoardMarker(
-                    marker_id=int(number), x_m=x, y_m=y, size_m=size_m if side is None else side,
-                    roll_deg=roll, z_m=z, tilt_deg=tilt, azimuth_deg=azimuth,
-                )
-                for number, x, y, side, roll, z, tilt, azimuth
-                in (given["markers"] if kind == "markers" else alone)
+                BoardMarker(int(number), x, y, size_m if side is None else side, *pose)
+                for number, x, y, side, *pose in (given["markers"] if kind == "markers" else alone)
             ),
         )
     if kind == "diamond":
@@ -790,29 +737,24 @@ def used_by(kind: Any) -> tuple[str, ...]:
     return (*NEEDED.get(kind, ()), *OPTIONAL.get(kind, ()), "distractors")
 
 
-ARRANGING = ("kind", *FROM_MARKER, "rows", "columns", "gap_m", "corner_squares", "squares_x",
-             "squares_y", "square_m", "legacy_pattern", "ids", "tagCols", "tagRows", "tagSpacing",
-             "markers", "distractors")
-"""The parameters that :func:`arranged_board` takes, in its order."""
-
-
 def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
     """Return what keeps values of :data:`ARRANGING` from being a board, by pipelines' names."""
-    _, dictionary, *_, listed = values
-    faults = arranged(values).faults() + listing_faults(listed, dictionary)
+    given = dict(zip(ARRANGING, values, strict=True))
+    listed = given["distractors"]
+    faults = arranged(values).faults() + listing_faults(listed, given["dictionary"])
     if listed and not faults:
         faults = overlap_faults(arranged_board(*values), listed)
-    return [
-        Fault(PIPELINE_NAMES.get(fault.key, fault.key), fault.value, fault.expected)
-        for fault in faults
-    ]
+    return [fault._replace(key=PIPELINE_NAMES.get(fault.key, fault.key)) for fault in faults]
 
 
 @lru_cache(maxsize=1024)
 def arranged_board(*values: Any) -> Board:
     """Return the board that values of :data:`ARRANGING` declare, the same for the same values."""
-    _, _, _, size_m, quiet_modules, *_, listed = values
-    return with_distractors(arranged(values).board(), listed, size_m, quiet_modules)
+    given = dict(zip(ARRANGING, values, strict=True))
+    return with_distractors(
+        arranged(values).board(), given["distractors"], given["size_m"],
+        given["quiet_zone_modules"],
+    )
 
 
 def is_solid(listed: Sequence[Sequence[Any]] | None) -> bool:

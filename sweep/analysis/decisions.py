@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,12 +45,14 @@ from sweep.analysis.rates import LOOKED_FOR, detection_rate
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
     MIN_DRAWS,
+    Cause,
     Decision,
     ErrorShares,
     Requirable,
     Requirement,
     combined_decision,
     decide,
+    draws_needed,
     excess_of,
     kept_by,
     named,
@@ -58,6 +60,7 @@ from sweep.analysis.requirements import (
     read_requirements,
     requirable_arrays,
     requirables,
+    worst_cell,
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.axes import TRIAL
@@ -168,31 +171,27 @@ def detection_limit(
     if stopped and distinct < math.prod(sides.sizes[name] for name in along):
         results = with_common_trials(results, kept)  # those of the same side are pooled
     table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
-    n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
-    drawn = table["detection_rate_low"].notnull()
+    counts = [table["detected"], table["looked_for"], table["draws"],
+              table["detection_rate_low"].notnull().astype(np.int64)]
     *values, limit = xr.apply_ufunc(
-        _side_limit, sides, hits, n, draws, drawn,
+        _side_limit, sides, *counts,
         kwargs={"rate": rate, "dims": len(along), "count": distinct, "stopped": stopped},
         input_core_dims=[along] * 5, output_core_dims=[[]] * 5,
     )
-    limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
-                      strict=True))
-    words = {
+    meanings = {
         "side_px": f"smallest side from which on the detection rate is at least {rate:g}",
         "side_px_low": "lower end of the 95 % interval: smallest side",
         "side_px_high": "upper end of the 95 % interval: smallest side",
         "side_px_below": "the grid's next smaller side",
     }
-    out = {name: array.assign_attrs(long_name=words[name], units="px")
-           for name, array in limits.items()}
-    count = _modules(results)
-    out |= {
-        name.replace("px", "px_per_module"): (limits[name] / count).assign_attrs(
-            long_name=f"{words[name]}, per module", units="px")
-        for name in ("side_px", "side_px_low", "side_px_high")
-    }
+    modules, out = _modules(results), {}
+    for (name, meaning), array in zip(meanings.items(), values, strict=True):
+        out[name] = array.assign_attrs(long_name=meaning, units="px")
+        if name != "side_px_below":
+            out[name.replace("px", "px_per_module")] = (array / modules).assign_attrs(
+                long_name=f"{meaning}, per module", units="px")
     if len(along) == 1:
-        out |= _in_units_of_the_axis(results, sides, along[0], bins, limits)
+        out |= _in_units_of_the_axis(results, sides, along[0], bins, out)
     out["limit"] = limit.astype(np.uint8).assign_attrs(
         cf_attributes("whether the rate is reached within the grid", flags=SideLimit))
     return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
@@ -210,8 +209,21 @@ def _is_next(sides: Floats) -> Masks:
     return np.concatenate([[True], sides[1:] < sides[:-1] * (1.0 - SAME_SIDE)])
 
 
+def last_steady(holds: Masks, judged: Masks) -> Integers:
+    """Return the index (...) of the last judged value up to which all judged ones hold; -1 of none.
+
+    ``holds`` and ``judged`` are (..., values), from easy to hard.
+
+    >>> last_steady(np.array([True, False, True, False]), np.array([True, False, True, True]))
+    array(2)
+    """
+    steady = np.logical_and.accumulate(holds | ~judged, axis=-1) & judged
+    last = steady.shape[-1] - 1 - np.argmax(steady[..., ::-1], axis=-1)
+    return np.asarray(np.where(steady.any(axis=-1), last, -1))
+
+
 def _side_limit(
-    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, *, rate: float,
+    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Integers, *, rate: float,
     dims: int, count: int, stopped: bool,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
@@ -225,8 +237,7 @@ def _side_limit(
     sides, hits, n, draws, drawn = (
         np.take_along_axis(each.reshape(shape), order, axis=-1)
         for each in (sides, hits, n, draws, drawn))
-    pooled = _pooled(sides, hits, n, draws, drawn.astype(np.int64))
-    hits, n, draws, drawn = (*pooled[:3], pooled[3] > 0)
+    hits, n, draws, drawn = _pooled(sides, hits, n, draws, drawn)
     exists = n > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         reached = hits / n >= rate
@@ -238,26 +249,24 @@ def _side_limit(
     surely = interval(fewest, draws, levels[0])[0] >= rate
     possibly = interval(most, draws, levels[1])[1] >= rate
 
-    def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
-        """Return the smallest side down to which it holds, and whether it holds for all."""
-        steady = np.logical_and.accumulate(holds | ~exists, axis=-1) & exists
-        side = np.where(steady, sides, np.inf).min(axis=-1, initial=np.inf)
-        return np.where(steady.any(axis=-1), side, none), (steady == exists).all(axis=-1)
+    def smallest(holds: Masks) -> Floats:
+        """Return the smallest side down to which it holds."""
+        at = last_steady(holds, exists)
+        side = np.take_along_axis(sides, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
+        return np.where(at < 0, np.inf, side)
 
-    side, always = smallest(reached, np.inf)
-    high, _ = smallest(surely, np.inf)
-    low, everywhere = smallest(possibly, np.inf)
-    low = np.where(everywhere, 0.0, low)
+    side, high, low = smallest(reached), smallest(surely), smallest(possibly)
+    low = np.where((possibly | ~exists).all(axis=-1), 0.0, low)
     smaller = np.where(exists & (sides < side[..., None]), sides, -np.inf).max(
         axis=-1, initial=-np.inf)
     empty = ~exists.any(axis=-1)
-    flag = np.select(
-        [empty, always, np.isinf(side)], [SideLimit.not_run, SideLimit.always, SideLimit.never],
-        SideLimit.found)
-    unknown = ~(drawn | ~exists).all(axis=-1) | empty
+    flags = np.select(
+        [empty, (reached | ~exists).all(axis=-1), np.isinf(side)],
+        [SideLimit.not_run, SideLimit.always, SideLimit.never], SideLimit.found)
+    unknown = ~((drawn > 0) | ~exists).all(axis=-1) | empty
     return (np.where(empty, np.nan, side), np.where(unknown, np.nan, low),
             np.where(unknown, np.nan, high), np.where(np.isinf(smaller), np.nan, smaller),
-            flag.astype(np.float64))
+            flags.astype(np.float64))
 
 
 def _pooled(sides: Floats, *counts: Integers) -> list[Integers]:
@@ -396,10 +405,7 @@ def farthest_met(
     >>> reach["value"].item(), reach["limited_by"].item(), reach["fails_at"].item()
     (20.0, 'detection_rate >= 0.6', 10.0)
     """
-    required = tuple(parse_requirements([
-        each.text if isinstance(each, Requirement) else each
-        for each in ([requirements] if isinstance(requirements, str | Requirement)
-                     else requirements)]))
+    required = parse_requirements(requirements)
     values = axis_values(results, along)
     together = [name for name in as_names(at_all) if name != along]
     names = [name for name in as_names(per) if name != along]
@@ -411,54 +417,47 @@ def farthest_met(
     upwards = is_harder_upwards(results, along, keeps)
     order = np.argsort(values if upwards else -values, kind="stable")
     table, keeps = table.isel({along: order}), keeps.isel({along: order})
-    values = values[order]
     inner = [*together, "requirement"]
     applicable = table["decision"] != Decision.not_applicable
     judged = applicable.any(inner)
-    all_keep = (keeps | ~applicable).all(inner) & judged
+    all_keep = ((keeps | ~applicable).all(inner) & judged).assign_attrs(
+        long_name="whether all values keep their limits", units="1")
     decision = xr.apply_ufunc(
         combined_decision, table["decision"], input_core_dims=[inner],
         kwargs={"axis": tuple(range(-len(inner), 0))}).assign_attrs(
         cf_attributes("whether all requirements are met", flags=Decision))
     kept = [dim for dim in decision.dims if dim != along]
-    shape = decision.transpose(*kept, along)
+    shape = [table.sizes[dim] for dim in kept]
+    arrays = [array.transpose(*kept, along).values for array in (all_keep, judged, decision)]
     rows = []
-    for index in np.ndindex(*shape.shape[:-1]):
-        at = dict(zip(kept, index, strict=True))
-        numbers, failing = _reach(
-            values, upwards, keeps=all_keep.isel(at).values, judged=judged.isel(at).values,
-            decision=decision.isel(at).values)
-        if failing is not None:
-            cell = {**at, along: failing}
-            numbers |= _cause(table.isel(cell), keeps.isel(cell), together)
-        rows.append(numbers)
-
-    def column(name: str, missing: Any) -> NDArray[Any]:
-        return np.array([row.get(name, missing) for row in rows]).reshape(shape.shape[:-1])
-
+    for index in np.ndindex(*shape):
+        row = _reach(values[order], upwards, *(array[index] for array in arrays))
+        if "fails" in row:
+            cell = {**dict(zip(kept, index, strict=True)), along: row["fails"]}
+            row |= _cause(table.isel(cell), keeps.isel(cell), together)
+        rows.append(row)
     units = str(results[along].attrs.get("units", ""))
     meanings = {
-        "value": f"{along} up to which all requirements are met",
-        "low": f"lower end of the interval: {along} up to which all are met",
-        "high": f"upper end of the interval: {along} up to which all are met",
-        "start": f"{along} from which all requirements are met",
-        "fails_at": f"first {along} at which one is not",
-        "farthest_beyond": f"farthest {along} beyond it at which all are met again",
-        "failing_value": "value of the requirement that fails there",
-        "met_beyond": "values beyond it at which all are met again",
+        "value": (f"{along} up to which all requirements are met", units),
+        "low": (f"lower end of the interval: {along} up to which all are met", units),
+        "high": (f"upper end of the interval: {along} up to which all are met", units),
+        "start": (f"{along} from which all requirements are met", units),
+        "fails_at": (f"first {along} at which one is not", units),
+        "farthest_beyond": (f"farthest {along} beyond it at which all are met again", units),
+        "failing_value": ("value of the requirement that fails there", ""),
+        "met_beyond": ("values beyond it at which all are met again", "1"),
+        "limited_by": ("requirement that fails", None),
+        "fails_where": ("where it fails", None),
     }
-    variables: dict[str, Any] = {
-        name: (kept, column(name, np.nan), {"long_name": meaning, "units": {
-            "failing_value": "", "met_beyond": "1"}.get(name, units)})
-        for name, meaning in meanings.items()}
-    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8), cf_attributes(
-        "how far the requirements are met", flags=Reach))
-    for name, meaning in (("limited_by", "requirement that fails"),
-                          ("fails_where", "where it fails")):
-        variables[name] = kept, column(name, ""), {"long_name": meaning}
-    variables["decision"] = decision.transpose(*kept, along)
-    variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
-        long_name="whether all values keep their limits", units="1")
+    variables: dict[str, Any] = {}
+    for name, (meaning, unit) in meanings.items():
+        column = np.array([row.get(name, np.nan if unit is not None else "") for row in rows])
+        variables[name] = (kept, column.reshape(shape), {
+            "long_name": meaning} | ({} if unit is None else {"units": unit}))
+    reach = np.array([row["reach"] for row in rows], dtype=np.uint8).reshape(shape)
+    variables["reach"] = kept, reach, cf_attributes("how far the requirements are met", flags=Reach)
+    variables |= {name: array.transpose(*kept, along)
+                  for name, array in (("decision", decision), ("keeps", all_keep))}
     coordinates = {name: value for name, value in table.coords.items()
                    if set(value.dims) <= {*kept, along}}
     found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
@@ -526,46 +525,41 @@ def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
 
 
 def _reach(
-    values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
-    judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
-) -> tuple[dict[str, Any], int | None]:
-    """Return the limit along the axis, from easy to hard, and the index of the failure beyond."""
+    values: Floats, upwards: bool, keeps: Masks, judged: Masks, decision: Decisions
+) -> dict[str, Any]:
+    """Return the limit of one condition along the axis, from easy to hard.
+
+    ``fails`` is the index of the first value beyond it that fails.
+    """
     if not judged.any():
-        return {"reach": Reach.not_run}, None
+        return {"reach": Reach.not_run}
     none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
-    run = met_run(keeps, judged)
-    before_run = np.nonzero(~keeps & judged)[0]
-    before_run = before_run[before_run < run[0]] if run else before_run[:0]
-    if before_run.size:
-        judged = judged & (np.arange(len(values)) > before_run[-1])
-    failing = np.nonzero(~keeps & judged)[0]
-    unsure = np.nonzero((decision != Decision.met) & judged)[0]
-    failed = np.nonzero((decision == Decision.not_met) & judged)[0]
+    run, index = met_run(keeps, judged), np.arange(len(values))
+    gaps = np.flatnonzero(judged & ~keeps & (index < (run[0] if run else 0)))
+    if gaps.size:
+        judged = judged & (index > gaps[-1])
 
-    def before(indices: np.ndarray[Any, Any], all_of_them: float) -> float:
-        """Return the last judged value before the first of some indices."""
-        if not len(indices):
-            return all_of_them
-        earlier = np.nonzero(judged[: indices[0]])[0]
-        return float(values[earlier[-1]]) if len(earlier) else none
+    def up_to(holds: Masks) -> float:
+        """Return the last judged value up to which it holds."""
+        at = int(last_steady(holds, judged))
+        return none if at < 0 else float(values[at])
 
-    last = float(values[np.nonzero(judged)[0][-1]])
-    value = before(failing, last)
-    ends = sorted((before(unsure, last), before(failed, beyond)))
-    numbers = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
-               "met_beyond": 0.0}
+    possible = decision != Decision.not_met
+    ends = sorted((up_to(decision == Decision.met),
+                   beyond if (possible | ~judged).all() else up_to(possible)))
+    value = up_to(keeps)
+    row = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
+           "met_beyond": 0.0}
     if run:
-        numbers["start"] = float(values[run[0]])
-    if not len(failing):
-        return {**numbers, "reach": Reach.within if before_run.size else Reach.always}, None
-    first = int(failing[0])
-    again = np.nonzero(keeps & judged)[0]
-    again = again[again > first]
-    numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
-                "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
-                "reach": Reach.never if run is None else
-                Reach.within if before_run.size else Reach.found}
-    return numbers, first
+        row["start"] = float(values[run[0]])
+    failing = np.flatnonzero(judged & ~keeps)
+    if not failing.size:
+        return {**row, "reach": Reach.within if gaps.size else Reach.always}
+    again = np.flatnonzero(judged & keeps & (index > failing[0]))
+    return {**row, "fails": int(failing[0]), "fails_at": float(values[failing[0]]),
+            "met_beyond": float(len(again)),
+            "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
+            "reach": Reach.never if run is None else Reach.within if gaps.size else Reach.found}
 
 
 def met_run(
@@ -579,17 +573,14 @@ def met_run(
     >>> met_run(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
     (3, 4)
     """
-    runs: list[list[int]] = []
-    inside = False
-    for index in np.nonzero(judged)[0]:
-        if keeps[index]:
-            runs = [*runs[:-1], [*runs[-1], int(index)]] if inside else [*runs, [int(index)]]
-        inside = bool(keeps[index])
-    if not runs:
+    at = np.flatnonzero(judged)
+    # Runs begin and end where what is kept changes.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keeps[at], [False]])))
+    if not edges.size:
         return None
-    first = int(np.nonzero(judged)[0][0])
-    run = runs[0] if runs[0][0] == first else max(runs, key=len)
-    return run[0], run[-1]
+    runs = edges.reshape(-1, 2)
+    first, end = runs[0] if runs[0, 0] == 0 else runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return int(at[first]), int(at[end - 1])
 
 
 def _cause(
@@ -597,14 +588,14 @@ def _cause(
 ) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~keeps & (cell["decision"] != Decision.not_applicable)
-    excess = excess_of(cell).where(failing)
-    flat = excess.stack(all_dims=excess.dims)
-    worst = flat.isel(all_dims=int(flat.argmax("all_dims")))
-    at = {name: worst[name].item() for name in excess.dims}
-    where = ", ".join(f"{name} = {at[name]:g}" if isinstance(at[name], float) else
-                      f"{name} = {at[name]}" for name in together)
-    return {"limited_by": str(at["requirement"]), "fails_where": where,
-            "failing_value": float(cell["value"].sel(at))}
+    excess = excess_of(cell).where(failing, -np.inf)
+    index = np.unravel_index(int(np.argmax(excess.to_numpy())), excess.shape)
+    worst = cell.isel(dict(zip(excess.dims, map(int, index), strict=True)))
+    at = {name: worst[name].item() for name in together}
+    where = ", ".join(f"{name} = {value:g}" if isinstance(value, float) else f"{name} = {value}"
+                      for name, value in at.items())
+    return {"limited_by": str(worst["requirement"].item()), "fails_where": where,
+            "failing_value": float(worst["value"])}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -728,12 +719,11 @@ def least_draws(requirement: Requirement, share: float) -> int:
 
     Examples
     --------
-    >>> from sweep.analysis.requirements import parse_requirement
-    >>> least_draws(parse_requirement("detection >= 0.99"), 1.0)
+    >>> least_draws(parse_requirements("detection >= 0.99")[0], 1.0)
     368
     """
     what = requirement.requirable
-    tail = (1.0 - what.level) * share / 2.0
+    tail = (1.0 - what.level(share)) / 2.0
     if what.is_rate:
         good = requirement.limit if requirement.at_least else 1.0 - requirement.limit
         return math.ceil(math.log(tail) / math.log(good)) if 0.0 < good < 1.0 else 1
@@ -875,34 +865,6 @@ def walk(decision: Decisions, keeps: Masks) -> Walk:
 # has its own answer.
 
 @dataclass(frozen=True, slots=True)
-class Cause:
-    """A requirement at a condition: by which a choice fails, or only just does not.
-
-    Attributes
-    ----------
-    requirement, units
-        Its text, and the units of its numbers.
-    condition
-        Values by axis.
-    decision, value, low, high, draws
-        As `sweep.analysis.check_requirements` has them, at the levels of the search.
-    draws_needed
-        About how many draws would decide it, if the value stays; NaN if it is decided, infinite if
-        no number would.
-    """
-
-    requirement: str
-    units: str
-    condition: Mapping[str, Any]
-    decision: Decision
-    value: float
-    low: float
-    high: float
-    draws: int
-    draws_needed: float = math.nan
-
-
-@dataclass(frozen=True, slots=True)
 class Nearest:
     """The value that is nearest to meeting all, where none does.
 
@@ -971,29 +933,30 @@ class ChoiceCells:
     Attributes
     ----------
     table
-        Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *per, requirement), the
-        values in the order of the walk; without the axis ``along`` if there is none.
+        Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *at_all, requirement),
+        the values in the order of the walk; without the axis ``along`` if there is none.
     decision, keeps
         (alternatives, values, conditions): of all requirements together, and whether the estimates
         keep all limits.
-    each, excess
-        (alternatives, values, conditions, requirements): the decision, and how far the value is
-        beyond the limit, relative to it; negative on the right side of it, infinite for no number.
+    excess
+        (alternatives, values): how far the worst value is beyond its limit, relative to it;
+        negative on the right side of it, infinite for no number.
     hopeless
         (alternatives, values, conditions): undecided, and no number of trials will tell.
+    rule, shares
+        What is sought, and the shares of the error probability that a decision may spend.
     """
 
     table: xr.Dataset
     decision: Decisions
     keeps: Masks
-    each: Decisions
     excess: Floats
     hopeless: Masks
-    among: tuple[str, ...]
-    per: tuple[str, ...]
+    rule: StoppingRule
+    shares: ErrorShares
 
     def needed(self) -> xr.DataArray:
-        """Return which cells need more trials, dimensions (*among, along, *per)."""
+        """Return which cells need more trials, dimensions (*among, along, *at_all)."""
         template = self.table["decision"].isel(requirement=0, drop=True)
         decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
         return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
@@ -1037,7 +1000,7 @@ def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -
     # Where so few poses count that max_trials will not have enough, there is nothing to learn.
     poses = cells("looked_for").astype(np.float64)
     pooled = math.prod(results.sizes[str(name)] for name in results["true_tvec_m"].dims if
-                       name not in (*kept, "trial", "xyz"))
+                       name not in (*kept, DRAWS, "xyz"))
     with np.errstate(invalid="ignore"):
         coming = cells("draws") / poses * rule.max_trials * pooled
     each = cells("decision").astype(np.uint8)
@@ -1047,96 +1010,49 @@ def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -
     excess = np.where(each == Decision.not_applicable, -np.inf, cells("excess"))
     keeps = cells("keeps") | (each == Decision.not_applicable)
     return ChoiceCells(
-        table, decision, np.asarray(keeps.all(-1)), each, excess,
-        hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.at_all)
+        table, decision, np.asarray(keeps.all(-1)), excess.max(axis=(2, 3)),
+        hopeless.any(-1) & (decision == Decision.undecided), rule, shares)
 
 
-def answers(cells: ChoiceCells, along: str) -> list[Answer]:
-    """Return the answer of each alternative, in the order of the table's dimensions.
-
-    Parameters
-    ----------
-    cells
-        Of `choice_cells`.
-    along
-        The axis that is sought along; empty for none.
-    """
-    names = [name for name in cells.among if name in cells.table.dims]
-    lengths = [cells.table.sizes[name] for name in names]
-    values = cells.table[along].to_numpy().tolist() if along else [None]
-    found = []
-    for k, index in enumerate(np.ndindex(*lengths)):
-        alternative = {name: cells.table[name].isel({name: at}).item()
-                       for name, at in zip(names, index, strict=True)}
-        found.append(_answer(cells, k, values, alternative))
-    return found
+def answers(cells: ChoiceCells) -> list[Answer]:
+    """Return the answer of each alternative, in the order of the table's dimensions."""
+    return [_answer(cells, k) for k in range(len(cells.decision))]
 
 
-def _answer(
-    cells: ChoiceCells, k: int, values: Sequence[float | None], alternative: Mapping[str, Any]
-) -> Answer:
+def _answer(cells: ChoiceCells, k: int) -> Answer:
     """Return the answer of alternative number ``k``."""
+    along, among = cells.rule.along, cells.rule.among
+    index = np.unravel_index(k, [cells.table.sizes[name] for name in among])
+    table = cells.table.isel(dict(zip(among, map(int, index), strict=True)))
+    values: list[Any] = table[along].to_numpy().tolist() if along else [None]
+
+    def cause(at: int) -> Cause:
+        """Return the requirement and condition by which a value fails worst, or is nearest."""
+        cell = worst_cell(table.isel({along: at}) if along else table)
+        needed = math.nan
+        if cell["decision"] == Decision.undecided:
+            required = parse_requirements(str(cell["requirement"].item()))[0]
+            solved = float(cell["solved"]) / max(float(cell["looked_for"]), 1.0)
+            needed = float(draws_needed(required, cell, solved, cells.shares.met))
+        return Cause.at(cell, cells.rule.at_all, draws_needed=needed)
+
     came = walk(cells.decision[k], cells.keeps[k])
-    tightest = None if came.answer < 0 else _cause_of_choice(cells, k, came.answer)
-    after, cause = None, None
-    if came.next < len(values):
-        after, cause = values[came.next], _cause_of_choice(cells, k, came.next)
-    nearest = None
-    if came.answer < 0:
-        worst = cells.excess[k].max(axis=(1, 2))
-        judged = (cells.decision[k] != Decision.not_applicable).any(axis=1)
-        best = int(np.argmin(np.where(judged, worst, np.inf)))
-        nearest = Nearest(values[best], float(worst[best]), _cause_of_choice(cells, k, best))
     value = combined_decision(cells.decision[k], -1)
-    failing = np.flatnonzero(value == Decision.not_met)
-    before = value[: failing[0] if failing.size else len(value)]
-    possible = np.flatnonzero(before != Decision.not_applicable)
-    is_open = bool((before == Decision.undecided).any())
+    judged = value != Decision.not_applicable
+    met, after = came.answer >= 0, came.next < len(values)
+    nearest = None
+    if not met:
+        best = int(np.argmin(np.where(judged, cells.excess[k], np.inf)))
+        nearest = Nearest(values[best], float(cells.excess[k, best]), cause(best))
+    possible = int(last_steady(value != Decision.not_met, judged))
     return Answer(
-        alternative, came.answer >= 0, values[came.answer] if came.answer >= 0 else None, tightest,
-        after, cause,
-        tuple((_number(values[at]), _cause_of_choice(cells, k, at)) for at in came.isolated),
-        tuple(_number(values[at]) for at in came.passing), nearest, is_open,
-        values[possible[-1]] if possible.size else None)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _cause_of_choice(cells: ChoiceCells, k: int, at: int) -> Cause:
-    """Return the requirement and condition by which a value fails worst, or is nearest to it."""
-    each, excess = cells.each[k, at], cells.excess[k, at]
-    among = next((mask for decision in (Decision.not_met, Decision.undecided, Decision.met)
-                  if (mask := each == decision).any()), np.ones(each.shape, bool))
-    flat = int(np.argmax(np.where(among, excess, -np.inf)))
-    condition, requirement = np.unravel_index(flat, each.shape)
-    table, names = cells.table, [str(name) for name in cells.table["decision"].dims][:-1]
-    position = np.ravel_multi_index((k, at, int(condition)), cells.decision.shape)
-    index = np.unravel_index(position, [table.sizes[name] for name in names]) if names else ()
-    one = table.isel(dict(zip(names, map(int, index), strict=True))).isel(
-        requirement=int(requirement))
-    cause = Cause(
-        str(one["requirement"].item()), str(one["units"].item()),
-        {name: one[name].item() for name in cells.per},
-        Decision(int(each.reshape(-1)[flat])), float(one["value"]), float(one["low"]),
-        float(one["high"]), int(one["draws"]))
-    if cause.decision is not Decision.undecided:
-        return cause
-    return replace(cause, draws_needed=_draws_needed(cause))
-
-
-def _draws_needed(cause: Cause) -> float:
-    """Return about how many draws would decide: intervals narrow with the root of their number."""
-    required = parse_requirements([cause.requirement])[0]
-    gap = abs(cause.value - required.limit)
-    good = (cause.value >= required.limit) == required.at_least
-    end = cause.low if good == required.at_least else cause.high
-    if gap == 0.0:
-        return math.inf
-    if not math.isfinite(end) or not math.isfinite(cause.value):
-        return 2.0 * cause.draws
-    return float(f"{cause.draws * max(1.1, abs(end - cause.value) / gap) ** 2:.2g}")
+        {name: table[name].item() for name in among}, met, values[came.answer] if met else None,
+        cause(came.answer) if met else None, values[came.next] if after else None,
+        cause(came.next) if after else None,
+        tuple((values[at], cause(at)) for at in came.isolated),
+        tuple(values[at] for at in came.passing), nearest,
+        bool((value[: possible + 1] == Decision.undecided).any()),
+        None if possible < 0 else values[possible])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1145,8 +1061,6 @@ def _draws_needed(cause: Cause) -> float:
 # Of rates they are as they are, of a bias relative to the root mean square error, of all else
 # relative to the value. The intervals are those that the analysis shows of a store whose sampling
 # was stopped (`sweep.analysis.estimator`).
-
-PoseStatistic = Statistic[Poses]
 
 MIN_MEAN_DRAWS = 450
 """Draws below which no interval of a mean or a root mean square is narrow enough.
@@ -1200,20 +1114,18 @@ class WantedPrecision:
         return "RMSE" if self._spread else "value"
 
     @property
-    def _spread(self) -> str:
-        """Of a bias the name of the standard deviation; else empty."""
-        name = self.name.replace("_bias_", "_sd_")
-        return name if name != self.name and name in requirables() else ""
+    def _spread(self) -> Requirable | None:
+        """Of a bias the standard deviation; else None."""
+        return requirables().get(self.name.replace("_bias_", "_sd_")) \
+            if "_bias_" in self.name else None
 
-    def statistics(self, prefix: str) -> list[PoseStatistic]:
+    def statistics(self, prefix: str) -> list[Statistic[Poses]]:
         """Return what must be computed, the names of their variables beginning with a prefix.
 
-        Their intervals are to be those of `sweep.analysis.estimator.as_stopped`.
+        Their intervals are to be those of stores whose sampling was stopped.
         """
-        parts = list(self.requirable.computed(prefix, LEVEL))
-        if self._spread:
-            parts.append(requirables()[self._spread].renamed(f"{prefix}of ", LEVEL))
-        return parts
+        parts = self.requirable.computed(prefix, LEVEL)
+        return parts + self._spread.computed(f"{prefix}of ", LEVEL)[:1] if self._spread else parts
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -1266,7 +1178,7 @@ class WantedPrecision:
                 scale = abs(value)
                 if self._spread:
                     scale = xr.apply_ufunc(
-                        np.hypot, value, table[f"{prefix}of {self._spread}"])
+                        np.hypot, value, table[f"{prefix}of {self._spread.name}"])
                 half = (half / scale).where(half != 0.0, 0.0)
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
         half = half.where(low != np.inf, 0.0)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import functools
+import itertools
 import math
+import operator
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -32,11 +34,11 @@ from sweep.analysis.estimator import (
     PERCENTS,
     Bins,
     Count,
-    FlipMixture,
     Mean,
     Output,
     Quantiles,
     Rate,
+    RootMeanSquare,
     Statistic,
     aggregate,
     draws_of_quantile,
@@ -67,7 +69,6 @@ from sweep.experiment.sampling import RequirementText, read_requirement
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
-from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # What can be required of results: every output of a statistic that has an interval.
@@ -105,23 +106,17 @@ class Requirable:
         What computes it.
     inputs
         Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
-    used
-        The poses that count.
-    exact
-        Whether the interval holds whatever the distribution.
     largest
         The largest value that exists.
-    signed
-        Whether the value has a sign: its absolute value is required.
+    percent
+        The percent of a quantile, else None.
     """
 
     output: Output
-    statistic: Statistic[Poses]
+    statistic: Any
     inputs: tuple[str, ...]
-    used: Callable[[Poses], Masks]
-    exact: bool
-    largest: float
-    signed: bool = False
+    largest: float = math.inf
+    percent: int | None = None
 
     @property
     def name(self) -> str:
@@ -136,47 +131,40 @@ class Requirable:
     @property
     def is_rate(self) -> bool:
         """Whether it is a share of poses."""
-        return self.exact and self.largest == 1.0
+        return isinstance(self.statistic, Rate)
 
     @property
-    def is_of_logarithm(self) -> bool:
-        """Whether its interval is one of the logarithm: a spread's without a largest value."""
-        parts = self.name.split("_")
-        return ("sd" in parts or "rmse" in parts) and math.isinf(self.largest)
+    def exact(self) -> bool:
+        """Whether the interval holds whatever the distribution."""
+        return isinstance(self.statistic, Rate | Quantiles)
 
     @property
-    def percent(self) -> int | None:
-        """The percent of a quantile."""
-        parts = self.name.split("_")
-        return next((PERCENTS[part] for part in parts if part in PERCENTS), None) \
-            if self.exact else None
+    def signed(self) -> bool:
+        """Whether the value has a sign: its absolute value is required."""
+        return type(self.statistic) is Mean
 
     @property
     def variables(self) -> list[str]:
         """The dataset's variables that it is computed of."""
         return ["true_tvec_m" if name == DEPTH else name for name in self.inputs]
 
-    @property
-    def level(self) -> float:
-        """Level of the interval by which one condition is decided."""
-        return EXACT_LEVEL if self.exact else MEAN_LEVEL
+    def level(self, share: float = 1.0) -> float:
+        """Return the level of the interval by which it is decided with a share of the error."""
+        return 1.0 - (1.0 - (EXACT_LEVEL if self.exact else MEAN_LEVEL)) * share
 
-    def renamed(self, prefix: str, level: float) -> Statistic[Poses]:
-        """Return what computes it, with another level; its variables' names begin with a prefix.
+    def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
+        """Return what computes it, its poses and draws; variables' names begin with a prefix.
 
         Rates have Clopper and Pearson's interval.
         """
-        statistic: Any = self.statistic
-        changes: dict[str, Any] = {"exact": True} if isinstance(statistic, Rate) else {}
-        if isinstance(statistic, Quantiles):
+        changes: dict[str, Any] = {"exact": True} if self.is_rate else {}
+        if isinstance(self.statistic, Quantiles):
             changes["with_reason"] = False
-        return cast("Statistic[Poses]", dataclasses.replace(
-            statistic, name=f"{prefix}{statistic.name}", level=level, **changes))
-
-    def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
-        """Return the statistics, their variables' names beginning with a prefix."""
-        return [self.renamed(prefix, level), Count(
-            f"{prefix}used", "poses that count", self.used, f"{prefix}draws", f"{prefix}drawn")]
+        return [
+            dataclasses.replace(
+                self.statistic, name=f"{prefix}{self.statistic.name}", level=level, **changes),
+            Count(f"{prefix}used", "poses that count", self.statistic.used, f"{prefix}draws",
+                  f"{prefix}drawn")]
 
     def interval(
         self, table: xr.Dataset, prefix: str
@@ -185,10 +173,9 @@ class Requirable:
         value, low, high = (table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high"))
         if not self.signed:
             return value, low, high
-        ends = abs(low), abs(high)
-        nearest = ends[0].where(ends[0] <= ends[1], ends[1]).where(low * high > 0.0, 0.0)
-        farthest = ends[0].where(ends[0] >= ends[1], ends[1])
-        return abs(value), nearest.where(low.notnull()), farthest
+        nearest, farthest = (xr.apply_ufunc(end, abs(low), abs(high))
+                             for end in (np.minimum, np.maximum))
+        return abs(value), nearest.where(low * high > 0.0, 0.0).where(low.notnull()), farthest
 
 
 def requirable_arrays(
@@ -232,24 +219,18 @@ def requirables() -> dict[str, Requirable]:
 
 def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Requirable]:
     """Return what a record gives with an interval."""
-    statistic = record.statistic
-    outputs = {output.name: output for output in statistic.outputs()}
-    quantity = next((each for each in quantities if any(
-        name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}") for name in outputs)),
-        None)
-    used = statistic.flips.used if isinstance(statistic, FlipMixture) else (
-        getattr(statistic, "used", None))
-    if used is None:
-        return []
-    exact, largest = isinstance(statistic, Rate | Quantiles), math.inf
-    if isinstance(statistic, Rate):
-        largest = 1.0
-    elif quantity is not None and quantity.bound is not None:
-        largest = quantity.bound
-    signed = type(statistic) is Mean
-    return [Requirable(
-        output, statistic, record.inputs, used, exact, largest, signed)
-        for name, output in outputs.items() if f"{name}_low" in outputs]
+    outputs = {output.name: output for output in record.statistic.outputs()}
+    found = []
+    for name, output in outputs.items():
+        if f"{name}_low" not in outputs:
+            continue
+        largest = next((each.bound for each in quantities if each.bound is not None and (
+            name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
+        percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
+        found.append(Requirable(
+            output, record.statistic, record.inputs,
+            1.0 if isinstance(record.statistic, Rate) else largest, percent))
+    return found
 
 
 # --------------------------------------------------------------------------------------------------
@@ -349,30 +330,20 @@ def _wrong_unit(what: Requirable, given: RequirementText) -> str:
     return f"{plain(given.unit)} after the limit: expected the number alone, {words}{more}"
 
 
-@dataclass(frozen=True, slots=True)
-class Side:
-    """One side of what a variable may be: at least a limit, or at most."""
-
-    text: str
-    variable: str
-    at_least: bool
-    limit: float
-
-
-def contradictions(given: Sequence[Side]) -> list[tuple[str, str]]:
+def contradictions(given: Sequence[Requirement]) -> list[tuple[str, str]]:
     """Return the requirements that cannot hold together, each as its text and a line.
 
     What is implied counts: a median is at most the 95 % quantile, a solved pose was detected, and
     where a 95 % quantile is finite, 95 % of the poses were solved.
     """
     faults = []
-    for number, side in enumerate(given):
-        if any((side.variable, side.at_least) == (other.variable, other.at_least)
+    for number, each in enumerate(given):
+        if any((each.variable, each.at_least) == (other.variable, other.at_least)
                for other in given[:number]):
-            faults.append((side.text, f"{side.variable} has another such limit; delete one"))
-    solved = [Side(side.text, "solved_rate", at_least=True, limit=share / 100.0) for side in given
-              if not side.at_least and (share := requirables()[side.variable].percent)]
-    for least in (*(side for side in given if side.at_least), *solved):
+            faults.append((each.text, f"{each.variable} has another such limit; delete one"))
+    solved = [Requirement(each.text, "solved_rate", ">=", each.requirable.percent / 100.0)
+              for each in given if not each.at_least and each.requirable.percent]
+    for least in (*(each for each in given if each.at_least), *solved):
         for most in given:
             if most.at_least or least.limit < most.limit:
                 continue
@@ -384,9 +355,8 @@ def contradictions(given: Sequence[Side]) -> list[tuple[str, str]]:
 def _ordered() -> frozenset[tuple[str, str]]:
     pairs = {("solved_rate", "detection_rate")}
     for quantity in (*QUANTITIES, *(each for group in SIGNED.values() for each in group)):
-        names = [quantity.named(each) for each in PERCENTS]
-        pairs |= {(a, b) for k, a in enumerate(names) for b in names[k + 1 :]}
-        pairs.add((quantity.named("bias"), quantity.named("rmse_unflipped")))
+        pairs |= {*itertools.combinations([quantity.named(each) for each in PERCENTS], 2),
+                  (quantity.named("bias"), quantity.named("rmse_unflipped"))}
     return frozenset(pairs)
 
 
@@ -492,12 +462,16 @@ class Requirement:
 
     def holds(self, value: xr.DataArray) -> xr.DataArray:
         """Return where values fulfil it; NaN does not."""
-        compare = {">=": value >= self.limit, "<=": value <= self.limit,
-                   ">": value > self.limit, "<": value < self.limit}
-        return compare[self.relation]
+        fulfils: xr.DataArray = RELATIONS[self.relation](value, self.limit)
+        return fulfils
 
 
-def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
+RELATIONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+
+
+def parse_requirements(
+    texts: str | Requirement | Iterable[str | Requirement]
+) -> tuple[Requirement, ...]:
     """Return the requirements of some texts.
 
     Parameters
@@ -520,7 +494,8 @@ def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
     >>> [each.text for each in parse_requirements(["detection>=0.99", "yaw_bias_deg < 0.1"])]
     ['detection_rate >= 0.99', 'yaw_bias_deg < 0.1']
     """
-    given = [texts] if isinstance(texts, str) else list(texts)
+    listed = [texts] if isinstance(texts, str | Requirement) else list(texts)
+    given = [each.text if isinstance(each, Requirement) else each for each in listed]
     requirements, faults = read_requirements(given)
     if not given:
         faults.append(("[]", "expected at least one, such as 'detection >= 0.95'"))
@@ -529,11 +504,6 @@ def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
         raise ArgumentError("requirements", first[0], "\n".join(
             [first[1], *(f"{text}: {problem}" for text, problem in others)]))
     return tuple(requirements)
-
-
-def parse_requirement(text: str) -> Requirement:
-    """Return the requirement of a text; ArgumentError as `parse_requirements`."""
-    return parse_requirements([text])[0]
 
 
 def read_requirements(
@@ -548,8 +518,7 @@ def read_requirements(
             faults.append((plain(text), str(error)))
         else:
             requirements.append(requirement)
-    faults += contradictions([
-        Side(each.text, each.variable, each.at_least, each.limit) for each in requirements])
+    faults += contradictions(requirements)
     return requirements, faults
 
 
@@ -628,16 +597,14 @@ def check_requirements(
     >>> [Decision(each).name for each in table["decision"].isel(solver=0, requirement=0).values]
     ['not_met', 'undecided', 'met']
     """
-    required = _requirements(requirements)
-    out = decide(results, required, per, bins)
-    table = out.drop_vars(["looked_for", "solved"])
-    share = (out["solved"] / out["looked_for"]).where(out["looked_for"] > 0)
-    needed = [
-        draws_needed(each, one["value"], one["low"], one["high"], one["draws"], share,
-                     one["decision"] == Decision.undecided)
-        for number, each in enumerate(required) for one in [table.isel(requirement=number)]]
-    return table.assign(draws_needed=stacked(needed, "requirement").assign_attrs(
-        long_name="draws that would decide it, if the value stays", units="1"))
+    required = parse_requirements(requirements)
+    table = decide(results, required, per, bins)
+    solved = (table["solved"] / table["looked_for"]).where(table["looked_for"] > 0)
+    needed = [draws_needed(each, table.isel(requirement=number), solved)
+              for number, each in enumerate(required)]
+    return table.drop_vars(["looked_for", "solved"]).assign(
+        draws_needed=stacked(needed, "requirement").assign_attrs(
+            long_name="draws that would decide it, if the value stays", units="1"))
 
 
 def decide(
@@ -660,49 +627,43 @@ def decide(
         As there, with ``looked_for`` and ``solved``: poses of the condition (without
         ``requirement``).
     """
-    dims = (*configuration_axes(results), *as_names(per))
-    kept = kept_dimensions(results, tuple(dict.fromkeys(dims)))
+    configuration = configuration_axes(results)
+    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *as_names(per)))))
     require_draws(results, kept)
-    count = math.prod(results.sizes[name] for name in kept if name not in
-                      configuration_axes(results))
-    count *= math.prod(len(edges) - 1 for edges in (bins or {}).values()) * len(required)
+    bin_counts = [len(edges) - 1 for edges in (bins or {}).values()]
+    count = len(required) * math.prod(
+        [*bin_counts, *(results.sizes[name] for name in kept if name not in configuration)])
     spent = shares or ErrorShares(not_met=1.0 / count)
     inputs = requirable_arrays(results, [each.requirable for each in required])
     statistics = [
         Count("looked_for", "", lambda poses: poses.looked_for),
         Count("solved", "", lambda poses: poses.solved),
-        *(statistic for number, each in enumerate(required) for prefix, share in (
+        *(guarded(statistic) for number, each in enumerate(required) for prefix, share in (
             (f"{number} one ", spent.met), (f"{number} all ", spent.not_met))
-          for statistic in map(guarded, each.requirable.computed(
-              prefix, 1.0 - (1.0 - each.requirable.level) * share))),
+          for statistic in each.requirable.computed(prefix, each.requirable.level(share))),
     ]
     stopped = None if shares is None else False
     table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped)
-    if shares is None:
-        _require_numbers(table, required)
-    replicated = is_replicated(results)
-    judged = [_judged(table, number, each, replicated) for number, each in enumerate(required)]
-    index = xr.DataArray([each.text for each in required], dims="requirement", attrs={
-        "long_name": "what is required"})
+    lacking = [each.variable for number, each in enumerate(required)
+               if not table[f"{number} one used"].any() and table["solved"].any()]
+    if lacking and shares is None:
+        raise DatasetError("\n".join(
+            f"{name}: no pose of this store has such a number; require something else, or give the "
+            "pipeline what computes it" for name in lacking))
+    judged = [_judged(table, number, each, is_replicated(results))
+              for number, each in enumerate(required)]
     out = xr.concat(
         judged, "requirement", data_vars="all", coords="minimal", compat="override", join="exact",
     ).assign_coords(
-        requirement=index,
+        requirement=xr.DataArray([each.text for each in required], dims="requirement", attrs={
+            "long_name": "what is required"}),
         variable=("requirement", [each.variable for each in required]),
         relation=("requirement", [each.relation for each in required]),
         limit=("requirement", [each.limit for each in required]),
         units=("requirement", [each.requirable.units for each in required]))
     out = out.transpose(..., "requirement")
-    out.attrs["configuration_dims"] = [
-        name for name in configuration_axes(results) if name in out.dims]
+    out.attrs["configuration_dims"] = [name for name in configuration if name in out.dims]
     return out.assign(looked_for=table["looked_for"], solved=table["solved"])
-
-
-def _requirements(given: Iterable[Requirement | str]) -> tuple[Requirement, ...]:
-    """Return requirements, those given as texts parsed, all checked together."""
-    listed = [given] if isinstance(given, str | Requirement) else list(given)
-    return parse_requirements([
-        each.text if isinstance(each, Requirement) else each for each in listed])
 
 
 def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
@@ -716,16 +677,6 @@ def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
             "and trial = 100 under [axes], and run it again")
 
 
-def _require_numbers(table: xr.Dataset, required: Sequence[Requirement]) -> None:
-    """Raise if poses were solved and what is required has no number at all."""
-    lacking = [each.variable for number, each in enumerate(required)
-               if not table[f"{number} one used"].any() and table["solved"].any()]
-    if lacking:
-        raise DatasetError("\n".join(
-            f"{name}: no pose of this store has such a number; require something else, or give the "
-            "pipeline what computes it" for name in lacking))
-
-
 def _judged(
     table: xr.Dataset, number: int, requirement: Requirement, replicated: bool
 ) -> xr.Dataset:
@@ -733,13 +684,13 @@ def _judged(
     what = requirement.requirable
     value, low, high = what.interval(table, f"{number} one ")
     _, joint_low, joint_high = what.interval(table, f"{number} all ")
+    # The end that shows it is met is of one decision, the other of all together.
     low, high = (low, joint_high) if requirement.at_least else (joint_low, high)
+    shows, refutes = (low, high) if requirement.at_least else (high, low)
     draws, drawn = table[f"{number} one draws"], table[f"{number} one drawn"]
     enough = drawn if what.exact or replicated else drawn & (draws >= MIN_DRAWS)
-    met = requirement.holds(low if requirement.at_least else high) & enough
-    possible = requirement.holds(high if requirement.at_least else low)
-    known = (high if requirement.at_least else low).notnull()
-    not_met = ~possible & known & enough
+    met = requirement.holds(shows) & enough
+    not_met = ~requirement.holds(refutes) & refutes.notnull() & enough
     no_number = (table[f"{number} one used"] == 0) & (
         (table["looked_for"] == 0) | (table["solved"] > 0))
     decision = (xr.full_like(value, Decision.undecided).where(~not_met, Decision.not_met)
@@ -765,55 +716,61 @@ MAX_DRAWS = 1e9
 
 
 def draws_needed(
-    requirement: Requirement, value: xr.DataArray, low: xr.DataArray, high: xr.DataArray,
-    draws: xr.DataArray, solved: xr.DataArray, undecided: xr.DataArray,
+    requirement: Requirement, table: xr.Dataset, solved: xr.DataArray | float, share: float = 1.0
 ) -> xr.DataArray:
     """Return about how many draws would decide a requirement, infinite if no number would.
 
-    NaN where it is not ``undecided``, and without a value.
+    NaN where it is decided, and without a value. For a rate it is the least n at which Clopper and
+    Pearson's end for n times the rate reaches the limit. Other intervals narrow with the root of
+    the number of draws (those of spreads on the scale of logarithms, on which they are made); a
+    quantile needs as many as its interval's ends need to exist and, if its end is infinite for too
+    few poses are solved, as many as decide whether enough are.
 
-    For a rate it is the least n at which Clopper and Pearson's end for n times the rate reaches
-    the limit. Other intervals narrow with the root of the number of draws (those of spreads on the
-    scale of logarithms, on which they are made); a quantile needs as
-    many as its interval's ends need to exist and, if its end is infinite for too few poses are
-    ``solved`` (a share), as many as decide whether enough are.
+    Parameters
+    ----------
+    requirement, table
+        What is required, and its decisions (`decide`).
+    solved
+        Share of the solved poses.
+    share
+        Share of the error probability that the decision may spend.
     """
-    what = requirement.requirable
-    needed: xr.DataArray = xr.apply_ufunc(
-        np.vectorize(lambda *numbers: _needed(what, requirement, *numbers), otypes=[float]),
-        value.where(undecided), low, high, draws.astype(np.float64), solved)
-    return needed
+    what, limit = requirement.requirable, requirement.limit
+    level = what.level(share)
 
+    def needed(value: float, low: float, high: float, draws: float, solved: float) -> float:
+        if math.isnan(value):
+            return math.nan
+        if what.is_rate:
+            return _of_rate(value, limit, level)
+        good = value >= limit if requirement.at_least else value <= limit
+        # The end that has to pass the limit.
+        end, gap = low if good == requirement.at_least else high, abs(value - limit)
+        least = float(MIN_DRAWS)
+        if what.percent is not None:
+            least = float(draws_of_quantile(what.percent, level))
+            if math.inf in (end, value) and draws >= least:
+                return max(least, _of_rate(solved, what.percent / 100.0, level))
+        if not math.isfinite(end) or not math.isfinite(value):
+            return max(least, 2.0 * draws)
+        if gap == 0.0:
+            return math.inf
+        reach = (end - value) / gap
+        # A spread without a largest value has an interval of the logarithm.
+        if isinstance(what.statistic, RootMeanSquare) and math.isinf(what.largest) and (
+                min(value, end) > 0.0):
+            reach = math.log(end / value) / math.log(limit / value)
+        if 2.0 <= draws < MIN_DRAWS and not what.exact:
+            # Student's factor of so few draws is far above that of many.
+            probability = (1.0 + level) / 2.0
+            reach *= special.ndtri(probability) / special.stdtrit(draws - 1.0, probability)
+        return _rounded(max(least, draws * reach ** 2))
 
-def _needed(
-    what: Requirable, requirement: Requirement, value: float, low: float, high: float, draws: float,
-    solved: float,
-) -> float:
-    if math.isnan(value):
-        return math.nan
-    if what.is_rate:
-        return _of_rate(value, requirement.limit, what.level)
-    least = float(MIN_DRAWS)
-    if what.percent is not None:
-        least = float(draws_of_quantile(what.percent, what.level))
-    good = value >= requirement.limit if requirement.at_least else value <= requirement.limit
-    # The end that has to pass the limit.
-    end = low if good == requirement.at_least else high
-    gap = abs(value - requirement.limit)
-    if what.percent is not None and math.inf in (end, value) and draws >= least:
-        return max(least, _of_rate(solved, what.percent / 100.0, what.level))
-    if not math.isfinite(end) or not math.isfinite(value):
-        return max(least, 2.0 * draws)
-    if gap == 0.0:
-        return math.inf
-    reach = (end - value) / gap
-    if what.is_of_logarithm and min(value, end) > 0.0:
-        reach = math.log(end / value) / math.log(requirement.limit / value)
-    if 2.0 <= draws < MIN_DRAWS and not what.exact:
-        # Student's factor of so few draws is far above that of many.
-        end_probability = (1.0 + what.level) / 2.0
-        reach *= special.ndtri(end_probability) / special.stdtrit(draws - 1.0, end_probability)
-    return _rounded(max(least, draws * reach ** 2))
+    found: xr.DataArray = xr.apply_ufunc(
+        np.vectorize(needed, otypes=[float]),
+        table["value"].where(table["decision"] == Decision.undecided), table["low"], table["high"],
+        table["draws"].astype(np.float64), solved)
+    return found
 
 
 def _of_rate(rate: float, limit: float, level: float) -> float:
@@ -876,32 +833,27 @@ def check_required(
 # --------------------------------------------------------------------------------------------------
 # One verdict for each requirement and configuration, from the decisions at all conditions.
 
+WORST_FIRST = (Decision.not_met, Decision.undecided, Decision.met, Decision.not_applicable)
+
+
 @dataclass(frozen=True)
-class Verdict:
-    """Whether a configuration meets a requirement at all conditions.
+class Cause:
+    """A requirement at the condition by which it fails, or is nearest to it.
 
     Attributes
     ----------
     requirement, units
-        Its text, and the units of value and limit.
-    configuration, condition
-        Values by axis: of detector and estimator; of the condition that is farthest from being
-        met, whose value, interval and draws follow.
-    decision
-        Not met if it is not met at any condition, met if it is at all that can be judged.
-    value, low, high, draws
-        At that condition.
+        Its text, and the units of its numbers.
+    condition
+        Values by axis.
+    decision, value, low, high, draws
+        As `check_requirements` has them.
     draws_needed
-        About how many draws would decide all of them; NaN if it is decided, infinite if no number
-        would do.
-    counts
-        Conditions by decision.
+        About how many draws would decide it; NaN if it is decided, infinite if no number would do.
     """
 
     requirement: str
     units: str
-    limit: float
-    configuration: Mapping[str, Any]
     condition: Mapping[str, Any]
     decision: Decision
     value: float
@@ -909,6 +861,38 @@ class Verdict:
     high: float
     draws: int
     draws_needed: float
+
+    @classmethod
+    def at(cls, cell: xr.Dataset, conditions: Sequence[str], **more: Any) -> Self:
+        """Return the cause of one cell of a table of `decide`."""
+        return cls(
+            str(cell["requirement"].item()), str(cell["units"].item()),
+            {name: cell[name].item() for name in conditions}, Decision(int(cell["decision"])),
+            float(cell["value"]), float(cell["low"]), float(cell["high"]), int(cell["draws"]),
+            **more)
+
+
+@dataclass(frozen=True)
+class Verdict(Cause):
+    """Whether a configuration meets a requirement at all conditions.
+
+    Attributes
+    ----------
+    requirement, units, condition, value, low, high, draws
+        At the condition that is farthest from being met.
+    decision
+        Not met if it is not met at any condition, met if it is at all that can be judged.
+    draws_needed
+        About how many draws would decide all of them; NaN if it is decided, infinite if no number
+        would do.
+    limit, configuration
+        The limit, and values by axis of detector and estimator.
+    counts
+        Conditions by decision.
+    """
+
+    limit: float
+    configuration: Mapping[str, Any]
     counts: Mapping[Decision, int]
 
     @property
@@ -918,48 +902,43 @@ class Verdict:
                    if decision is not Decision.not_applicable)
 
 
+def worst_cell(table: xr.Dataset) -> xr.Dataset:
+    """Return the cell of a table of `decide` that fails worst, or is nearest to it."""
+    decision = table["decision"]
+    worst = next(each for each in WORST_FIRST if (decision == each).any())
+    excess = excess_of(table).where(decision == worst, -np.inf)
+    index = np.unravel_index(int(np.argmax(excess.to_numpy())), excess.shape)
+    return table.isel(dict(zip(excess.dims, map(int, index), strict=True)))
+
+
 def verdicts(table: xr.Dataset) -> list[Verdict]:
     """Return the verdicts of a table of `sweep.analysis.check_requirements`."""
     configuration = [str(name) for name in table.attrs["configuration_dims"]]
-    conditions = [str(dim) for dim in table["decision"].dims
-                  if dim not in (*configuration, "requirement")]
+    dims = [str(dim) for dim in table["decision"].dims]
+    conditions = [name for name in dims if name not in (*configuration, "requirement")]
+    table = table.transpose(*configuration, "requirement", *conditions)
     found = []
-    for at in np.ndindex(*(table.sizes[name] for name in configuration)):
-        chosen = table.isel(dict(zip(configuration, at, strict=True)))
-        found += [_verdict(chosen.isel(requirement=number), configuration, conditions)
-                  for number in range(table.sizes["requirement"])]
+    for at in np.ndindex(*(table.sizes[name] for name in (*configuration, "requirement"))):
+        one = table.isel(dict(zip((*configuration, "requirement"), at, strict=True)))
+        decisions = one["decision"].values
+        needed = one["draws_needed"].values[decisions == Decision.undecided]
+        cell = worst_cell(one)
+        is_open = cell["decision"] == Decision.undecided and not np.isnan(needed).all()
+        found.append(Verdict.at(
+            cell, conditions, limit=float(one["limit"]),
+            draws_needed=float(np.nanmax(needed)) if is_open else math.nan,
+            configuration={name: one[name].item() for name in configuration},
+            counts={each: int((decisions == each).sum()) for each in Decision
+                    if (decisions == each).any()}))
     return found
 
 
 def combined(found: Iterable[Verdict]) -> Decision:
-    """Return the decision of all verdicts together."""
-    decisions = [verdict.decision for verdict in found]
-    for decision in (Decision.not_met, Decision.undecided, Decision.not_applicable):
-        if decision in decisions:
-            return Decision.undecided if decision is Decision.not_applicable else decision
-    return Decision.met
-
-
-def _verdict(
-    one: xr.Dataset, configuration: Sequence[str], conditions: Sequence[str]
-) -> Verdict:
-    """Return the verdict of a table (*conditions) of one configuration and requirement."""
-    one = one.transpose(*conditions)
-    decisions = one["decision"].values
-    counts = {each: count for each in Decision if (count := int((decisions == each).sum()))}
-    order = (Decision.not_met, Decision.undecided, Decision.met, Decision.not_applicable)
-    decision = next(each for each in order if each in counts)
-    among = np.where(decisions == decision, excess_of(one).values, -np.inf)
-    index = np.unravel_index(int(np.argmax(among)), among.shape)
-    cell = one.isel(dict(zip(conditions, index, strict=True)))
-    needed = one["draws_needed"].values[decisions == Decision.undecided]
-    return Verdict(
-        str(one["requirement"].item()), str(one["units"].item()), float(one["limit"]),
-        {name: one[name].item() for name in configuration},
-        {name: cell[name].item() for name in conditions}, decision,
-        float(cell["value"]), float(cell["low"]), float(cell["high"]), int(cell["draws"]),
-        float(np.nanmax(needed)) if decision is Decision.undecided and (
-            np.isfinite(needed) | np.isinf(needed)).any() else math.nan, counts)
+    """Return the decision of all verdicts together; without anything to judge it is undecided."""
+    decisions = {verdict.decision for verdict in found}
+    if Decision.not_met in decisions:
+        return Decision.not_met
+    return Decision.undecided if decisions - {Decision.met} else Decision.met
 
 
 def excess_of(table: xr.Dataset) -> xr.DataArray:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes, is_replicated
 from sweep.analysis.decisions import CONFIDENCE
-from sweep.analysis.requirements import Decision, Verdict, described
+from sweep.analysis.requirements import Cause, Decision, Verdict, described
 from sweep.errors import ArgumentError
 from sweep.experiment.cell_selection import parse_selection
 from sweep.experiment.draws import REPLICATES
@@ -28,7 +28,7 @@ from sweep.report.table import (
 
 if TYPE_CHECKING:
     from sweep.analysis.comparisons import Regression
-    from sweep.analysis.decisions import Answer, Cause
+    from sweep.analysis.decisions import Answer
     from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
@@ -148,7 +148,7 @@ def valued(value: float, low: float, high: float, units: str) -> str:
     return f"{number(value)} ({interval_text(low, high)}){UNITS.get(units, f' {units}')}"
 
 
-def needs(each: Verdict | Cause) -> str:
+def needs(each: Cause) -> str:
     """Return the draws of what is undecided, and how many would decide it."""
     if each.decision is not Decision.undecided or math.isnan(each.draws_needed):
         return ""

@@ -20,7 +20,7 @@ from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import CHOICES, StoppingRule
+from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
 from sweep.store.blocks import RunStore, region
@@ -214,18 +214,6 @@ class Waves:
 # --------------------------------------------------------------------------------------------------
 # The rule that samples, by what the pipeline says.
 
-RULES: Mapping[str, str] = {
-    "along": "limit_sampling",
-    **dict.fromkeys(CHOICES, "choice_sampling"),
-    "precision": "precision_sampling",
-}
-"""Kind of search -> function of `sweep.sampling.searches` that makes its rule of a pipeline.
-
-The function raises PipelineError with a line for each name that it does not know. Its module is
-imported on use: runs of fixed trials need none.
-"""
-
-
 def make_rule(pipeline: Pipeline) -> Stopping | None:
     """Return the rule by which a pipeline's sampling stops; None if every trial is computed.
 
@@ -236,9 +224,9 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
     """
     if pipeline.stopping is None:
         return None
+    # Imported here: runs of fixed trials need no SciPy.
     searches = importlib.import_module("sweep.sampling.searches")
-    make = getattr(searches, RULES[pipeline.stopping.kind])
-    return cast("Stopping", make(pipeline, pipeline.stopping))
+    return cast("Stopping", searches.search_rule(pipeline, pipeline.stopping))
 
 
 # --------------------------------------------------------------------------------------------------

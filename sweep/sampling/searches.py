@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,6 @@ from scipy import special
 from sweep.analysis.dataset import sides_of
 from sweep.analysis.decisions import (
     ChoiceCells,
-    WantedPrecision,
     choice_cells,
     choice_faults,
     choice_shares,
@@ -39,7 +39,7 @@ from sweep.analysis.requirements import (
     parse_requirements,
 )
 from sweep.errors import DatasetError
-from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.axes import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
@@ -50,16 +50,6 @@ from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # The results of a group of scenes as a dataset, as the analysis reads them.
-
-def with_flags(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the variables that are read for some: themselves, and the flags of every result.
-
-    >>> with_flags(["rotation_error_rad"])
-    ('detection', 'estimate', 'flipped', 'rotation_error_rad')
-    """
-    flags = [name for name in REQUIRED_VARIABLES if VARIABLES[name].flags is not None]
-    return tuple(dict.fromkeys([*flags, *names]))
-
 
 def group_dataset(results: GroupResults) -> xr.Dataset:
     """Return the results of a group as a dataset with coordinates of its axes.
@@ -72,7 +62,7 @@ def group_dataset(results: GroupResults) -> xr.Dataset:
     stops = dict(zip((axis.name for axis in scene), results.stops, strict=True))
     coordinates = {
         axis.name: (axis.name, axis.coordinates(starts.get(axis.name, 0), stops.get(axis.name)),
-                    _attributes(axis))
+                    {"zip": " ".join(axis.columns)} if axis.zipped else {})
         for axis in pipeline.axes if axis.name != TRIAL
     }
     coordinates[TRIAL] = (TRIAL, np.arange(results.trials), {})
@@ -87,10 +77,6 @@ def group_dataset(results: GroupResults) -> xr.Dataset:
             shape = [sizes[dim] if dim in sizes else len(LABELS[dim]) for dim in dims]
             arrays[name] = (dims, np.broadcast_to(np.float32(np.nan), shape))
     return xr.Dataset(arrays, coordinates)
-
-
-def _attributes(axis: Axis) -> dict[str, str]:
-    return {"zip": " ".join(axis.columns)} if axis.zipped else {}
 
 
 def _dimensions(pipeline: Pipeline, variable: Variable) -> list[str]:
@@ -164,119 +150,123 @@ def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Ma
 
 
 # --------------------------------------------------------------------------------------------------
-# The rule of a search along an axis: trials come where they decide how far requirements are met.
+# A rule: what the results of earlier waves decide, and where more trials decide the rest.
 
 @dataclass(frozen=True, slots=True)
-class LimitSampling:
+class Search:
     """Attributes as `sweep.sampling.rules.Stopping` has them.
 
     Attributes
     ----------
-    rule, required, shares
-        What is searched, what is required, and the error probability of each decision.
-    upwards
-        Whether large values of the axis are the hard ones; None where the results say.
+    open_cells
+        Returns where trials are needed, over some axes of the scene, of the dataset of a group.
     """
 
     ends: tuple[int, ...]
     variables: tuple[str, ...]
     coupled: tuple[str, ...]
-    rule: StoppingRule
-    required: tuple[Requirement, ...]
-    shares: ErrorShares
-    upwards: bool | None
+    open_cells: Callable[[xr.Dataset], xr.DataArray]
 
     def needed(self, results: GroupResults) -> Masks:
-        """Return the scenes at whose values of the axis trials decide the limit."""
+        """Return for each scene of a group whether it is needed."""
         names = [axis.name for axis in condition_axes(results.pipeline)]
-        rule = self.rule
         dataset = group_dataset(results)
-        table = decide(dataset, self.required, [*rule.per, *rule.at_all, rule.along],
-                       shares=self.shares)
-        searched = {*rule.per, *rule.at_all, rule.along}
-        pooled = {name: dataset.sizes[name] for name in names if name not in searched}
-        mask = self._of_table(table, rule.max_trials * math.prod(pooled.values()))
-        return np.asarray(mask.expand_dims(pooled).transpose(*names).values)
-
-    def _of_table(self, table: xr.Dataset, most: int) -> xr.DataArray:
-        """Return what is needed (*per, *at_all, along), of any configuration.
-
-        ``most`` draws are the most that a value can have.
-        """
-        rule = self.rule
-        configurations = [str(name) for name in table.attrs["configuration_dims"]]
-        inner = [*rule.at_all, "requirement"]
-        keeps = kept_by(table, self.required)
-        order = [*configurations, *rule.per, rule.along, *inner]
-        arrays = [array.transpose(*order).values
-                  for array in (table["decision"], keeps, self._may_be_decided(
-                      table, keeps, most))]
-        ascending = np.argsort(table[rule.along].values, kind="stable")
-        shape = arrays[0].shape
-        rows = (-1, shape[len(configurations) + len(rule.per)], *shape[-len(inner):])
-        arrays = [array.reshape(rows).take(ascending, axis=1) for array in arrays]
-        wanted = np.stack([self._of_row(*each) for each in zip(*arrays, strict=True)])
-        found = np.empty_like(wanted)
-        found[:, ascending] = wanted
-        return xr.DataArray(found.reshape(shape), dims=order).any([*configurations, "requirement"])
-
-    def _may_be_decided(self, table: xr.Dataset, keeps: xr.DataArray, most: int) -> xr.DataArray:
-        """Return where there are draws, and ``most`` of them may decide.
-
-        Rates that are all but the limit need more: the interval must shrink to the distance from
-        the limit, which is taken for a standard error larger than it seems. In simulated searches
-        that saves 15 % of the poses, and the intervals stay as they were.
-        """
-        value, draws = table["value"], table["draws"]
-        met, not_met = (-float(special.ndtri(ERROR_PROBABILITY / 2.0 * share))
-                        for share in (self.shares.met, self.shares.not_met))
-        errors = xr.full_like(value, not_met).where(~keeps, met)
-        above = value >= table["limit"]
-        width = (value - table["low"]).where(above, table["high"] - value)
-        shrinks = width / (abs(value - table["limit"]) + width / errors)
-        of_rates = xr.DataArray(
-            [each.requirable.is_rate for each in self.required], dims="requirement")
-        possible: xr.DataArray = (draws > 0) & ((draws * shrinks**2 <= most) | ~of_rates)
-        return possible
-
-    def _of_row(self, decision: NDArray[np.uint8], keeps: Masks, possible: Masks) -> Masks:
-        """Return which decisions (values, *at_all, requirement) of a condition need trials."""
-        inner = tuple(range(1, decision.ndim))
-        keep = keeps | (decision == Decision.not_applicable)
-        upwards = self.upwards
-        if upwards is None:
-            upwards = easier_first(keeps, np.arange(len(keeps)))
-        step = slice(None, None, 1 if upwards else -1)
-        of_values = combined_decision(decision, inner)[step]
-        values = wanted_values(
-            keep.all(axis=inner)[step], of_values == Decision.met, of_values == Decision.not_met,
-            of_values != Decision.not_applicable)[step]
-        # Where something fails, it is that which decides.
-        open_ = (decision == Decision.undecided) & possible
-        all_keep = keep.all(axis=inner, keepdims=True)
-        values = values.reshape((-1, *(1,) * (decision.ndim - 1)))
-        return np.asarray(open_ & values & (all_keep | ~keep))
+        wanted = self.open_cells(dataset)
+        pooled = {name: dataset.sizes[name] for name in names if name not in wanted.dims}
+        return np.asarray(wanted.expand_dims(pooled).transpose(*names).values)
 
 
-def limit_sampling(pipeline: Pipeline, rule: StoppingRule) -> LimitSampling:
-    """Return the rule of a search along an axis.
+def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Search:
+    """Return the rule of a pipeline's search.
 
     Raises
     ------
     PipelineError
-        One line for each requirement that is none, and for those that contradict each other.
+        One line for each requirement that is none or cannot be judged within ``max_trials``, for
+        those that contradict each other, and for each quantity whose interval cannot be as narrow.
     """
+    axes = condition_axes(pipeline)
+    if rule.kind == "precision":
+        variables, open_cells = _precision(pipeline, rule)
+    else:
+        open_cells = (_limit if rule.kind == "along" else _choice)(pipeline, rule)
+        variables = [name for each in parse_requirements(rule.requirements)
+                     for name in each.requirable.variables]
+    free = rule.among if rule.is_choice else rule.per
+    return Search(rule.ends, tuple(dict.fromkeys([*ESTIMATE_INPUTS, *variables])),
+                  tuple(axis.name for axis in axes if axis.name not in free), open_cells)
+
+
+def _limit(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Return what tells at which values of the axis trials decide the limit."""
     check_required(rule.requirements, pipeline.source)
     required = parse_requirements(rule.requirements)
-    axes = condition_axes(pipeline)
-    count = len(required) * math.prod(
-        len(axis) for axis in axes if axis.name in (rule.along, *rule.at_all))
-    inputs = [name for each in required for name in each.requirable.variables]
-    return LimitSampling(
-        rule.ends, with_flags(inputs),
-        tuple(axis.name for axis in axes if axis.name not in rule.per),
-        rule, required, error_shares(count, len(rule.ends)),
-        size_shrinks_upwards(pipeline, rule.along))
+    searched = (*rule.per, *rule.at_all, rule.along)
+    lengths = {axis.name: len(axis) for axis in condition_axes(pipeline)}
+    count = len(required) * math.prod(lengths[name] for name in {rule.along, *rule.at_all})
+    most = rule.max_trials * math.prod(
+        length for name, length in lengths.items() if name not in searched)
+    shares = error_shares(count, len(rule.ends))
+    upwards = size_shrinks_upwards(pipeline, rule.along)
+
+    def open_cells(dataset: xr.Dataset) -> xr.DataArray:
+        table = decide(dataset, required, searched, shares=shares)
+        keeps = kept_by(table, required)
+        inner = [*rule.at_all, "requirement"]
+        arrays = [array.sortby(rule.along) for array in (
+            table["decision"], keeps, may_be_decided(table, keeps, required, shares, most))]
+        wanted: xr.DataArray = xr.apply_ufunc(
+            functools.partial(_of_row, upwards), *arrays,
+            input_core_dims=[[rule.along, *inner]] * 3, output_core_dims=[[rule.along, *inner]],
+            vectorize=True)
+        others = [name for name in wanted.dims if name not in searched]
+        return wanted.any(others).sel({rule.along: dataset[rule.along]})
+
+    return open_cells
+
+
+def may_be_decided(
+    table: xr.Dataset, keeps: xr.DataArray, required: Sequence[Requirement], shares: ErrorShares,
+    most: int,
+) -> xr.DataArray:
+    """Return where there are draws, and ``most`` of them may decide.
+
+    Rates that are all but the limit need more: the interval must shrink to the distance from
+    the limit, which is taken for a standard error larger than it seems. In simulated searches
+    that saves 15 % of the poses, and the intervals stay as they were.
+    """
+    value, draws, limit = table["value"], table["draws"], table["limit"]
+    met, not_met = (-float(special.ndtri(ERROR_PROBABILITY / 2.0 * share))
+                    for share in (shares.met, shares.not_met))
+    errors = xr.full_like(value, not_met).where(~keeps, met)
+    width = (value - table["low"]).where(value >= limit, table["high"] - value)
+    shrinks = width / (abs(value - limit) + width / errors)
+    of_rates = xr.DataArray([each.requirable.is_rate for each in required], dims="requirement")
+    possible: xr.DataArray = (draws > 0) & ((draws * shrinks**2 <= most) | ~of_rates)
+    return possible
+
+
+def _of_row(
+    upwards: bool | None, decision: NDArray[np.uint8], keeps: Masks, possible: Masks
+) -> Masks:
+    """Return which decisions (values, *at_all, requirement) of a condition need trials.
+
+    ``upwards`` says whether large values of the axis are the hard ones; None where the results say.
+    """
+    inner = tuple(range(1, decision.ndim))
+    keep = keeps | (decision == Decision.not_applicable)
+    if upwards is None:
+        upwards = easier_first(keeps, np.arange(len(keeps)))
+    step = slice(None, None, 1 if upwards else -1)
+    of_values = combined_decision(decision, inner)[step]
+    values = wanted_values(
+        keep.all(axis=inner)[step], of_values == Decision.met, of_values == Decision.not_met,
+        of_values != Decision.not_applicable)[step]
+    # Where something fails, it is that which decides.
+    all_keep = keep.all(axis=inner, keepdims=True)
+    values = values.reshape((-1, *(1,) * (decision.ndim - 1)))
+    return np.asarray(
+        (decision == Decision.undecided) & possible & values & (all_keep | ~keep))
 
 
 def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
@@ -306,56 +296,19 @@ def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
     return smaller_upwards(sides, values, along)
 
 
-# --------------------------------------------------------------------------------------------------
-# The rule of a choice: trials where they decide what the smallest, or the cheapest, choice is.
-
-@dataclass(frozen=True, slots=True)
-class ChoiceSampling:
-    """Attributes as `sweep.sampling.rules.Stopping` has them.
-
-    Attributes
-    ----------
-    rule, shares
-        What is sought, and the shares of the error probability that a decision may spend.
-    """
-
-    rule: StoppingRule
-    shares: ErrorShares
-    ends: tuple[int, ...]
-    variables: tuple[str, ...]
-    coupled: tuple[str, ...]
-
-    def needed(self, results: GroupResults) -> Masks:
-        """Return the scenes of the cells that `sweep.analysis.decisions.needed` names."""
-        dataset = group_dataset(results)
-        cells = choice_cells(dataset, self.rule, self.shares).needed()
-        pipeline = results.pipeline
-        configurations = [axis.name for axis in pipeline.axes_of(Stage.detection, Stage.estimation)]
-        wanted = cells.any([name for name in configurations if name in cells.dims])
-        if self.rule.along:
-            wanted = wanted.sel({self.rule.along: dataset[self.rule.along]})
-        names = [axis.name for axis in condition_axes(pipeline)]
-        pooled = tuple(k for k, name in enumerate(names) if name not in wanted.dims)
-        along = wanted.transpose(*(name for name in names if name in wanted.dims)).to_numpy()
-        return np.broadcast_to(np.expand_dims(along, pooled), results.shape)
-
-
-def choice_sampling(pipeline: Pipeline, rule: StoppingRule) -> ChoiceSampling:
-    """Return the rule of a choice.
-
-    Raises
-    ------
-    PipelineError
-        One line for each requirement that cannot be judged, or not within ``max_trials``.
-    """
+def _choice(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Return what tells which cells decide what the smallest, or the cheapest, choice is."""
     shares = choice_shares(pipeline, rule)
     if faults := choice_faults(pipeline, rule, shares):
         raise refusal([f"{pipeline.source}: {line}" for line in faults])
-    read = [name for each in parse_requirements(rule.requirements)
-            for name in each.requirable.variables]
-    coupled = tuple(axis.name for axis in condition_axes(pipeline) if axis.name not in rule.among)
-    return ChoiceSampling(
-        rule, shares, rule.ends, tuple(dict.fromkeys((*ESTIMATE_INPUTS, *read))), coupled)
+    configurations = [axis.name for axis in pipeline.axes_of(Stage.detection, Stage.estimation)]
+
+    def open_cells(dataset: xr.Dataset) -> xr.DataArray:
+        wanted = choice_cells(dataset, rule, shares).needed()
+        wanted = wanted.any([name for name in configurations if name in wanted.dims])
+        return wanted.sel({rule.along: dataset[rule.along]}) if rule.along else wanted
+
+    return open_cells
 
 
 def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> ChoiceCells:
@@ -363,51 +316,22 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> 
     return choice_cells(results, rule, choice_shares(pipeline, rule))
 
 
-# --------------------------------------------------------------------------------------------------
-# The rule of a precision: a condition needs trials until every interval is narrow enough.
-#
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
 # quantity of every configuration has an interval as narrow as is wanted, or cannot have one: no
 # pose was looked for, or so few have the number that all trials would not give enough
 # (`sweep.analysis.decisions.Reached`).
 
-@dataclass(frozen=True, slots=True)
-class PrecisionSampling:
-    """Attributes as `sweep.sampling.rules.Stopping` has them, and what is wanted."""
-
-    ends: tuple[int, ...]
-    variables: tuple[str, ...]
-    coupled: tuple[str, ...]
-    wanted: tuple[WantedPrecision, ...]
-
-    def needed(self, results: GroupResults) -> Masks:
-        """Return the scenes whose condition has a configuration that is not known well enough."""
-        names = [axis.name for axis in condition_axes(results.pipeline)]
-        dataset = group_dataset(results)
-        per = [name for name in names if name not in self.coupled]
-        table = precision_table(dataset, self.wanted, per, trials=self.ends[-1])
-        needs = (~table["settled"]).expand_dims({
-            name: dataset.sizes[name] for name in self.coupled})
-        return np.asarray(needs.transpose(*names).values)
-
-
-def precision_sampling(pipeline: Pipeline, rule: StoppingRule) -> PrecisionSampling:
-    """Return the rule of a search for a precision.
-
-    Raises
-    ------
-    PipelineError
-        One line for each name that no quantity has, or each whose interval cannot be as narrow
-        within ``max_trials``.
-    """
+def _precision(
+    pipeline: Pipeline, rule: StoppingRule
+) -> tuple[list[str], Callable[[xr.Dataset], xr.DataArray]]:
+    """Return what is read, and what tells the conditions that are not known well enough."""
     try:
         wanted = wanted_precisions(dict(rule.precision))
     except ValueError as error:
         raise refusal([f"{pipeline.source}: search.precision.{line}"
                        for line in str(error).splitlines()]) from None
     axes = condition_axes(pipeline)
-    coupled = tuple(axis.name for axis in axes if axis.name not in rule.per)
-    pooled = math.prod(len(axis) for axis in axes if axis.name in coupled)
+    pooled = math.prod(len(axis) for axis in axes if axis.name not in rule.per)
     if too_few := [
         f"{pipeline.source}: search.max_trials = {rule.max_trials}: expected at least "
         f"{least:,}: with fewer no interval of {each.name} has a half-width of {each.half_width:g}"
@@ -415,5 +339,9 @@ def precision_sampling(pipeline: Pipeline, rule: StoppingRule) -> PrecisionSampl
         if rule.max_trials < (least := math.ceil(each.fewest_draws / pooled))
     ]:
         raise refusal(too_few)
-    variables = with_flags(name for each in wanted for name in each.variables)
-    return PrecisionSampling(rule.ends, variables, coupled, wanted)
+    per = [axis.name for axis in axes if axis.name in rule.per]
+
+    def open_cells(dataset: xr.Dataset) -> xr.DataArray:
+        return ~precision_table(dataset, wanted, per, trials=rule.ends[-1])["settled"]
+
+    return [name for each in wanted for name in each.variables], open_cells

@@ -248,7 +248,7 @@ def search_choice(
     summary = execute(pipeline, store, progress=progress, child=child, **options)
     results = open_dataset(summary.store)
     cells = store_cells(results, pipeline, rule)
-    found = tuple(answers(cells, rule.along))
+    found = tuple(answers(cells))
     costs: Sequence[Cost | None] = [None] * len(found)
     if len(found) > 1 or pipeline.budget_ms is not None:
         costs = choice_costs(

@@ -260,7 +260,7 @@ def test_answers_name_the_next_size_and_what_it_fails_by():
     rates[0, 1, 1] = 0.3
     rates[1] = [[1.0, 1.0], [0.2, 1.0]]
     results = group_dataset(group(pipeline, rates, 400, np.random.default_rng(2)))
-    found = answers(store_cells(results, pipeline, pipeline.stopping), "size_m")
+    found = answers(store_cells(results, pipeline, pipeline.stopping))
     by = {tuple(each.alternative.values()): each for each in found}
     assert list(by) == [(dictionary, solver) for dictionary in ("DICT_4X4_50", "DICT_6X6_50")
                         for solver in ("ippe", "iterative")]

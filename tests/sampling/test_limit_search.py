@@ -22,7 +22,7 @@ from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import (
     BEYOND,
     group_dataset,
-    limit_sampling,
+    search_rule,
     size_shrinks_upwards,
     wanted_values,
 )
@@ -98,7 +98,7 @@ def test_every_wanted_cell_is_of_the_condition_alone():
     rng = np.random.default_rng(2)
     curves = special.expit((SIDES - rng.uniform(10, 40, (4, 1))) / 3)
     pipeline = pipeline_of(curves, SIDES, "detection >= 0.9", 200)
-    rule = limit_sampling(pipeline, pipeline.stopping)
+    rule = search_rule(pipeline, pipeline.stopping)
     hits = rng.random((*curves.shape, 80)) < curves[..., None]
     detection = np.where(hits, DetectionStatus.detected, DetectionStatus.rejected).astype(np.uint8)
     whole = rule.needed(GroupResults(
@@ -248,7 +248,7 @@ def test_names_and_contradictions_are_told_when_the_rule_is_made(texts, words):
     pipeline = Pipeline.from_dict({
         "pose": {"jitter_px": 0.5}, "axes": AXES, "search": GOOD, "require": {"all": texts}})
     with pytest.raises(PipelineError, match=words):
-        limit_sampling(pipeline, pipeline.stopping)
+        search_rule(pipeline, pipeline.stopping)
 
 
 def test_waves_end_at_the_most_trials():

@@ -6,7 +6,7 @@ from sweep.analysis.decisions import requirement_limits
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.sampling.rules import GroupResults
-from sweep.sampling.searches import group_dataset, limit_sampling
+from sweep.sampling.searches import group_dataset, search_rule
 
 
 def pipeline_of(curves, values, text, most):
@@ -36,7 +36,7 @@ def flags_of(detection):
 def searched(curves, values, text, most, seed):
     """Return the limits that a search finds on curves (conditions, values) of rates."""
     pipeline = pipeline_of(curves, values, text, most)
-    rule = limit_sampling(pipeline, pipeline.stopping)
+    rule = search_rule(pipeline, pipeline.stopping)
     rng = np.random.default_rng(seed)
     shape = curves.shape
     detection = np.full((*shape, most), DetectionStatus.not_needed, dtype=np.uint8)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sweep import compilation
-from sweep.cli.prepared import announce_compilation
+from sweep.cli.command import announce_compilation
 from sweep.errors import MachineFaultError
 from sweep.experiment.pipeline import Pipeline
 

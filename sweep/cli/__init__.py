@@ -6,17 +6,19 @@ Ctrl-C. Heavy packages are imported inside each command, so that ``sweep --help`
 
 from __future__ import annotations
 
-import argparse
+import inspect
 import sys
 from collections.abc import Sequence
 
 from sweep.cli.command import (
+    SESSION,
     accept_any_text,
+    answer,
     flushed,
     print_error,
     print_system_error,
 )
-from sweep.cli.parser import build_parser, parse
+from sweep.cli.parser import build_parser
 from sweep.errors import SweepError
 from sweep.installation import check_installation
 
@@ -31,20 +33,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     accept_any_text()
     parser, _ = build_parser()
-    options = argparse.Namespace()
+    SESSION.given = list(sys.argv[1:] if arguments is None else arguments)
+    SESSION.flags, SESSION.stopped = {}, "stopped"
     try:
-        given = list(sys.argv[1:] if arguments is None else arguments)
-        options = parse(parser, arguments)
-        options.given = given
+        options = parser.parse_args(arguments)
         if options.command is None:
             print(parser.format_help(), end="")
             return flushed(0)
+        SESSION.flags, SESSION.form = options.flags, getattr(options, "printed", "text")
         check_installation()
-        return flushed(options.command.execute(options))
+        function = options.command.function
+        found = function(**{name: getattr(options, name)
+                            for name in inspect.signature(function).parameters})
+        return flushed(answer(found))
     except SweepError as error:
-        return print_error(error, options)
+        return print_error(error)
     except KeyboardInterrupt:
-        print(getattr(options, "stopped", "stopped"), file=sys.stderr)
+        print(SESSION.stopped, file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()

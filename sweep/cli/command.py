@@ -1,16 +1,18 @@
-"""What commands share: their declaration, arguments, printing, and messages of errors."""
+"""Commands: functions whose signature and docstring are their help; their output and errors."""
 
 from __future__ import annotations
 
 import argparse
 import errno
+import inspect
 import io
 import itertools
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,44 +25,31 @@ from sweep.errors import (
     StoreError,
     SweepError,
 )
-from sweep.messages import plain, quoted, to_json
+from sweep.messages import notice, plain, quoted
 
 if TYPE_CHECKING:
     from sweep.experiment.pipeline import Pipeline
     from sweep.report.table import Findings
 
-
 # --------------------------------------------------------------------------------------------------
-# What a command declares: its name, its help, its arguments, and the function that runs it.
+# A command: a function, and what is read from its signature and its docstring.
 
-CONTINUES = "stopped; the same command continues"
-"""Told after Ctrl-C where it does; a command sets ``options.stopped`` to it."""
+Names = Sequence[str] | None
+"""Names that are listed behind commas; a flag that may be repeated. None if it is not given."""
 
+PARAMETER = re.compile(r"^(\w[\w, ]*?)(?: : (.*))?\n((?:    .*\n?|\n)+)", re.MULTILINE)
+"""A part of numpydoc: names, in place of a type flags and what stands for the value, meaning."""
 
-@dataclass(frozen=True, slots=True)
-class Argument:
-    """One argument of a command: names and options of argparse's ``add_argument``."""
-
-    names: tuple[str, ...]
-    options: Mapping[str, Any]
-
-
-def argument(*names: str, **options: Any) -> Argument:
-    """Return an argument. One that may be repeated is empty by default.
-
-    Its ``dest`` is the name of the Python function's argument that it sets, so that an
-    :class:`~sweep.errors.ArgumentError` can be reported by its flag.
-    """
-    if options.get("action") == "append":
-        options.setdefault("default", [])
-    return Argument(names, options)
+ELSEWHERE = re.compile(r"As for `(\w+)`\.?")
+"""A docstring's text in place of parameters that another command explains."""
 
 
 @dataclass(frozen=True, slots=True)
-class Example:
-    """A command line and what it does."""
+class Described:
+    """What a docstring says of a parameter: flags, what stands for its value, and meaning."""
 
-    line: str
+    flags: tuple[str, ...]
+    metavar: str | None
     meaning: str
 
 
@@ -70,156 +59,144 @@ class Command:
 
     Attributes
     ----------
-    name
-        As typed after ``sweep``.
-    summary
-        What it does, without a final full stop.
+    function
+        Runs it; returns findings, which are printed, or an exit status. Parameters before ``*`` are
+        positional arguments, those behind it flags.
     guide
         Path of the page that explains it, from the top of the repository.
     examples
-        Two command lines, shown at the end of its help.
-    arguments
-        Its arguments; of those in a tuple only one may be given.
-    execute
-        Runs it; returns the exit status.
+        Two command lines and what they do, shown at the end of its help.
     """
 
-    name: str
-    summary: str
+    function: Callable[..., Findings | int]
     guide: str
-    examples: tuple[Example, ...]
-    arguments: tuple[Argument | tuple[Argument, ...], ...]
-    execute: Callable[[argparse.Namespace], int]
+    examples: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """As typed after ``sweep``."""
+        return self.function.__name__.replace("_", "-")
+
+    @property
+    def description(self) -> str:
+        """The docstring without its parameters."""
+        return (inspect.getdoc(self.function) or "").partition("\nParameters\n---")[0].strip()
+
+    @property
+    def summary(self) -> str:
+        """What it does, without a final full stop."""
+        line = self.description.partition("\n")[0]
+        return line[:1].lower() + line[1:].removesuffix(".")
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add the arguments to a parser."""
-        for entry in self.arguments:
-            group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
-            for each in entry if isinstance(entry, tuple) else (entry,):
-                group.add_argument(*each.names, **each.options)
+        """Add the function's parameters to a parser."""
+        said = described(self.function)
+        for parameter in inspect.signature(self.function).parameters.values():
+            one = said[parameter.name]
+            names, options = argument(parameter, one.flags)
+            if "action" not in options or options["action"] in ("append", "extend"):
+                options["metavar"] = one.metavar
+            parser.add_argument(*names, help=one.meaning.replace("%", "%%"), **options)
+        if self.prints_findings:
+            form = parser.add_mutually_exclusive_group()
+            for name, meaning in (("json", "one JSON object"), ("markdown", "Markdown")):
+                form.add_argument(f"--{name}", dest="printed", action="store_const", const=name,
+                                  default="text", help=f"print {meaning}")
+
+    @property
+    def prints_findings(self) -> bool:
+        """Whether the function returns findings."""
+        return str(inspect.signature(self.function).return_annotation) == "Findings"
+
+
+DECLARED: dict[str, Command] = {}
+"""The commands by the name of their function."""
 
 
 def command(
-    guide: str, examples: Mapping[str, str], *arguments: Argument | tuple[Argument, ...]
-) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
-    """Return a decorator that makes a command of the function that runs it.
-
-    The function's name is that of the command, its docstring says what the command does.
-    ``examples`` has command line -> what it does.
-    """
-    def declared(execute: Callable[[argparse.Namespace], int]) -> Command:
-        text = (execute.__doc__ or " ").strip()
-        return Command(
-            execute.__name__.replace("_", "-"), text[:1].lower() + text[1:].removesuffix("."),
-            guide, tuple(Example(*each) for each in examples.items()), arguments, execute)
+    guide: str, examples: Mapping[str, str]
+) -> Callable[[Callable[..., Findings | int]], Command]:
+    """Return a decorator that makes a command of the function that runs it."""
+    def declared(function: Callable[..., Findings | int]) -> Command:
+        DECLARED[function.__name__] = Command(function, guide, examples)
+        return DECLARED[function.__name__]
 
     return declared
 
 
+def described(function: Callable[..., Any]) -> dict[str, Described]:
+    """Return what a function's docstring says of its parameters, by name.
+
+    Of parameters described as "As for `run`." it is what that command's docstring says.
+    """
+    text = (inspect.getdoc(function) or "").partition("\nParameters\n----------\n")[2]
+    found: dict[str, Described] = {}
+    for names, spelled, meaning in PARAMETER.findall(text):
+        words, parts = " ".join(meaning.split()), spelled.split()
+        elsewhere = ELSEWHERE.fullmatch(words)
+        other = described(DECLARED[elsewhere[1]].function) if elsewhere else {}
+        flags = tuple(part for part in parts if part.startswith("-"))
+        metavar = " ".join(part for part in parts if not part.startswith("-"))
+        one = Described(flags, metavar or None, words.removesuffix("."))
+        found |= {name: other.get(name, one) for name in names.split(", ")}
+    return found
+
+
+def names_of(text: str) -> list[str]:
+    """Return the names that a flag such as ``--per`` lists.
+
+    >>> names_of("tilt_deg, distance_m"), names_of("")
+    (['tilt_deg', 'distance_m'], [])
+    """
+    return [name for part in text.split(",") if (name := part.strip())]
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "int": {"type": int}, "float": {"type": float}, "bool": {"action": "store_true"},
+    "Sequence[str]": {"action": "append"}, "Names": {"action": "extend", "type": names_of},
+}
+"""Annotation -> what argparse makes of a flag; others are text."""
+
+
+def argument(
+    parameter: inspect.Parameter, flags: Sequence[str]
+) -> tuple[Sequence[str], dict[str, Any]]:
+    """Return the names and options of argparse's ``add_argument`` for a parameter."""
+    kind = str(parameter.annotation).removesuffix(" | None")
+    options: dict[str, Any] = {}
+    if kind.startswith("Literal"):
+        options["choices"] = re.findall(r"'(.*?)'", kind)
+    required = parameter.default is parameter.empty
+    default = None if required else parameter.default
+    if parameter.kind is not parameter.KEYWORD_ONLY:
+        count = "?" if kind != "Sequence[str]" else "+" if required else "*"
+        return [parameter.name], options | {"default": default} | (
+            {} if required and count == "?" else {"nargs": count})
+    names = flags or [f"--{parameter.name.replace('_', '-')}"]
+    options |= {"dest": parameter.name, "default": default} | KINDS.get(kind, {})
+    if default is True:
+        return [names[0].replace("--", "--no-")], options | {"action": "store_false"}
+    return names, options | ({"default": []} if kind == "Sequence[str]" else {})
+
+
+@dataclass
+class Session:
+    """The command being run: its words, the flag of each argument, what Ctrl-C tells, the form."""
+
+    given: Sequence[str] = ()
+    flags: Mapping[str, str] = field(default_factory=dict)
+    stopped: str = "stopped"
+    form: str = "text"
+
+
+SESSION = Session()
+
+CONTINUES = "stopped; the same command continues"
+"""Told after Ctrl-C where it does; a command sets ``SESSION.stopped`` to it."""
+
+
 # --------------------------------------------------------------------------------------------------
-# Arguments that several commands share.
-
-def settings_argument(meaning: str) -> Argument:
-    """Return the argument of TOML values that replace or give others."""
-    return argument(
-        "--set", action="append", metavar="KEY=VALUE", dest="settings",
-        help=f"{meaning}; may be repeated")
-
-
-PIPELINE = (
-    argument("pipeline", metavar="PIPELINE",
-             help="TOML file of the experiment, or a store that was made from it"),
-    settings_argument("replace a value of the file by this TOML value; a list makes an axis"),
-)
-PRECISION = (
-    argument(
-        "--precision", action="append", metavar="NAME=WIDTH",
-        help="compute trials until the interval of this quantity is as narrow at each condition: "
-        "half-width of a rate, of another quantity as a share of it, such as "
-        "'detection_rate = 0.02' or 'rotation_error_rmse_deg = 5 %%'; may be repeated"),
-    argument("--max-trials", type=int, metavar="N", help="the most trials of a condition"),
-)
-STORE = argument("store", metavar="STORE", help="path or URL of the store")
-WORKERS = argument(
-    "--workers", type=int, metavar="N",
-    help="number of worker processes (default: one for each processor)")
-OVERWRITE = argument("--overwrite", action="store_true", help="replace an existing store")
-SCHEDULER = argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
-
-
-def new_store(default: str = "runs/NAME.zarr") -> tuple[Argument, ...]:
-    """Return where a store is written, whether it replaces another one, and the processes."""
-    place = f"path or URL of the store (default: {default})"
-    return argument("--store", metavar="STORE", help=place), OVERWRITE, WORKERS
-
-
-LARGE_RUN = (
-    argument(
-        "--reuse", action="append", metavar="STORE",
-        help="copy the finished cells that this store shares with the experiment; may be "
-        "repeated"),
-    argument(
-        "--yes", action="store_true",
-        help="run also what would take more than a day, or more than is free on the disk"),
-)
-PHOTOGRAPHS = (
-    argument(
-        "folders", metavar="FOLDER", nargs="+",
-        help="photographs (PNG, JPEG, BMP, PGM) of one camera; with --stereo two folders, or one "
-        "of images whose halves are the left and the right camera's"),
-    argument(
-        "--camera", metavar="FILE",
-        help="file of the camera's calibration, or `calibrate`: from the board in the "
-        "photographs"),
-    argument(
-        "--board", metavar="FILE",
-        help="TOML file of the board; the truth of a marker is the pose by all corners but its "
-        "own"),
-    argument("--poses", metavar="FILE", help="the true poses, CSV as `sweep score` reads it"),
-    argument(
-        "--stereo", metavar="FILE",
-        help="calibration of a stereo camera (K1, D1, K2, D2, R, T); the truth is the pose in the "
-        "other camera's image"),
-)
-
-
-def cell_argument(meaning: str, others: str = ", with other names") -> Argument:
-    """Return the argument that selects one cell, or several."""
-    return argument(
-        "--at", metavar="NAME=VALUE,...", action="append",
-        help=f"{meaning}; an axis that is not named takes its first value; may be "
-        f"repeated{others}")
-
-
-def picture(default: str | None = None) -> tuple[Argument, ...]:
-    """Return where and how one scene is drawn; without a default, nothing is unless asked for."""
-    written = f"default: {default}" if default else "default: no file is written"
-    return (
-        argument("-o", "--output", default=default, metavar="PNG",
-                 help=f"file to write the image to ({written})"),
-        argument("--plain", action="store_true", help="draw the image without annotations"),
-        argument("--full", action="store_true",
-                 help="draw the whole frame instead of the marker's surroundings"),
-    )
-
-
-def seconds(default: float, meaning: str) -> Argument:
-    """Return the time limit of a measurement."""
-    return argument(
-        "--seconds", type=float, default=default, metavar="S", dest="limit_s",
-        help=f"{meaning}, in seconds (default: {default:g})")
-
-
-def figure_argument(meaning: str) -> Argument:
-    """Return the file of a figure."""
-    return argument("-o", "--output", metavar="FIGURE", help=f"{meaning} into this PNG or SVG file")
-
-
-JSON = argument("--json", action="store_true", help="print one JSON object")
-MARKDOWN = argument("--markdown", action="store_true", help="print Markdown")
-FORM = (JSON, MARKDOWN)
-"""The choice of JSON or Markdown on standard output."""
-
+# What commands do before they run something: read a pipeline, say that code is compiled.
 
 def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
     """Return settings, as ``--set`` takes them, that say how well quantities are to be known.
@@ -243,15 +220,17 @@ def precision_settings(precision: Sequence[str], max_trials: int | None) -> list
                 "expected a quantity and the half-width of its interval, such as "
                 "'detection_rate = 0.02'",
             )
-        quoted = width if not width.endswith("%") else f'"{width}"'
-        widths.append(f"{name} = {quoted}")
+        widths.append(f"{name} = " + (f'"{width}"' if width.endswith("%") else width))
     settings = [f"search.precision={{ {', '.join(widths)} }}"] if widths else []
     if max_trials is not None:
         settings.append(f"search.max_trials={max_trials}")
     return settings
 
 
-def read_pipeline(options: argparse.Namespace) -> Pipeline:
+def read_pipeline(
+    source: str, settings: Sequence[str] = (), precision: Sequence[str] = (),
+    max_trials: int | None = None,
+) -> Pipeline:
     """Return the pipeline of a command that takes one.
 
     Raises
@@ -261,55 +240,63 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     StoreError
         If it is given as a folder that is no store.
     """
-    source = plain(options.pipeline)
-    options.settings = [*options.settings, *precision_settings(
-        getattr(options, "precision", ()), getattr(options, "max_trials", None))]
+    settings = [*settings, *precision_settings(precision, max_trials)]
     try:
-        pipeline = library.lifecycle.read_pipeline(options.pipeline, options.settings)
+        pipeline = library.lifecycle.read_pipeline(source, settings)
     except PipelineError as error:
-        if (
-            options.settings
-            and any(line.endswith(library.sampling.NO_TRIALS) for line in error.faults)
-            and (getattr(options, "precision", ()))
-        ):
+        if precision and any(line.endswith(library.sampling.NO_TRIALS) for line in error.faults):
             raise ArgumentError(
-                "max_trials",
-                "",
+                "max_trials", "",
                 f"expected {library.sampling.NO_TRIALS}, such as 2400; beside --precision",
             ) from None
-        if texts := library.lifecycle.texts_required(options.pipeline, options.settings):
-
-            library.requirements.check_required(texts, source, error)
+        if texts := library.lifecycle.texts_required(source, settings):
+            library.requirements.check_required(texts, plain(source), error)
         raise
     if pipeline.requirements:
-
-        library.requirements.check_required(pipeline.requirements, source)
+        library.requirements.check_required(pipeline.requirements, plain(source))
     if pipeline.stopping is not None:
-
         library.rules.make_rule(pipeline)
     return pipeline
 
 
-def names_of(text: str | None) -> list[str] | None:
-    """Return the names that a flag such as ``--per`` lists, None if it is not given.
+def store_of(pipeline: str, store: str | None) -> str | None:
+    """Return the store that a command was told to write, or to continue; None for the default."""
+    return store or (pipeline if library.lifecycle.names_store(pipeline) else None)
 
-    >>> names_of("tilt_deg, distance_m"), names_of("")
-    (['tilt_deg', 'distance_m'], [])
-    """
-    if text is None:
-        return None
-    return [name for part in text.split(",") if (name := part.strip())]
+
+COMPILATION_S = 8
+"""Seconds that the renderer takes to compile, which every run needs."""
+
+PHOTOGRAPH_S = 20
+"""Seconds that `photometric_real` takes beyond that."""
+
+LIKELIHOOD_S = 10
+"""Seconds that the bound and `photometric` take beyond that."""
+
+
+def announce_compilation(pipeline: Pipeline) -> None:
+    """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
+    solvers = pipeline.values_of("solver")
+    fits = "photometric" in solvers or bool(set(pipeline.values_of("bound")) - {"none"})
+    seconds = sum(
+        length for needed, module, name, length in (
+            (True, "model.coverage", "accumulate", COMPILATION_S),
+            (fits, "measure.likelihood", "fit", LIKELIHOOD_S),
+            ("photometric_real" in solvers, "measure.photometric", "locate_photograph",
+             PHOTOGRAPH_S))
+        if needed and not library.compilation.is_cached(f"sweep.{module}", name))
+    if seconds:
+        notice(f"compiling, once for this version: about {seconds} s")
 
 
 # --------------------------------------------------------------------------------------------------
-# Output that commands share: lines, JSON, and a picture.
+# Output: lines without control characters, and a picture.
 
 AS_MODULE = ("sweep", "__main__.py")
 """How the program's path ends if Python was told to run the package."""
 
 MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
-
 
 OTHER_FORMATS = {
     ".jpg", ".jpeg", ".svg", ".pdf", ".gif", ".tif", ".tiff", ".bmp", ".webp", ".html", ".toml",
@@ -318,40 +305,39 @@ OTHER_FORMATS = {
 """Suffixes of files that a PNG image would not be taken for."""
 
 
-def lines_of(text: str) -> list[str]:
-    """Return the lines of a text without control characters, whosever names they quote."""
-    return [plain(line, len(line)) for line in text.split("\n")]
-
-
 def say(text: str = "") -> None:
-    """Print lines without control characters."""
-    print("\n".join(lines_of(text)))
+    """Print lines without control characters, whosever names they quote."""
+    print("\n".join(plain(line, len(line)) for line in text.split("\n")))
 
 
-def answered(options: argparse.Namespace, found: Findings) -> int:
+def answer(found: Findings | int) -> int:
     """Print findings as JSON, Markdown or text, and what to do next; return the exit status."""
-    if getattr(options, "json", False):
+    if isinstance(found, int):
+        return found
+    if SESSION.form == "json":
         print(found.to_json())
-        return found.status
-    if getattr(options, "markdown", False):
+    elif SESSION.form == "markdown":
         say(found.markdown())
-        return found.status
-    if text := str(found):
-        say(text)
-    if found.then[0]:
-        say_next(*found.then)
+    else:
+        if text := str(found):
+            say(text)
+        following, meaning = found.then
+        if following:
+            say(f"next: {following}" + (f"  # {meaning}" if meaning else ""))
     return found.status
 
 
-def say_next(command: str, meaning: str = "") -> None:
-    """Print the last line of a command: what to do next."""
-    say(f"next: {command}" + (f"  # {meaning}" if meaning else ""))
+def findings(
+    lines: Sequence[Any], numbers: Any, status: int = 0, then: str = "", meaning: str = ""
+) -> Findings:
+    """Return the findings of a command: lines and tables, what JSON has, and what to do next."""
+    return library.table.Findings(lines, numbers, None, status, (then, meaning))
 
 
-def command_line(options: argparse.Namespace) -> str:
+def command_line() -> str:
     """Return the command line as it was given, quoted for a shell, with how sweep was called."""
     called = "python -m sweep" if Path(sys.argv[0]).parts[-2:] == AS_MODULE else "sweep"
-    return f"{called} {quoted(*options.given)}"
+    return f"{called} {quoted(*SESSION.given)}"
 
 
 def accept_any_text() -> None:
@@ -393,11 +379,6 @@ def quiet_matplotlib() -> None:
     """
     os.environ.pop("MPLBACKEND", None)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-
-
-def print_json(content: Any) -> None:
-    """Print one JSON object, of a mapping or a dataclass."""
-    print(to_json(content))
 
 
 def check_png(output: str) -> None:
@@ -454,7 +435,7 @@ REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
 """Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
 
 
-def print_error(error: SweepError, options: argparse.Namespace) -> int:
+def print_error(error: SweepError) -> int:
     """Print an error's lines, without terminal control characters; return the exit status.
 
     An :class:`ArgumentError` names an argument of a Python function, such as ``time_limit_s``; the
@@ -463,13 +444,14 @@ def print_error(error: SweepError, options: argparse.Namespace) -> int:
     text = str(error)
     if isinstance(error, ArgumentError):
         given = f" {error.value}" if str(error.value) else ""
-        text = f"{flag_of(error.argument, options)}{given}: {error.problem}"
-    if isinstance(error, OtherExperimentError) and error.reusable and "reuse" in options:
-        command = _reusing_command(options.given, error.url)
+        flag = SESSION.flags.get(error.argument, f"--{error.argument.replace('_', '-')}")
+        text = f"{flag}{given}: {error.problem}"
+    if isinstance(error, OtherExperimentError) and error.reusable and "reuse" in SESSION.flags:
+        line = _reusing_command(SESSION.given, error.url)
         text = "\n".join([
-            f"{error.url}: holds another experiment; reuse its cells in a new store: {command}",
+            f"{error.url}: holds another experiment; reuse its cells in a new store: {line}",
             *(f"  {line}" for line in error.differences)])
-    for line in lines_of(text):
+    for line in text.split("\n"):
         print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
     return 2 if isinstance(error, REFUSALS) else 1
 
@@ -505,13 +487,3 @@ def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
     advice = f"; {ADVICE[number]}" if number in ADVICE else ""
     print(plain(line + advice, MAX_LINE_LENGTH), file=sys.stderr)
     return 1
-
-
-def flag_of(argument: str, options: argparse.Namespace) -> str:
-    """Return the flag that sets an argument of a Python function, in the command being run.
-
-    A command declares flags under the names of these arguments (``dest``); an argument without a
-    declared flag is named as a flag usually is, with ``-`` for ``_``.
-    """
-    flags: dict[str, str] = getattr(options, "flags", {})
-    return flags.get(argument, f"--{argument.replace('_', '-')}")

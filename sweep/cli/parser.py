@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import re
-from collections.abc import Sequence
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 from sweep.cli.answers import (
     calibration,
@@ -19,30 +18,29 @@ from sweep.cli.answers import (
     size,
     tradeoff,
 )
-from sweep.cli.command import Command, argument, command, flushed
+from sweep.cli.command import Command, command, flushed
 from sweep.cli.experiments import plan, repro, run, show, status, verify
 from sweep.cli.programs import diagnose, export, fit, photos, plugins, score
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep completion``: a script by which a shell completes commands, options and files.
-
-SHELLS = ("bash", "zsh", "fish")
-
 FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR",
          "FILE", "FIGURE", "PNG")
 """Arguments for which names of files and folders are offered."""
 
 
-@command(
-    "pipelines/README.md", {
-        "sweep completion bash": "prints it for bash: source <(sweep completion bash)",
-        "sweep completion fish": "prints it for fish: sweep completion fish | source"},
-    argument("shell", metavar="SHELL", choices=SHELLS, help="bash, zsh or fish"))
-def completion(options: argparse.Namespace) -> int:
-    """Print a script by which a shell completes commands and files."""
+@command("pipelines/README.md", {
+    "sweep completion bash": "prints it for bash: source <(sweep completion bash)",
+    "sweep completion fish": "prints it for fish: sweep completion fish | source"})
+def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
+    """Print a script by which a shell completes commands and files.
+
+    Parameters
+    ----------
+    shell : SHELL
+        Bash, zsh or fish.
+    """
     try:
         import shtab  # noqa: PLC0415
     except ImportError:
@@ -52,12 +50,9 @@ def completion(options: argparse.Namespace) -> int:
         for action in added._actions:  # noqa: SLF001  (argparse offers no other list)
             if action.metavar in FILES:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
-    print(shtab.complete(parser, options.shell))
+    print(shtab.complete(parser, shell))
     return 0
 
-
-# --------------------------------------------------------------------------------------------------
-# The parser of the command line, assembled from the commands' own declarations.
 
 GROUPS = {
     "experiments": (run, plan, show, status, verify, repro),
@@ -92,6 +87,11 @@ class Parser(argparse.ArgumentParser):
         """Print the usage and an error with a hint, and exit with status 2."""
         super().error(plain(message + _hint(message), MAX_LINE_LENGTH))
 
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """Exit once everything printed is written; OSError if it cannot be."""
+        flushed(0)
+        super().exit(status, message)
+
 
 def _hint(message: str) -> str:
     """Return what may be meant in place of what argparse refuses; empty if nothing is similar."""
@@ -108,26 +108,26 @@ def _meant(word: str) -> str:
     if word in ("--dry-run", "--dryrun", "-n"):
         return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
-        name, flags = word.partition("=")[0], set[str]()
-        for each in COMMANDS:
-            parser = argparse.ArgumentParser(add_help=False)
-            each.add_arguments(parser)
-            flags.update(_flags(parser).values())
+        flags = {name for added in build_parser()[1] for name in _flags(added).values()}
+        name = word.partition("=")[0]
         return "" if name in flags else nearest(name, sorted(flags))
     if "=" in word:
         return f"; did you mean --set {word}?"
     return "; values are set by --set KEY=VALUE, in quotes if there are spaces in it"
 
 
-def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParser]]:
+def build_parser() -> tuple[Parser, list[argparse.ArgumentParser]]:
     """Return the parser of ``sweep``, and those of the commands.
 
     Parsed, ``command`` is the chosen :class:`Command`, or None.
     """
+    groups = "".join(
+        f"{group}:\n" + "".join(f"    {each.name:12} {each.summary}\n" for each in commands)
+        for group, commands in GROUPS.items())
     parser = Parser(
         prog="sweep",
         description="How well will I know the pose? Experiments with fiducial markers.",
-        epilog=_groups() + "\n`sweep COMMAND --help` explains a command, with examples.\n"
+        epilog=f"{groups}\n`sweep COMMAND --help` explains a command, with examples.\n"
         "first run: sweep run --example smoke\n"
         f"which command answers which question: {GUIDES[1]}\n"
         f"guides: {GUIDES[0]}, {GUIDES[2]}",
@@ -138,7 +138,7 @@ def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParse
     commands = parser.add_subparsers(metavar="COMMAND", title=UNGROUPED)
     for each in COMMANDS:
         added = commands.add_parser(
-            each.name, help=each.summary, description=each.execute.__doc__,
+            each.name, help=each.summary, description=each.description,
             epilog=_epilog(each), formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         each.add_arguments(added)
@@ -146,36 +146,9 @@ def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParse
     return parser, list(commands.choices.values())
 
 
-def _groups() -> str:
-    """Return the commands by group, each with its summary."""
-    return "".join(
-        f"{group}:\n" + "".join(f"    {each.name:12} {each.summary}\n" for each in commands)
-        for group, commands in GROUPS.items())
-
-
-def parse(
-    parser: argparse.ArgumentParser, arguments: Sequence[str] | None
-) -> argparse.Namespace:
-    """Return the parsed arguments.
-
-    Raises
-    ------
-    SystemExit
-        After the help, the version, or an error was printed.
-    OSError
-        If it could not be printed.
-    """
-    try:
-        return parser.parse_args(arguments)
-    except SystemExit:
-        flushed(0)
-        raise
-
-
 def _epilog(declared: Command) -> str:
     examples = "\n".join(
-        f"  {example.line}\n      {example.meaning}" for example in declared.examples
-    )
+        f"  {line}\n      {meaning}" for line, meaning in declared.examples.items())
     return f"examples:\n{examples}\n\nguide: {declared.guide}"
 
 

@@ -2,210 +2,227 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sweep import library
 from sweep.cli.command import (
     CONTINUES,
-    FORM,
-    JSON,
-    PHOTOGRAPHS,
-    PIPELINE,
-    answered,
-    argument,
+    SESSION,
+    announce_compilation,
     command,
-    figure_argument,
-    new_store,
-    print_json,
+    findings,
     quiet_matplotlib,
     read_pipeline,
-    say,
-    say_next,
-    settings_argument,
 )
-from sweep.cli.prepared import announce_compilation, run_prepared, say_summary
 from sweep.errors import ArgumentError
 from sweep.messages import byte_count, notice, quoted
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep photos``.
+if TYPE_CHECKING:
+    from sweep.conformance.check import ConformanceReport
+    from sweep.execution.status import Summary
+    from sweep.experiment.pipeline import Pipeline
+    from sweep.report.table import Findings
 
-@command(
-    "pipelines/photographs/README.md", {
-        "sweep photos shots --camera camera.yaml --board BOARD.toml":
-            "compares each marker with the board without it; writes runs/shots.zarr",
-        "sweep photos shots --camera calibrate --board BOARD.toml "
-        "--set 'cornerRefinementMethod=[\"none\", \"subpix\"]'":
-            "calibrates the camera from the same photographs; compares two refinements"},
-    *PHOTOGRAPHS,
-    settings_argument("set a parameter of detector or estimator; a list compares its values"),
-    *new_store("runs/NAME.zarr with the folder's name"), JSON)
-def photos(options: argparse.Namespace) -> int:
-    """Measure detectors and estimators on photographs of markers."""
-    options.stopped = "stopped before anything was computed"
-    home, name = library.folder.record_home(options.store)
+
+def _run_prepared(
+    pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
+) -> Summary:
+    """Run a pipeline into a store, after lines on stderr on what it was made of."""
+    announce_compilation(pipeline)
+    for line in lines:
+        notice(line)
+    SESSION.stopped = CONTINUES
+    with library.progress.progress_display() as display:
+        return library.runner.execute(
+            pipeline, store, workers=workers, overwrite=overwrite, progress=display)
+
+
+def _summary(summary: Summary, line: str, **numbers: Any) -> Findings:
+    """Return what became of a run: ``line``, the dataset, warnings, and what to do next."""
+    again = [] if summary.computed_blocks else [
+        f"{summary.store} is already finished; --overwrite measures it again"]
+    return findings(
+        [*again, line, f'xarray.open_zarr("{summary.data}")', *summary.warnings],
+        dataclasses.asdict(summary) | numbers, int(summary.nothing_computed),
+        summary.advice or f"sweep report {quoted(summary.store)}")
+
+
+@command("pipelines/photographs/README.md", {
+    "sweep photos shots --camera camera.yaml --board BOARD.toml":
+        "compares each marker with the board without it; writes runs/shots.zarr",
+    "sweep photos shots --camera calibrate --board BOARD.toml "
+    "--set 'cornerRefinementMethod=[\"none\", \"subpix\"]'":
+        "calibrates the camera from the same photographs; compares two refinements"})
+def photos(
+    folders: Sequence[str], *, camera: str | None = None, board: str | None = None,
+    poses: str | None = None, stereo: str | None = None, settings: Sequence[str] = (),
+    store: str | None = None, overwrite: bool = False, workers: int | None = None,
+) -> Findings:
+    """Measure detectors and estimators on photographs of markers.
+
+    Parameters
+    ----------
+    folders : FOLDER
+        Photographs (PNG, JPEG, BMP, PGM) of one camera; with --stereo two folders, or one of
+        images whose halves are the left and the right camera's.
+    camera : --camera FILE
+        File of the camera's calibration, or `calibrate`: from the board in the photographs.
+    board : --board FILE
+        TOML file of the board; the truth of a marker is the pose by all corners but its own.
+    poses : --poses FILE
+        The true poses, CSV as `sweep score` reads it.
+    stereo : --stereo FILE
+        Calibration of a stereo camera (K1, D1, K2, D2, R, T); the truth is the pose in the other
+        camera's image.
+    settings : --set KEY=VALUE
+        Set a parameter of detector or estimator; a list compares its values; may be repeated.
+    store : --store STORE
+        Path or URL of the store (default: runs/NAME.zarr with the folder's name).
+    overwrite, workers
+        As for `run`.
+    """
+    SESSION.stopped = "stopped before anything was computed"
+    home, name = library.folder.record_home(store)
     prepared = library.prepare.prepare(
-        options.folders, options.camera, board=options.board, poses=options.poses,
-        stereo=options.stereo, settings=options.settings, home=home, name=name,
-        overwrite=options.overwrite,
-    )
-    store = options.store or str(Path(home) / f"{prepared.pipeline.name}.zarr")
-    summary = run_prepared(options, prepared.pipeline, store, prepared.lines)
-    if options.json:
-        print_json({**dataclasses.asdict(summary), "photographs": prepared.lines})
-        return int(summary.nothing_computed)
-    settings = prepared.pipeline.size(library.parameters.Stage.detection)
-    each = f" with {settings} detector settings" if settings > 1 else ""
-    say_summary(
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
+        name=name, overwrite=overwrite)
+    summary = _run_prepared(
+        prepared.pipeline, store or str(Path(home) / f"{prepared.pipeline.name}.zarr"),
+        prepared.lines, workers, overwrite=overwrite)
+    count = prepared.pipeline.size(library.parameters.Stage.detection)
+    each = f" with {count} detector settings" if count > 1 else ""
+    return _summary(
         summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
-        f"{summary.detected_line}{each}")
-    return int(summary.nothing_computed)
+        f"{summary.detected_line}{each}", photographs=prepared.lines)
 
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep fit``.
+@command("pipelines/photographs/README.md", {
+    "sweep fit shots --camera camera.yaml --board BOARD.toml":
+        "writes scene.toml: blur, sharpening, tone, noise, geometry",
+    "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml":
+        "calibrates the camera from the same photographs"})
+def fit(
+    folders: Sequence[str], *, camera: str | None = None, board: str | None = None,
+    poses: str | None = None, stereo: str | None = None, settings: Sequence[str] = (),
+    markers: int = 12, check: bool = True, output: str = "scene.toml",
+) -> Findings:
+    """Estimate a camera's [scene] from photographs.
 
-@command(
-    "pipelines/photographs/README.md", {
-        "sweep fit shots --camera camera.yaml --board BOARD.toml":
-            "writes scene.toml: blur, sharpening, tone, noise, geometry",
-        "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml":
-            "calibrates the camera from the same photographs"},
-    *PHOTOGRAPHS,
-    settings_argument(
-        "dictionary and size_m of single markers; detectors and estimators whose errors are "
-        "compared (default: two refinements)"),
-    argument(
-        "--markers", type=int, default=12, metavar="N",
-        help="the most markers of a photograph that are fitted, well spread over the frame "
-        "(default: 12)"),
-    argument(
-        "--no-check", dest="check", action="store_false",
-        help="do not hold half of the photographs out, to see which effects move their errors"),
-    argument("-o", "--output", default="scene.toml", metavar="FILE",
-             help="pipeline file to write (default: scene.toml)"),
-    JSON)
-def fit(options: argparse.Namespace) -> int:
-    """Estimate a camera's [scene] from photographs."""
-    output = Path(options.output)
-    library.output_file.check_output_file(output)
+    Parameters
+    ----------
+    folders, camera, board, poses, stereo
+        As for `photos`.
+    settings : --set KEY=VALUE
+        Dictionary and size_m of single markers; detectors and estimators whose errors are compared
+        (default: two refinements); may be repeated.
+    markers : --markers N
+        The most markers of a photograph that are fitted, well spread over the frame (default: 12).
+    check
+        Do not hold half of the photographs out, to see which effects move their errors.
+    output : -o --output FILE
+        Pipeline file to write (default: scene.toml).
+    """
+    path = Path(output)
+    library.output_file.check_output_file(path)
     fitted = library.folders.fit_folder(
-        options.folders, options.camera, board=options.board, poses=options.poses,
-        stereo=options.stereo, settings=options.settings, markers=options.markers,
-        check=options.check,
-    )
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
+        markers=markers, check=check)
     for line in fitted.lines:
         notice(line)
-    library.output_file.write_output_file(output, fitted.text.encode())
-    found = fitted.found
-    if options.json:
-        print_json({
-            "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
-            "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
-            "check": [] if fitted.gap is None
-            else library.comparison_tables.gap_table(fitted.gap).as_json()["rows"],
-            "output": str(output),
-        })
-        return 0
+    library.output_file.write_output_file(path, fitted.text.encode())
+    found, gap = fitted.found, fitted.gap
     rows = [
-        (
-            each.name, each.parameter, library.table.number(each.estimate.value),
-            library.table.interval_text(each.estimate.low, each.estimate.high)
-            if math.isfinite(each.estimate.low) else "",
-            f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}",
-        )
-        for each in found.terms
-    ]
-    say(library.table.Table.of(
+        (each.name, each.parameter, library.table.Value(
+            each.estimate.value, each.estimate.low, each.estimate.high)
+         if math.isfinite(each.estimate.low) else each.estimate.value,
+         f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}")
+        for each in found.terms]
+    lines = [library.table.Table.of(
         f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph",
-        ("term", "parameter", "value", "interval", ""), rows, stub=2,
-    ).text())
-    say()
-    for line in found.lines:
-        say(f"- {line}")
-    if fitted.gap is not None:
-        say()
-        say("Half of the photographs, simulated with the scene of the others:")
-        say(library.comparison_tables.gap_table(fitted.gap).text())
-        say()
-    say_next(f"sweep run {quoted(str(output))}", "simulates this camera")
+        ("term", "parameter", "value", ""), rows, stub=2, words=True),
+        *(f"- {line}" for line in found.lines)]
+    held_out = None if gap is None else library.comparison_tables.gap_table(gap)
+    if held_out is not None:
+        lines += ["", "Half of the photographs, simulated with the scene of the others:", held_out]
     store = f"runs/{fitted.pipeline.name}.zarr"
-    compare = quoted("sweep", "compare", store, str(output))
+    following = quoted("sweep", "compare", store, output)
     if library.locations.exists(store):
-        say_next(compare, "the photographs beside their simulation")
+        lines.append(f"beside the photographs: {following}")
     else:
-        say_next(_measuring_command(options), f"measures the photographs, for {compare}")
-    return 0
+        given = {"--camera": camera, "--board": board, "--poses": poses, "--stereo": stereo}
+        words = [word for flag, value in given.items() if value is not None
+                 for word in (flag, value)]
+        words += [word for setting in settings for word in ("--set", setting)]
+        lines.append(f"measures the photographs, for {following}: "
+                     f"{quoted('sweep', 'photos', *folders, *words)}")
+    return findings(lines, {
+        "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
+        "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
+        "check": [] if held_out is None else held_out.as_json()["rows"], "output": output,
+    }, 0, f"sweep run {quoted(output)}", "simulates this camera")
 
 
-def _measuring_command(options: argparse.Namespace) -> str:
-    """Return the command that measures the photographs of `sweep fit`."""
-    words = ["sweep", "photos", *options.folders]
-    for name in ("camera", "board", "poses", "stereo"):
-        if (value := getattr(options, name)) is not None:
-            words += [f"--{name}", value]
-    for setting in options.settings:
-        words += ["--set", setting]
-    return quoted(*words)
+@command("pipelines/diagnose/README.md", {
+    "sweep diagnose rows.csv --camera camera.yaml --set size_m=0.153":
+        "ranks the causes of wrong distances, and says what to measure next",
+    "sweep diagnose rows.csv --set dictionary=tagStandard41h12 -o residuals.png":
+        "draws what each cause leaves unexplained"})
+def diagnose(
+    observations: str, *, camera: str | None = None, settings: Sequence[str] = (),
+    output: str | None = None,
+) -> Findings:
+    """Find why poses differ from what a tape says.
 
-
-# --------------------------------------------------------------------------------------------------
-# ``sweep diagnose``.
-
-@command(
-    "pipelines/diagnose/README.md", {
-        "sweep diagnose rows.csv --camera camera.yaml --set size_m=0.153":
-            "ranks the causes of wrong distances, and says what to measure next",
-        "sweep diagnose rows.csv --set dictionary=tagStandard41h12 -o residuals.png":
-            "draws what each cause leaves unexplained"},
-    argument(
-        "observations", metavar="OBSERVATIONS",
-        help="CSV file with a row a pose: what the program said (tvec_x_m, tvec_y_m, tvec_z_m or "
-        "range_m) and what was measured (tape_m, or x_m, y_m, z_m)"),
-    argument("--camera", metavar="FILE",
-             help="file of the calibration that the program believes"),
-    settings_argument(
-        "what the program believes: size_m, dictionary, refinement; zero_sd_m of the tape's zero "
-        "point; compared, z or range"),
-    figure_argument("draw the residuals of each cause"), FORM)
-def diagnose(options: argparse.Namespace) -> int:
-    """Find why poses differ from what a tape says."""
+    Parameters
+    ----------
+    observations : OBSERVATIONS
+        CSV file with a row a pose: what the program said (tvec_x_m, tvec_y_m, tvec_z_m or range_m)
+        and what was measured (tape_m, or x_m, y_m, z_m).
+    camera : --camera FILE
+        File of the calibration that the program believes.
+    settings : --set KEY=VALUE
+        What the program believes: size_m, dictionary, refinement; zero_sd_m of the tape's zero
+        point; compared, z or range; may be repeated.
+    output : -o --output FIGURE
+        Draw the residuals of each cause into this PNG or SVG file.
+    """
     quiet_matplotlib()
-    return answered(options, library.diagnosis.diagnose(
-        options.observations, camera=options.camera, output=options.output,
-        **library.observations.settings_of(options.settings)))
+    return library.diagnosis.diagnose(
+        observations, camera=camera, output=output, **library.observations.settings_of(settings))
 
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep export``.
+@command("sweep/exchange/README.md", {
+    "sweep export pipelines/smoke.toml images": "writes every image as a whole frame",
+    "sweep export runs/smoke.zarr windows --windows":
+        "writes the marker's surroundings alone, of the experiment of a store"})
+def export(
+    pipeline: str, folder: str, *, settings: Sequence[str] = (), windowed: bool = False,
+    workers: int | None = None, yes: bool = False,
+) -> Findings:
+    """Write an experiment's images and truth for other programs.
 
-@command(
-    "sweep/exchange/README.md", {
-        "sweep export pipelines/smoke.toml images": "writes every image as a whole frame",
-        "sweep export runs/smoke.zarr windows --windows":
-            "writes the marker's surroundings alone, of the experiment of a store"},
-    *PIPELINE,
-    argument("folder", metavar="DIR", help="new or empty folder, or one to continue"),
-    argument(
-        "--windows", action="store_true", dest="windowed",
-        help="images of the marker's surroundings, as a run searches them (default: whole "
-        "frames)"),
-    argument("--workers", type=int, metavar="N",
-             help="number of processes that render (default: 1)"),
-    argument("--yes", action="store_true",
-             help="export also what takes more than 10 GB, or more than is free on the disk"),
-    JSON)
-def export(options: argparse.Namespace) -> int:
-    """Write an experiment's images and truth for other programs."""
-    pipeline = read_pipeline(options)
-
-    announce_compilation(pipeline)
-    options.stopped = CONTINUES
+    Parameters
+    ----------
+    pipeline, settings
+        As for `run`.
+    folder : DIR
+        New or empty folder, or one to continue.
+    windowed : --windows
+        Images of the marker's surroundings, as a run searches them (default: whole frames).
+    workers : --workers N
+        Number of processes that render (default: 1).
+    yes
+        Export also what takes more than 10 GB, or more than is free on the disk.
+    """
+    read = read_pipeline(pipeline, settings)
+    announce_compilation(read)
+    SESSION.stopped = CONTINUES
     watched = sys.stderr is not None and sys.stderr.isatty()
 
     def report(done: int, count: int) -> None:
@@ -214,158 +231,133 @@ def export(options: argparse.Namespace) -> int:
             print(f"\r{done:,} of {count:,} scenes", end=end, file=sys.stderr, flush=True)
 
     result = library.export.export(
-        pipeline, options.folder, windowed=options.windowed, workers=options.workers,
-        yes=options.yes, progress=report,
-    )
-    if options.json:
-        print_json(result)
-        return 0
+        read, folder, windowed=windowed, workers=workers, yes=yes, progress=report)
     without = f", {result.invisible:,} scenes without" if result.invisible else ""
-    say(f"{result.folder}: {result.images:,} images, {byte_count(result.bytes)}{without}")
+    lines = [f"{result.folder}: {result.images:,} images, {byte_count(result.bytes)}{without}"]
     if result.kept:
-        say(f"{result.kept:,} were there already, {result.written:,} written now")
+        lines.append(f"{result.kept:,} were there already, {result.written:,} written now")
     if result.damaged:
-        say(f"{result.damaged:,} were missing or changed, and are written again")
-    folder = quoted(result.folder)
-    say_next(f"sweep score {folder} detections.csv", f"{folder}/README.md has the conventions")
-    return 0
+        lines.append(f"{result.damaged:,} were missing or changed, and are written again")
+    place = quoted(result.folder)
+    return findings(lines, result, 0, f"sweep score {place} detections.csv",
+                    f"{place}/README.md has the conventions")
 
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep score``.
+@command("sweep/exchange/README.md", {
+    "sweep score images detections.csv --name mine":
+        "compares them with the truth; writes runs/mine.zarr",
+    "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside":
+        "in other conventions, and beside the experiment's own detector"})
+def score(
+    folder: str, files: Sequence[str], *, names: Sequence[str] = (), pixel_center: str = "0",
+    corner_order: str = "TL TR BR BL", frame: str = "right up out", doubled: str = "refuse",
+    beside: bool = False, settings: Sequence[str] = (), store: str | None = None,
+    overwrite: bool = False, workers: int | None = None,
+) -> Findings:
+    """Score what another program detected in an export's images.
 
-@command(
-    "sweep/exchange/README.md", {
-        "sweep score images detections.csv --name mine":
-            "compares them with the truth; writes runs/mine.zarr",
-        "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside":
-            "in other conventions, and beside the experiment's own detector"},
-    argument("folder", metavar="DIR", help="an export, made by `sweep export`"),
-    argument(
-        "files", metavar="FILE", nargs="+",
-        help="detections or poses, CSV; several files are compared on the same images"),
-    argument(
-        "--name", action="append", dest="names", metavar="NAME",
-        help="name of the program that made a file (default: the file's); may be repeated"),
-    argument("--pixel-center", default="0", metavar="C",
-             help="coordinate of the centre of the first pixel: 0 (default), or 0.5"),
-    argument(
-        "--corner-order", default="TL TR BR BL", metavar="ORDER",
-        help="order of the corners, as OpenCV draws the marker (default: TL TR BR BL)"),
-    argument(
-        "--frame", default="right up out", metavar="XYZ",
-        help="directions of the marker's x, y, z for a viewer (default: right up out)"),
-    argument(
-        "--doubled", default="refuse", metavar="HOW",
-        help="what an ID counts that is twice in an image: refuse (default), or nearest"),
-    argument("--beside", action="store_true",
-             help="also search the images with the experiment's own detector"),
-    settings_argument("replace a value of the experiment, such as solver=ippe"), *new_store(),
-    JSON)
-def score(options: argparse.Namespace) -> int:
-    """Score what another program detected in an export's images."""
-    conventions = library.answers.Conventions.of(
-        options.pixel_center, options.corner_order, options.frame
-    )
+    Parameters
+    ----------
+    folder : DIR
+        An export, made by `sweep export`.
+    files : FILE
+        Detections or poses, CSV; several files are compared on the same images.
+    names : --name NAME
+        Name of the program that made a file (default: the file's); may be repeated.
+    pixel_center : --pixel-center C
+        Coordinate of the centre of the first pixel: 0 (default), or 0.5.
+    corner_order : --corner-order ORDER
+        Order of the corners, as OpenCV draws the marker (default: TL TR BR BL).
+    frame : --frame XYZ
+        Directions of the marker's x, y, z for a viewer (default: right up out).
+    doubled : --doubled HOW
+        What an ID counts that is twice in an image: refuse (default), or nearest.
+    beside
+        Also search the images with the experiment's own detector.
+    settings, store, overwrite, workers
+        As for `run`.
+    """
     scored = library.score.prepare(
-        options.folder, options.files, names=options.names, conventions=conventions,
-        doubled=options.doubled, beside=options.beside, settings=options.settings,
-    )
+        folder, files, names=names,
+        conventions=library.answers.Conventions.of(pixel_center, corner_order, frame),
+        doubled=doubled, beside=beside, settings=settings)
     with scored.withdrawn_if_refused():
-        summary = run_prepared(
-            options, scored.pipeline, options.store or f"runs/{scored.name}.zarr", scored.lines)
-    if options.json:
-        print_json({**dataclasses.asdict(summary), "answers": scored.lines})
-    else:
-        say_summary(summary, f"{summary.poses:,} poses, {summary.detected_line}")
-    return int(summary.nothing_computed)
+        summary = _run_prepared(
+            scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
+            overwrite=overwrite)
+    return _summary(
+        summary, f"{summary.poses:,} poses, {summary.detected_line}", answers=scored.lines)
 
 
-# --------------------------------------------------------------------------------------------------
-# ``sweep plugins``.
+@command("pipelines/plugins/README.md", {
+    "sweep plugins pyapriltags": "imports one, and lists its settings",
+    "sweep plugins check mine:SOLVER": "tries SOLVER of mine.py in this folder"})
+def plugins(
+    name: str | None = None, tried: str | None = None, *, settings: Sequence[str] = (),
+    dictionary: str | None = None, time_limit_s: float = 120.0,
+) -> Findings:
+    """List, describe or check detectors and solvers of other packages.
 
-@command(
-    "pipelines/plugins/README.md", {
-        "sweep plugins pyapriltags": "imports one, and lists its settings",
-        "sweep plugins check mine:SOLVER": "tries SOLVER of mine.py in this folder"},
-    argument(
-        "name", metavar="NAME", nargs="?",
-        help="a plug-in to describe: the name of an installed one, or file:name in this folder; "
-        "or the word check, and the plug-in to try behind it"),
-    argument("tried", metavar="TRIED", nargs="?",
-             help="behind check: a detector or a solver, also opencv or one of our solvers"),
-    settings_argument("check: give a setting of it this TOML value"),
-    argument(
-        "--dictionary", metavar="DICTIONARY",
-        help="check: dictionary of the markers (default: DICT_APRILTAG_36h11, or a detector's "
-        "first)"),
-    argument(
-        "--time-limit", type=float, default=120.0, metavar="S", dest="time_limit_s",
-        help="check: seconds after which one of its steps is taken for endless (default: 120)"),
-    JSON)
-def plugins(options: argparse.Namespace) -> int:
-    """List, describe or check detectors and solvers of other packages."""
-    if options.name == "check" and options.tried is not None:
-        return _check(options)
-    if options.tried is not None:
+    Parameters
+    ----------
+    name : NAME
+        A plug-in to describe: the name of an installed one, or file:name in this folder; or the
+        word check, and the plug-in to try behind it.
+    tried : TRIED
+        Behind check: a detector or a solver, also opencv or one of our solvers.
+    settings : --set KEY=VALUE
+        Check: give a setting of it this TOML value; may be repeated.
+    dictionary : --dictionary DICTIONARY
+        Check: dictionary of the markers (default: DICT_APRILTAG_36h11, or a detector's first).
+    time_limit_s : --time-limit S
+        Check: seconds after which one of its steps is taken for endless (default: 120).
+    """
+    if name == "check" and tried is not None:
+        return _checked(library.check.check_plugin(
+            tried, dictionary, settings, time_limit_s=time_limit_s))
+    if tried is not None:
         raise ArgumentError(
-            "tried", options.tried, f"expected one name; `sweep plugins check {options.tried}` "
-            "tries it"
-        )
-    if options.settings or options.dictionary:
+            "tried", tried, f"expected one name; `sweep plugins check {tried}` tries it")
+    if settings or dictionary:
         raise ArgumentError(
-            "settings" if options.settings else "dictionary", "", "expected `check` and a name")
-    if options.name is None:
+            "settings" if settings else "dictionary", "", "expected `check` and a name")
+    if name is None:
         every = library.declared.installed()
-        if options.json:
-            print_json({"plugins": every})
-            return 0
-        for each in every:
-            say(f"{each['kind']:10} {each['name']:20} of {each['distribution']}")
-        if not every:
-            say("no plug-in is installed")
-        say_next("sweep plugins NAME", "describes one, and says whether it can be used")
-        return 0
-    found = [plugin.to_json() for plugin in library.declared.described(options.name)]
-    if options.json:
-        print_json({"plugins": found})
-        return 0
-    for plugin in found:
-        say(f"{plugin['kind']} {plugin['name']}" + (
-            f": {plugin['meaning']}" if plugin["meaning"] else ""
-        ))
-        for distribution, version in plugin["versions"].items():
-            say(f"  needs      {distribution} {version}")
-        if plugin["dictionaries"]:
-            say(f"  knows      {', '.join(plugin['dictionaries'])}")
-        for setting in plugin["settings"]:
-            unit = f" {setting['unit']}" if "unit" in setting else ""
-            say(f"  setting    {setting['name']} = {setting['default']}{unit}: "
-                f"{setting['meaning']}")
-    return 0
+        lines = [f"{each['kind']:10} {each['name']:20} of {each['distribution']}"
+                 for each in every]
+        return findings(lines or ["no plug-in is installed"], {"plugins": every}, 0,
+                        "sweep plugins NAME", "describes one, and says whether it can be used")
+    found = [plugin.to_json() for plugin in library.declared.described(name)]
+    return findings(
+        [line for plugin in found for line in _plugin_lines(plugin)], {"plugins": found})
 
 
-def _check(options: argparse.Namespace) -> int:
-    report = library.check.check_plugin(
-        options.tried, options.dictionary, options.settings, time_limit_s=options.time_limit_s
-    )
-    if options.json:
-        print_json({
-            "name": report.name, "kind": report.kind, "dictionary": report.dictionary,
-            "versions": report.versions, "conforms": report.conforms, **report.numbers,
-            "findings": [
-                {"check": each.check, "verdict": each.verdict, "text": each.text}
-                for each in report.findings
-            ],
-        })
-        return 0 if report.conforms else 1
+def _plugin_lines(plugin: dict[str, Any]) -> list[str]:
+    """Return what a plug-in needs, knows, and has settings of."""
+    meaning = f": {plugin['meaning']}" if plugin["meaning"] else ""
+    known = [f"  knows      {', '.join(plugin['dictionaries'])}"] if plugin["dictionaries"] else []
+    return [
+        f"{plugin['kind']} {plugin['name']}{meaning}",
+        *(f"  needs      {name} {version}" for name, version in plugin["versions"].items()),
+        *known,
+        *(f"  setting    {each['name']} = {each['default']}"
+          f"{' ' + each['unit'] if 'unit' in each else ''}: {each['meaning']}"
+          for each in plugin["settings"])]
+
+
+def _checked(report: ConformanceReport) -> Findings:
+    """Return the findings of a check of a plug-in."""
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    say(f"{report.kind} {report.name}{f' ({versions})' if versions else ''} on "
-        f"{report.dictionary}: {'conforms' if report.conforms else 'does not conform'}")
-    for each in report.findings:
-        say(f"  {each.verdict:5}  {each.check:22}  {each.text}")
-    if report.conforms:
-        key = "detector" if report.kind == "detector" else "solver"
-        chosen = shlex.quote(f'{key}="{report.name}"')
-        say_next(f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
-    return 0 if report.conforms else 1
+    whole = f"{report.kind} {report.name}{f' ({versions})' if versions else ''}"
+    conforms = "conforms" if report.conforms else "does not conform"
+    lines = [f"{whole} on {report.dictionary}: {conforms}",
+             *(f"  {each.verdict:5}  {each.check:22}  {each.text}" for each in report.findings)]
+    key = "detector" if report.kind == "detector" else "solver"
+    chosen = shlex.quote(f'{key}="{report.name}"')
+    then = (f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
+    return findings(lines, {
+        "name": report.name, "kind": report.kind, "dictionary": report.dictionary,
+        "versions": report.versions, "conforms": report.conforms, **report.numbers,
+        "findings": [{"check": each.check, "verdict": each.verdict, "text": each.text}
+                     for each in report.findings],
+    }, int(not report.conforms), *(then if report.conforms else ("", "")))

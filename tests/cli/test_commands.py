@@ -17,7 +17,7 @@ import pytest
 import sweep
 from support.here import calls_here
 from sweep import cli, installation
-from sweep.cli.command import flag_of, print_error
+from sweep.cli.command import SESSION, print_error
 from sweep.cli.parser import COMMANDS, GUIDES, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
 from sweep.execution.progress import Progress
@@ -98,7 +98,7 @@ def test_each_help_ends_with_two_examples_and_the_guide(command, capsys):
     assert code == 0
     examples = out.split("examples:\n")[1]
     assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [
-        example.line for example in command.examples]
+        *command.examples]
     assert len(command.examples) == 2
     assert out.endswith(f"\nguide: {command.guide}\n")
 
@@ -106,7 +106,7 @@ def test_each_help_ends_with_two_examples_and_the_guide(command, capsys):
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
 def test_every_example_is_a_command_that_the_parser_takes(command):
     for example in command.examples:
-        program, *arguments = shlex.split(example.line)
+        program, *arguments = shlex.split(example)
         assert program == "sweep"
         options = build_parser()[0].parse_args(arguments)
         assert options.command is command
@@ -161,39 +161,39 @@ def test_a_run_is_of_a_file_or_of_an_example(arguments, capsys):
 
 # Messages.
 
-def test_an_argument_is_named_by_its_flag(capsys):
-    options = build_parser()[0].parse_args(["run", "file.toml"])
-    error = ArgumentError("time_limit_s", 0, "expected seconds above 0")
-    assert print_error(error, options) == 2
-    assert capsys.readouterr().err == "--time-limit 0: expected seconds above 0\n"
-    assert print_error(ArgumentError("workers", "", "expected a number"), options) == 2
-    assert capsys.readouterr().err == "--workers: expected a number\n"
+@pytest.fixture
+def parsed(monkeypatch):
+    """Return a function that parses arguments as the session's command."""
+    return lambda *arguments: monkeypatch.setattr(
+        SESSION, "flags", build_parser()[0].parse_args(arguments).flags)
+
+
+def test_an_argument_is_named_by_its_flag(capsys, parsed):
     flags = {
-        ("run", "workers"): "--workers", ("run", "scheduler"): "--scheduler",
+        ("run", "workers"): "--workers", ("run", "time_limit_s"): "--time-limit",
         ("run", "settings"): "--set", ("tradeoff", "limit_s"): "--seconds",
         ("report", "form"): "--format", ("report", "output"): "--output",
         ("report", "store"): "STORE", ("verify", "sample"): "--sample",
         ("fit", "folders"): "FOLDER", ("photos", "folders"): "FOLDER",
         ("verify", "some_other"): "--some-other",
     }
-    for (command, argument), flag in flags.items():
-        chosen = build_parser()[0].parse_args([command, "x"])
-        assert flag_of(argument, chosen) == flag
+    for (name, argument), flag in flags.items():
+        parsed(name, "x")
+        for value, shown in ((0, " 0"), ("", "")):
+            assert print_error(ArgumentError(argument, value, "expected a number")) == 2
+            assert capsys.readouterr().err == f"{flag}{shown}: expected a number\n"
 
 
 @pytest.mark.parametrize(
     ("error", "status"),
     [(ArgumentError("workers", 0, "expected at least 1"), 2), (PipelineError(["a", "b"]), 2),
-     (StoreError("s"), 2), (RunError("r"), 1)],
+     (StoreError("s\x1b[2J"), 2), (RunError("r"), 1)],
 )
 def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
-    assert print_error(error, build_parser()[0].parse_args(["status", "x"])) == status
-    assert capsys.readouterr().err.count("\n") == len(getattr(error, "faults", ["one"]))
-
-
-def test_control_characters_do_not_reach_the_terminal(capsys):
-    print_error(StoreError("x\x1b[2J"), build_parser()[0].parse_args(["status", "x"]))
-    assert capsys.readouterr().err == "x\\u001b[2J\n"
+    assert print_error(error) == status
+    err = capsys.readouterr().err
+    assert err.count("\n") == len(getattr(error, "faults", ["one"]))
+    assert "\x1b" not in err  # it would reach the terminal
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ from sweep.experiment.parameters import (
     EFFECTS_KEY,
     NAMED_BY,
     PARAMETERS,
-    REMOVED,
     SECTIONS,
     Parameter,
     is_zip,
@@ -284,7 +283,7 @@ class Reading(Grid):
     def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
         """Note an unknown key, with the nearest known one if the line will be printed."""
         hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
-        self.note(plain(key), f"{problem}{removed(key.rpartition('.')[2]) or hint}")
+        self.note(plain(key), f"{problem}{hint}")
 
     def unknown_key(self, section: str, key: str, known: Sequence[str], expected: str = "") -> None:
         """Note a key that a section does not have, with the section where it or a similar one is.
@@ -295,8 +294,8 @@ class Reading(Grid):
             name: home for name in (*self.parameters, TRIAL, *HEADER)
             if name not in known and (home := self._home_of(name))
         }
-        hint = removed(key)
-        if not hint and len(self.faults) < MAX_FAULTS:
+        hint = ""
+        if len(self.faults) < MAX_FAULTS:
             hint = f"; it belongs {homes[key]}" if homes.get(key) else (
                 nearest(key, list(homes), 0.8) or nearest(key, known))
             similar = hint.removeprefix("; did you mean ").removesuffix("?")
@@ -340,11 +339,6 @@ class Reading(Grid):
         """Return the value that the document gives a parameter, for messages."""
         given = places(self.document, self.parameters[name]).values()
         return next(iter(given), self.fixed.get(name))
-
-
-def removed(key: str) -> str:
-    """Return what to do instead of a parameter of an earlier version; empty for others."""
-    return f"; {REMOVED[key]}" if key in REMOVED else ""
 
 
 def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:

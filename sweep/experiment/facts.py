@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -39,7 +39,7 @@ from sweep.plugins.declared import DeclaredPlugin
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
-# What a pipeline's camera is: focal lengths, fields of view, the marker's side in pixels.
+# What a pipeline's camera and poses are: ranges over the scenes that are looked at.
 
 Range = tuple[float, float]
 """The least and the largest value on the grid."""
@@ -88,25 +88,23 @@ class CameraFacts:
 
     def line(self) -> str:
         """Return the camera in one line."""
-        focal = f"fx = fy = {_text(self.fx_px)} px"
-        if not self.square:
-            focal = (
-                f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
-                f"(pixels are not square: fy/fx = {_text(self.aspect, 4)})"
-            )
-        parts = [
-            f"{_text(self.width_px)} x {_text(self.height_px)} px", focal,
-            f"HFOV {_text(self.hfov_deg, 4)}°", f"VFOV {_text(self.vfov_deg, 4)}°",
-        ]
-        if self.side_px is not None:
-            far, near = self.side_px
-            parts.append(
-                f"the markers have sides of {_text(self.side_px, 4)} px" if self.boards else
-                f"the marker's side is {far:.4g} px" if far == near else
-                f"the marker's side is {near:.4g} px at the nearest pose, {far:.4g} px at the "
-                "farthest"
-            )
-        return ", ".join(parts)
+        focal = f"fx = fy = {_text(self.fx_px)} px" if self.square else (
+            f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
+            f"(pixels are not square: fy/fx = {_text(self.aspect, 4)})")
+        line = (f"{self.frame}, {focal}, HFOV {_text(self.hfov_deg, 4)}°, "
+                f"VFOV {_text(self.vfov_deg, 4)}°")
+        if self.side_px is None:
+            return line
+        if self.boards:
+            return f"{line}, the markers have sides of {_text(self.side_px, 4)} px"
+        far, near = self.side_px
+        return f"{line}, the marker's side is " + (f"{far:.4g} px" if far == near else (
+            f"{near:.4g} px at the nearest pose, {far:.4g} px at the farthest"))
+
+    @property
+    def frame(self) -> str:
+        """The frame's size, in words."""
+        return f"{_text(self.width_px)} x {_text(self.height_px)} px"
 
     def attributes(self) -> dict[str, Any]:
         """Return the dataset's attributes: a number, or the least and the largest one."""
@@ -117,79 +115,6 @@ class CameraFacts:
             for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
             for low, high in [getattr(self, name)]
         } | sides
-
-
-def _text(numbers: Sequence[float] | Floats, digits: int = 6) -> str:
-    """Return the least and the largest of some numbers; one of them if they print alike."""
-    low, high = (f"{round(float(end), 9) + 0.0:.{digits}g}" for end in (min(numbers), max(numbers)))
-    return low if low == high else f"{low} to {high}"
-
-
-MAX_SAMPLE = 600
-"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
-
-MAX_CORNERS = 200
-"""The most corners of a grid that are looked at."""
-
-
-def _in_degrees(name: str, numbers: Sequence[float]) -> str:
-    largest = max(numbers, key=abs)
-    return (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
-            f"{math.degrees(largest):.4g}")
-
-
-OFF_CENTRE = 0.15
-"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
-
-WIDE_DEG = 150.0
-"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
-
-RADIANS = (0.2, math.pi)
-"""Fields of view between these look like radians: of 12 to 180 degrees."""
-
-POLE = 1e-9
-"""Denominator of the radial distortion at a fold below which it is a pole."""
-
-NOT_SQUARE = 0.01
-"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
-
-
-def _centre_notes(facts: CameraFacts) -> list[str]:
-    lines = []
-    frame = f"{_text(facts.width_px)} x {_text(facts.height_px)} px"
-    for name, ends, shares in (
-        ("cx_px", facts.cx_px, facts.off_centre_x), ("cy_px", facts.cy_px, facts.off_centre_y),
-    ):
-        off = max(map(abs, shares))
-        if off > 0.5:
-            lines.append(f"{name} = {_text(ends)}: outside the frame of {frame}")
-        elif off > OFF_CENTRE:
-            lines.append(
-                f"{name} = {_text(ends)}: far from the centre of the frame of {frame}; is it that "
-                "of another frame size?"
-            )
-    halves = facts.width_px[0] / 2, facts.height_px[0] / 2
-    if (facts.cx_px, facts.cy_px) == tuple((half, half) for half in halves):
-        lines.append(
-            f"cx_px = {halves[0]:g}, cy_px = {halves[1]:g}: half the frame; with pixel (0, 0) at "
-            f"the pixel's centre, as here, the middle is {halves[0] - 0.5:g}, "
-            f"{halves[1] - 0.5:g}: subtract 0.5 if the program that gave them has its corner there "
-            "(pipelines/half_pixel/README.md)"
-        )
-    return lines
-
-
-# --------------------------------------------------------------------------------------------------
-# What a pipeline's poses are: how they are seen, how far away, and what may surprise of them.
-
-APART_DEG = 5.0
-"""Difference of tilt and viewing angle that is told."""
-
-FARTHER = 1.1
-"""Range over depth that is told: a direction of 25° from the optical axis."""
-
-MIN_SHARE = 0.01
-"""Share of poses that is told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,26 +153,26 @@ class PoseFacts:
 
     def ranges(self) -> dict[str, list[float]]:
         """Return the least and the largest tilt, viewing angle and distance."""
-        return {
-            name: [float(getattr(self, name).min()), float(getattr(self, name).max())]
-            for name in ("tilt_deg", "viewing_angle_deg", "range_m")
-        }
+        return {name: list(_ends(getattr(self, name)))
+                for name in ("tilt_deg", "viewing_angle_deg", "range_m")}
 
     def share(self, chosen: Masks) -> str:
         """Return the share of the poses that are ``chosen``, in words."""
-        count = int(chosen.sum())
+        count, whole = int(chosen.sum()), self.sampled == self.poses
         if count == self.sampled:
-            return "all poses" if self.sampled == self.poses else f"all {count:,} poses looked at"
-        roughly = "" if self.sampled == self.poses else "about "
-        return f"{roughly}{100 * chosen.mean():.2g} % of the poses"
+            return "all poses" if whole else f"all {count:,} poses looked at"
+        return f"{'' if whole else 'about '}{100 * chosen.mean():.2g} % of the poses"
 
 
-ROUNDED_RAD = 4e-3
-"""How far an angle in radians that someone rounded may be from a multiple of 15°."""
+def _ends(numbers: Floats) -> Range:
+    return float(np.min(numbers)), float(np.max(numbers))
 
 
-# --------------------------------------------------------------------------------------------------
-# The optional parts of model and measurement that a pipeline needs, and why.
+def _text(numbers: Sequence[float] | Floats, digits: int = 6) -> str:
+    """Return the least and the largest of some numbers; one of them if they print alike."""
+    low, high = (f"{round(float(end), 9) + 0.0:.{digits}g}" for end in (min(numbers), max(numbers)))
+    return low if low == high else f"{low} to {high}"
+
 
 @dataclass(frozen=True, slots=True)
 class Part:
@@ -269,13 +194,6 @@ class Part:
     switch: str = ""
 
 
-def _described(plugin: DeclaredPlugin) -> str:
-    """Return a plug-in in words: kind, name, versions."""
-    versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
-    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
-    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads
-
-
 def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") -> Part:
     """Return a part that is active if there are values, which are its reason."""
     text = ", ".join(values)
@@ -284,6 +202,40 @@ def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") 
 
 # --------------------------------------------------------------------------------------------------
 # The facts of an experiment, and what may surprise: a line each. They are gathered once.
+
+MAX_SAMPLE = 600
+"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
+
+MAX_CORNERS = 200
+"""The most corners of a grid that are looked at."""
+
+OFF_CENTRE = 0.15
+"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
+
+WIDE_DEG = 150.0
+"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
+
+RADIANS = (0.2, math.pi)
+"""Fields of view between these look like radians: of 12 to 180 degrees."""
+
+ROUNDED_RAD = 4e-3
+"""How far an angle in radians that someone rounded may be from a multiple of 15°."""
+
+POLE = 1e-9
+"""Denominator of the radial distortion at a fold below which it is a pole."""
+
+NOT_SQUARE = 0.01
+"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
+
+APART_DEG = 5.0
+"""Difference of tilt and viewing angle that is told."""
+
+FARTHER = 1.1
+"""Range over depth that is told: a direction of 25° from the optical axis."""
+
+MIN_SHARE = 0.01
+"""Share of poses that is told."""
+
 
 class Facts:
     """What an experiment's camera and poses are, which parts are active, and what may surprise.
@@ -325,123 +277,24 @@ class Facts:
         count, values = self._sample
         fx, fy, cx, cy = build_cameras(values, count).view.T
         width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
-
-        def ends(numbers: Floats) -> Range:
-            return float(np.min(numbers)), float(np.max(numbers))
-
         given = values["side_px"]
         with np.errstate(divide="ignore"):
             sides = given.broadcast(count) if not given.missing else (
                 fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
         sides = sides[sides > 0]  # before the camera
-        least, largest = relative_sizes(self.grid)
+        relative = relative_sizes(self.grid)
         return CameraFacts(
-            width_px=ends(width), height_px=ends(height), fx_px=ends(fx), fy_px=ends(fy),
-            cx_px=ends(cx), cy_px=ends(cy), hfov_deg=ends(field_of_view_deg(width, fx)),
-            vfov_deg=ends(field_of_view_deg(height, fy)), aspect=ends(fy / fx),
-            off_centre_x=ends((cx - (width - 1) / 2) / width),
-            off_centre_y=ends((cy - (height - 1) / 2) / height),
+            **{name: _ends(numbers) for name, numbers in {
+                "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
+                "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
+                "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
+                "off_centre_x": (cx - (width - 1) / 2) / width,
+                "off_centre_y": (cy - (height - 1) / 2) / height,
+            }.items()},
             square=bool(np.all(are_square(fx, fy))), boards=self.experiment.shows_boards,
             side_px=None if not len(sides) else (
-                float(sides.min()) * least, float(sides.max()) * largest),
+                float(sides.min()) * relative[0], float(sides.max()) * relative[1]),
         )
-
-    def _numbers(self, name: str) -> list[float]:
-        """Return the numbers of the document for a parameter: the ends or the mean of draws."""
-        if (drawn := self.grid.distributions.get(name)) is not None:
-            return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
-        return [float(value) for value in self.grid.values_of(name) if value is not None]
-
-    @cached_property
-    def camera_notes(self) -> list[str]:
-        """A line for each property of the camera, or of beliefs about it, that may surprise."""
-        facts = self.camera
-        hfov, lines = _text(facts.hfov_deg, 4), []
-        if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
-            lines.append(
-                f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
-                "sensor, or fx_px alone, makes them square")
-        if facts.hfov_deg[1] > WIDE_DEG:
-            lines.append(f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length "
-                         "in another unit?")
-        if len(self.grid.values_of("width_px")) > 1 and self.grid.fixed.get("fx_px") is not None:
-            lines.append(f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg "
-                         "in place of fx_px keeps it")
-        lines += [
-            _in_degrees(name, numbers) for name in FIELDS_OF_VIEW
-            if (numbers := self._numbers(name))
-            and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]
-        ]
-        return [
-            *lines, *_centre_notes(facts), *self._fold_notes(), *self._side_notes(),
-            *self._belief_notes(),
-        ]
-
-    def _belief_notes(self) -> list[str]:
-        """Return a line for each belief that may surprise."""
-        given, calibrated = self.grid.given, self.grid.calibration is not None
-        lines = [
-            f"believed_{own}_px alone: the {other} believed stays the true one; "
-            "believed_focal_scale is a focal length believed wrongly"
-            for own, other in (("fx", "fy"), ("fy", "fx"))
-            if f"believed_{own}_px" in given and f"believed_{other}_px" not in given
-        ]
-        lines += [
-            f"{name} has no effect: no estimator has believed = calibration" for name in STATED
-            if name in given and not calibrated and self.grid.fixed.get("camera_file") is None
-        ]
-        if calibrated and self.grid.fixed["calibration_sd"]:
-            lines.append(
-                "the calibration's numbers are drawn independently of each other; those of most "
-                "calibrations, fx and fy above all, vary together, which calibration_covariance "
-                "states")
-        return lines
-
-    def _side_notes(self) -> list[str]:
-        """Return a line if no marker of the grid is of a size that can be detected."""
-        facts = self.camera
-        if facts.side_px is None:
-            return []
-        far, near = facts.side_px
-        if near < min(map(module_count, self.grid.values_of("dictionary"))):
-            problem = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
-        elif far > max(facts.width_px[1], facts.height_px[1]):
-            problem = f"at least {far:.4g} px, more than the frame's"
-        else:
-            return []
-        units = (
-            "" if "side_px" in self.grid.given
-            else "; are size_m and the distances in metres?" if "size_m" in self.grid.given
-            else f"; size_m is not given: {self.grid.fixed['size_m']:g} m"
-        )
-        whose = "the markers' sides are" if facts.boards else "the marker's side is"
-        return [f"{whose} {problem}{units}"]
-
-    def _fold_notes(self) -> list[str]:
-        """Return a line if the only lens' radial distortion stops growing within the frame."""
-        facts = self.camera
-        lens = canonical_distortion(self.grid.fixed.get("distortion", ()))
-        ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
-        varies = any(low != high for low, high in ends)
-        if not lens or varies or not math.isfinite(fold_radius(lens)):
-            return []
-        width, height, fx, fy, cx, cy = (low for low, _ in ends)
-        radius = fold_radius(lens)
-        k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
-        s = radius**2
-        denominator = 1 + s * (k4 + s * (k5 + s * k6))
-        if denominator <= POLE:
-            return []
-        fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
-        corner = math.hypot(
-            max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
-        )
-        if fold >= corner:
-            return []
-        where = f"{fold * fx:.0f} px from the principal point, within the frame"
-        return [
-            f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
-        ]
 
     @cached_property
     def poses(self) -> PoseFacts:
@@ -467,78 +320,7 @@ class Facts:
             cut=np.asarray(beyond.any(axis=(1, 2)) & ~behind & ~averted & ~outside),
         )
 
-    @cached_property
-    def pose_notes(self) -> list[str]:
-        """A line for each property of a pipeline's poses that may surprise."""
-        return [*self._visibility_notes(), *self._axis_notes(),
-                *self._unit_notes()]
-
-    def _visibility_notes(self) -> list[str]:
-        lines, facts = [], self.poses
-        world = any(name in self.grid.given for name in WORLD)
-        framed = {"frame_x", "frame_y"} & self.grid.given
-        target = target_word(self.grid)
-        where = "outside the frame of the camera" if world else "outside the frame"
-        for chosen, what in (
-            (facts.behind, "have a corner behind the camera: not_visible"),
-            (facts.averted,
-             f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
-            (facts.outside, f"are {where}: not_visible"
-             + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
-            (facts.cut, "are cut off by the frame's edge"
-             + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
-                "the middle" if framed else "")),
-        ):
-            if chosen.mean() > MIN_SHARE:
-                lines.append(f"{facts.share(chosen)} {what}")
-        unseen = facts.behind | facts.averted | facts.outside
-        if unseen.all() and len(lines) > 1:
-            lines.insert(0, f"{facts.share(unseen)} are not_visible:")
-        return lines
-
-    def _axis_notes(self) -> list[str]:
-        """Return lines for angles and distances that differ off the axis, or do nothing."""
-        facts = self.poses
-        given, shown = self.grid.given, ~facts.behind
-        in_camera = given.isdisjoint(WORLD)
-        tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
-        apart = np.abs(view - tilt).max(initial=0)
-        farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
-        angles = "yaw_deg and pitch_deg are" if {"yaw_deg", "pitch_deg"} & given else "tilt_deg is"
-        distance = "side_px" if "side_px" in given else "distance_m"
-        turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
-        drawn = self.grid.distributions
-        azimuths = "azimuth_deg" in drawn or len(self.grid.values_of("azimuth_deg")) > 1
-        tilted = turned in drawn or self.grid.any_value(turned, bool)
-        lines = []
-        if in_camera and "view_angle_deg" not in given and apart > APART_DEG:
-            lines.append(
-                "off the optical axis the viewing angle differs from the tilt by up to "
-                f"{apart:.3g}° (tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): "
-                f"{angles} to the image plane, view_angle_deg is to the line of sight")
-        if in_camera and farther > FARTHER:
-            lines.append(
-                f"{distance} counts along the optical axis: off it, the {target_word(self.grid)}'s "
-                f"centre is up to {farther:.3g} times as far away")
-        if azimuths and not tilted:
-            lines.append(
-                f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0")
-        return lines
-
-    def _unit_notes(self) -> list[str]:
-        """Return a line for each angle whose values look like radians."""
-        lines = []
-        for parameter in PARAMETERS.values():
-            if parameter.section != "pose" or parameter.unit != "degree":
-                continue
-            values = self._numbers(parameter.name)
-            steps = np.array([value for value in values if value]) / (math.pi / 12)
-            close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
-            if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
-                lines.append(_in_degrees(parameter.name, values))
-        return lines
-
-    @cached_property
+    @property
     def notes(self) -> list[str]:
         """The lines that `sweep plan` and the start of a run print."""
         if PHOTOGRAPHS in self.grid.given:
@@ -546,106 +328,265 @@ class Facts:
         return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
 
     @cached_property
+    def camera_notes(self) -> list[str]:
+        """A line for each property of the camera, or of beliefs about it, that may surprise."""
+        return [*self._view_notes(), *self._centre_notes(), *self._fold_notes(),
+                *self._side_notes(), *self._belief_notes()]
+
+    @cached_property
+    def pose_notes(self) -> list[str]:
+        """A line for each property of a pipeline's poses that may surprise."""
+        return [*self._visibility_notes(), *self._axis_notes(), *self._unit_notes()]
+
+    def _numbers(self, name: str) -> list[float]:
+        """Return the numbers of the document for a parameter: the ends or the mean of draws."""
+        if (drawn := self.grid.distributions.get(name)) is not None:
+            return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
+        return [float(value) for value in self.grid.values_of(name) if value is not None]
+
+    def _view_notes(self) -> Iterator[str]:
+        facts = self.camera
+        hfov = _text(facts.hfov_deg, 4)
+        if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
+            yield (f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
+                   "sensor, or fx_px alone, makes them square")
+        if facts.hfov_deg[1] > WIDE_DEG:
+            yield (f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in "
+                   "another unit?")
+        if len(self.grid.values_of("width_px")) > 1 and self.grid.fixed.get("fx_px") is not None:
+            yield (f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
+                   "place of fx_px keeps it")
+        for name in FIELDS_OF_VIEW:
+            numbers = self._numbers(name)
+            if numbers and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]:
+                yield _in_degrees(name, numbers)
+
+    def _centre_notes(self) -> Iterator[str]:
+        facts = self.camera
+        for name, ends, shares in (
+            ("cx_px", facts.cx_px, facts.off_centre_x), ("cy_px", facts.cy_px, facts.off_centre_y),
+        ):
+            off = max(map(abs, shares))
+            if off > 0.5:
+                yield f"{name} = {_text(ends)}: outside the frame of {facts.frame}"
+            elif off > OFF_CENTRE:
+                yield (f"{name} = {_text(ends)}: far from the centre of the frame of "
+                       f"{facts.frame}; is it that of another frame size?")
+        x, y = facts.width_px[0] / 2, facts.height_px[0] / 2
+        if (facts.cx_px, facts.cy_px) == ((x, x), (y, y)):
+            yield (f"cx_px = {x:g}, cy_px = {y:g}: half the frame; with pixel (0, 0) at the "
+                   f"pixel's centre, as here, the middle is {x - 0.5:g}, {y - 0.5:g}: subtract 0.5 "
+                   "if the program that gave them has its corner there "
+                   "(pipelines/half_pixel/README.md)")
+
+    def _fold_notes(self) -> Iterator[str]:
+        """Yield a line if the only lens' radial distortion stops growing within the frame."""
+        facts = self.camera
+        lens = canonical_distortion(self.grid.fixed.get("distortion", ()))
+        ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
+        radius = fold_radius(lens) if lens else math.inf
+        if any(low != high for low, high in ends) or not math.isfinite(radius):
+            return
+        width, height, fx, fy, cx, cy = (low for low, _ in ends)
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
+        s = radius**2
+        denominator = 1 + s * (k4 + s * (k5 + s * k6))
+        if denominator <= POLE:
+            return
+        fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+        corner = math.hypot(
+            max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+        )
+        if fold < corner:
+            yield (f"the lens folds {fold * fx:.0f} px from the principal point, within the frame "
+                   f"(corner: {corner * fx:.0f} px): poses beyond are not_modelled")
+
+    def _side_notes(self) -> Iterator[str]:
+        """Yield a line if no marker of the grid is of a size that can be detected."""
+        facts = self.camera
+        far, near = facts.side_px or (0.0, math.inf)
+        whose = "the markers' sides are" if facts.boards else "the marker's side is"
+        units = (
+            "" if "side_px" in self.grid.given
+            else "; are size_m and the distances in metres?" if "size_m" in self.grid.given
+            else f"; size_m is not given: {self.grid.fixed['size_m']:g} m"
+        )
+        if near < min(map(module_count, self.grid.values_of("dictionary"))):
+            yield (f"{whose} at most {near:.4g} px, less than a pixel a module: too small to be "
+                   f"read{units}")
+        elif far > max(facts.width_px[1], facts.height_px[1]):
+            yield f"{whose} at least {far:.4g} px, more than the frame's{units}"
+
+    def _belief_notes(self) -> Iterator[str]:
+        given, calibrated = self.grid.given, self.grid.calibration is not None
+        for own, other in (("fx", "fy"), ("fy", "fx")):
+            if f"believed_{own}_px" in given and f"believed_{other}_px" not in given:
+                yield (f"believed_{own}_px alone: the {other} believed stays the true one; "
+                       "believed_focal_scale is a focal length believed wrongly")
+        for name in STATED:
+            if name in given and not calibrated and self.grid.fixed.get("camera_file") is None:
+                yield f"{name} has no effect: no estimator has believed = calibration"
+        if calibrated and self.grid.fixed["calibration_sd"]:
+            yield ("the calibration's numbers are drawn independently of each other; those of most "
+                   "calibrations, fx and fy above all, vary together, which "
+                   "calibration_covariance states")
+
+    def _visibility_notes(self) -> list[str]:
+        facts, target = self.poses, target_word(self.grid)
+        world = not self.grid.given.isdisjoint(WORLD)
+        framed = not self.grid.given.isdisjoint(("frame_x", "frame_y"))
+        lines = [f"{facts.share(chosen)} {what}" for chosen, what in (
+            (facts.behind, "have a corner behind the camera: not_visible"),
+            (facts.averted,
+             f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
+            (facts.outside, f"are outside the frame{' of the camera' * world}: not_visible"
+             + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
+            (facts.cut, "are cut off by the frame's edge"
+             + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
+                "the middle" if framed else "")),
+        ) if chosen.mean() > MIN_SHARE]
+        unseen = facts.behind | facts.averted | facts.outside
+        whole = [f"{facts.share(unseen)} are not_visible:"]
+        return whole + lines if unseen.all() and len(lines) > 1 else lines
+
+    def _axis_notes(self) -> Iterator[str]:
+        """Yield lines for angles and distances that differ off the axis, or do nothing."""
+        facts, given, drawn = self.poses, self.grid.given, self.grid.distributions
+        shown, in_camera = ~facts.behind, given.isdisjoint(WORLD)
+        tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
+        apart = np.abs(view - tilt).max(initial=0)
+        farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
+        turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
+        if in_camera and turned == "tilt_deg" and apart > APART_DEG:
+            angles = "tilt_deg is" if given.isdisjoint(("yaw_deg", "pitch_deg")) else (
+                "yaw_deg and pitch_deg are")
+            yield ("off the optical axis the viewing angle differs from the tilt by up to "
+                   f"{apart:.3g}° (tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): "
+                   f"{angles} to the image plane, view_angle_deg is to the line of sight")
+        if in_camera and farther > FARTHER:
+            distance = "side_px" if "side_px" in given else "distance_m"
+            yield (f"{distance} counts along the optical axis: off it, the "
+                   f"{target_word(self.grid)}'s centre is up to {farther:.3g} times as far away")
+        if ("azimuth_deg" in drawn or len(self.grid.values_of("azimuth_deg")) > 1) and not (
+                turned in drawn or self.grid.any_value(turned, bool)):
+            yield f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0"
+
+    def _unit_notes(self) -> Iterator[str]:
+        """Yield a line for each angle whose values look like radians."""
+        for parameter in PARAMETERS.values():
+            if parameter.section != "pose" or parameter.unit != "degree":
+                continue
+            values = self._numbers(parameter.name)
+            steps = np.array([value for value in values if value]) / (math.pi / 12)
+            close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
+            if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
+                yield _in_degrees(parameter.name, values)
+
+    @property
     def detector_notes(self) -> list[str]:
         """A line for each property of the detections that may surprise."""
-        return [*self._corner_square_notes(), *self._offset_notes()]
-
-    def _offset_notes(self) -> list[str]:
-        """Return how far corners are beside the camera's convention: OpenCV's own apriltag ones."""
-        if "apriltag" not in self.grid.values_of("cornerRefinementMethod"):
-            return []
-        return [(
-            "cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of and "
-            "below those of its other refinements, and of its calibrations: half a pixel in "
-            "position and direction (pipelines/half_pixel/README.md)"
-        )]
-
-    def _corner_square_notes(self) -> list[str]:
-        """Return what to set where OpenCV's default threshold loses markers beside squares."""
-        squares = (
-            self.grid.any_value("kind", lambda kind: kind == "aprilgrid")
-            or self.grid.any_value("corner_squares", bool)
-        )
-        by_default = self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector"))
-        if not (squares and by_default):
-            return []
-        return [(
-            "board: squares touch its markers' corners, and OpenCV's default threshold joins both: "
-            "it finds a third of sharp markers; adaptiveThreshConstant = 60, "
-            "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in five "
-            "(pipelines/boards/README.md)"
-        )]
+        lines = []
+        squares = self.grid.any_value("kind", lambda kind: kind == "aprilgrid") or (
+            self.grid.any_value("corner_squares", bool))
+        if squares and self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector")):
+            lines.append(
+                "board: squares touch its markers' corners, and OpenCV's default threshold joins "
+                "both: it finds a third of sharp markers; adaptiveThreshConstant = 60, "
+                "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in "
+                "five (pipelines/boards/README.md)")
+        if "apriltag" in self.grid.values_of("cornerRefinementMethod"):
+            lines.append(
+                "cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of "
+                "and below those of its other refinements, and of its calibrations: half a pixel "
+                "in position and direction (pipelines/half_pixel/README.md)")
+        return lines
 
     @cached_property
     def parts(self) -> list[Part]:
         """Every optional part, active or not."""
-        effects, target = self.experiment.effects, target_word(self.grid)
-        drawn = self.grid.distributions
+        grid, effects, settings = self.grid, self.experiment.effects, self.experiment.detectors
         on = [effect for effect in effects
-              if effect.switch in drawn or self.grid.any_value(effect.switch, effect.is_on)]
-        calibrated = "calibration" in self.grid.values_of("believed")
-        draws = list(dict.fromkeys([
-            *drawn, *(["jitter_px"] if self.grid.any_value("jitter_px", bool) else []),
+              if effect.switch in grid.distributions
+              or grid.any_value(effect.switch, effect.is_on)]
+        calibrated = grid.calibration is not None
+        draws = dict.fromkeys([
+            *grid.distributions, *["jitter_px"] * grid.any_value("jitter_px", bool),
             *(each.switch for each in on if each.random),
-            *(["the believed calibration"] if calibrated else []),
-        ]))
-        lens = any(map(canonical_distortion, self.grid.values_of("distortion")))
-        image = self.grid.any_value("background", lambda value: isinstance(value, str))
-        asked = "full" in self.grid.values_of("window")
-        guarded = self.grid.any_value("guarded", bool)
-        settings = self.experiment.detectors
-        whole = sorted({reason for reason in map(full_frame_reason, settings) if reason})
-        gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
-            [1.0, *self.grid.values_of("gain")])
-        if any(effect.widens == "uneven light" for effect in on) and any(
-                uneven_light_needs_frame(setting, gain) for setting in settings):
-            whole.append("adaptiveThreshConstant is low for uneven light")
-        if image:
-            whole.append(
-                f"the background is an image: clutter near the {target} may change the detection")
-        if asked:
-            whole.append('window = "full"')
-        coarse = any("noise" in effect.worsens for effect in on)
+            *["the believed calibration"] * calibrated,
+        ])
+        lens = any(map(canonical_distortion, grid.values_of("distortion")))
+        image = grid.any_value("background", lambda value: isinstance(value, str))
+        guarded = grid.any_value("guarded", bool)
+        whole = self._reasons_for_the_frame(on, image=image)
         noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
+        coarse = any("noise" in effect.worsens for effect in on)
         noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
-        margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
+        windows = {margin_px(each) for each in settings if full_frame_reason(each) is None}
+        if image or "full" in grid.values_of("window"):
+            windows = set()
         assumptions = [
             name for name in PARAMETERS
-            if name.startswith("believed_") and self.grid.fixed.get(name, "varies") is not None
-        ] + (["believed: calibration"] if calibrated else [])
+            if name.startswith("believed_") and grid.fixed.get(name, "varies") is not None
+        ] + ["believed: calibration"] * calibrated
         return [
             Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
             _listed("random draws", draws, "nothing is random",
-                    "{}, Sobol' points" if self.grid.sampling == "sobol" else "{}"),
+                    "{}, Sobol' points" if grid.sampling == "sobol" else "{}"),
             Part("background image", image, "background names a file" if image else "a level"),
-            _listed("window", [] if asked or image else map(str, margins), "the full frame",
-                    f"{{}} px around the {target}'s pixels{noise}"),
-            _listed("plug-ins", map(_described, self.grid.plugins), "none is named"),
+            _listed("window", map(str, sorted(windows)), "the full frame",
+                    f"{{}} px around the {target_word(grid)}'s pixels{noise}"),
+            _listed("plug-ins", map(_described, grid.plugins), "none is named"),
             Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
-            Part("renderer", True, ", ".join(sorted(set(self.grid.values_of("renderer"))))),
-            *(self._effect(effect) for effect in effects),
+            Part("renderer", True, ", ".join(sorted(set(grid.values_of("renderer"))))),
+            *map(self._effect, effects),
             Part("solver guard", guarded,
                  "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP"),
-            _listed("accuracy bound", sorted(set(self.grid.values_of("bound")) - {"none"}),
+            _listed("accuracy bound", sorted(set(grid.values_of("bound")) - {"none"}),
                     "bound is none", "bound is {}"),
-            _listed("pixels kept",
-                    (name for name in self.grid.values_of("solver") if self._needs_images(name)),
+            _listed("pixels kept", filter(self._needs_images, grid.values_of("solver")),
                     "no solver needs them", "solver {} needs them"),
             _listed("wrong assumptions", assumptions,
                     "the estimator knows the true camera and size"),
         ]
 
+    def _reasons_for_the_frame(self, on: Sequence[Effect], *, image: bool) -> list[str]:
+        """Return why the whole frame is searched, given the effects that are on."""
+        settings = self.experiment.detectors
+        reasons = sorted({reason for each in settings if (reason := full_frame_reason(each))})
+        gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
+            [1.0, *self.grid.values_of("gain")])
+        if any(effect.widens == "uneven light" for effect in on) and any(
+                uneven_light_needs_frame(setting, gain) for setting in settings):
+            reasons.append("adaptiveThreshConstant is low for uneven light")
+        if image:
+            reasons.append("the background is an image: clutter near the "
+                           f"{target_word(self.grid)} may change the detection")
+        return reasons + ['window = "full"'] * ("full" in self.grid.values_of("window"))
+
     def _effect(self, effect: Effect) -> Part:
-        name, switch = effect.label, effect.switch
-        if switch in self.grid.distributions:
-            return Part(name, True, f"{switch} is drawn: {self.grid.distributions[switch]}", switch)
+        switch, drawn = effect.switch, self.grid.distributions.get(effect.switch)
         values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
-        if not values:
-            return Part(name, False, f"{switch} is {effect.off_text}", switch)
-        coded = is_coded(effect.off)
-        extent = ", ".join(dict.fromkeys(map(label, values))) if coded else _text(values)
-        return Part(name, True, f"{switch} is {extent}", switch)
+        extent = str(effect.off_text)
+        if drawn is not None:
+            return Part(effect.label, True, f"{switch} is drawn: {drawn}", switch)
+        if values:
+            extent = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) else (
+                _text(values))
+        return Part(effect.label, bool(values), f"{switch} is {extent}", switch)
 
     def _needs_images(self, solver: str) -> bool:
         plugin = self.grid.plugin("estimator", solver)
         return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
+
+
+def _in_degrees(name: str, numbers: Sequence[float]) -> str:
+    largest = max(numbers, key=abs)
+    return (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
+            f"{math.degrees(largest):.4g}")
+
+
+def _described(plugin: DeclaredPlugin) -> str:
+    """Return a plug-in in words: kind, name, versions."""
+    versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
+    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from sweep.experiment.draws import (
     geometry_keys,
     hashed,
     jointly_drawn,
+    key_texts,
     resolve_pose,
     uniform,
 )
@@ -39,7 +40,6 @@ from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
 from sweep.model.board_kinds import ARRANGING, arranged_board
-from sweep.model.calibration import CalibrationError
 from sweep.model.camera import Column, canonical_distortion, map_columns
 from sweep.model.effects import Effect, ScenePlugins
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
@@ -251,11 +251,6 @@ class Experiment:
         return scene_plugins(self.grid)
 
     @cached_property
-    def calibration(self) -> CalibrationError | None:
-        """The error of the calibration that an estimator believes; None if none does."""
-        return self.grid.calibration
-
-    @cached_property
     def shows_boards(self) -> bool:
         """Whether scenes show boards; single markers count as boards then."""
         return shows_boards(self.grid)
@@ -311,7 +306,7 @@ class Experiment:
         poses = {} if values["photographs"].missing else self._photographed(values, trials)
         if shows_photographs(grid):
             return values | poses
-        calibration = self.calibration
+        calibration = grid.calibration
         if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
             resolve_pose(values)
             return values | poses
@@ -367,8 +362,11 @@ class Experiment:
             for name, along in axis.columns.items():
                 values[name] = Column.of([along[i] for i in index.tolist()])
         trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+        if "background" in values:  # an image is known by its content
+            values["background"] = values["background"].map(
+                lambda value: grid.files.get(value) or value)
         texts = [
-            self._texts(name, values[name])
+            key_texts(name, values[name], grid.parameters[name].default)
             for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())
         ]
         texts += [
@@ -377,23 +375,3 @@ class Experiment:
             if grid.parameters[name].stage is Stage.scene
         ]
         return bits(grid.seed, f"image {grid.sampling}", hashed(texts, count), trials)
-
-    def _texts(self, name: str, column: Column) -> Column:
-        """Return "name=value" of each value, empty where it is the default."""
-        default = self.grid.parameters[name].default
-
-        @cache
-        def text(value: Any) -> str:
-            if value is None or value == default:
-                return ""
-            if name == "background" and isinstance(value, str):
-                return f"{name}={self.grid.files.get(value) or value}"
-            return f"{name}={_text(value)}"
-
-        return column.map(text)
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ",".join("" if item is None else _text(item) for item in value)
-    return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"

@@ -74,15 +74,6 @@ def _gather() -> dict[str, Parameter]:
 PARAMETERS: dict[str, Parameter] = _gather()
 """Every parameter by its name; names are unique over all sections."""
 
-REMOVED = {
-    "environment": "to compare versions of OpenCV, run `sweep run` in each virtual environment, "
-    "then `sweep compare A.zarr B.zarr`",
-    "limit": "write [search] along = AXIS, and [require] all",
-    "choose": "write [search] smallest = AXIS, largest = AXIS or cheapest = true",
-    "precision": "write [search] precision = { detection_rate = 0.02 }",
-}
-"""Parameters and sections of earlier versions -> what to do instead."""
-
 
 # --------------------------------------------------------------------------------------------------
 # Parameters that say the same in different ways: one of the ways is given, not two.

@@ -23,7 +23,6 @@ from sweep.experiment.document import (
     read_document,
     read_keys,
     read_value,
-    removed,
     section_of,
     toml_item,
 )
@@ -106,7 +105,7 @@ def parse_settings(
         elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-            faults.append(f"{start}unknown parameter{removed(section) or removed(name) or hint}")
+            faults.append(f"{start}unknown parameter{hint}")
         elif is_zip(value) and section in ("", "axes"):
             chosen[name] = value
         elif home and section not in ("", home, "axes"):

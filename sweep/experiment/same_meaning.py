@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sweep.experiment.axes import Axis
@@ -40,15 +40,32 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     >>> used_settings(pipeline, {"solver": "ippe", "estimate_blur": True})
     {'solver': 'ippe'}
     """
-    parameters = dict(_parameters(pipeline, values))
-    unused = {*_unused_by_detector(pipeline, _only(pipeline, "detector", parameters)),
-              *_unused_by_solver(pipeline, _only(pipeline, "solver", parameters))}
-    used = {}
-    for name, value in values.items():
-        axis = pipeline.axis(name)
-        if axis is None or not unused.issuperset(axis.columns):
-            used[name] = value
-    return used
+    chosen = {
+        name: several[0] for name in ("detector", "solver")
+        if len(several := list(set(pipeline.values_of(name)))) == 1
+    }
+    axes = {name: pipeline.axis(name) for name in values}
+    for name, axis in axes.items():
+        if axis is not None and values[name] in list(axis.values):
+            chosen |= axis.at(list(axis.values).index(values[name]))
+    unused = set()
+    if (detector := chosen.get("detector")) is not None:
+        unused |= _settings_of_others(pipeline, "detector", detector)
+        unused |= set() if detector == OPENCV else {*OPENCV_FIELDS}
+    if (solver := chosen.get("solver")) is not None:
+        unused |= _settings_of_others(pipeline, "estimator", solver)
+        unused |= set() if solver in SOLVERS and SOLVERS[solver].guarded else {"guarded"}
+        unused |= frozenset().union(*PIXEL_SETTINGS.values()) - PIXEL_SETTINGS.get(solver, set())
+    return {name: value for name, value in values.items()
+            if (axis := axes[name]) is None or not unused.issuperset(axis.columns)}
+
+
+def _settings_of_others(pipeline: Grid, kind: str, name: str) -> set[str]:
+    """Return the settings of the plug-ins of a kind that the one of this name does not have."""
+    own = pipeline.plugin(kind, name)
+    every = {each.name for plugin in pipeline.plugins if plugin.kind == kind
+             for each in plugin.settings}
+    return every - {each.name for each in (own.settings if own is not None else ())}
 
 
 def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -57,48 +74,6 @@ def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[
     for index, values in enumerate(combinations):
         first.setdefault(tuple(used_settings(pipeline, values).items()), index)
     return list(first.values())
-
-
-def _parameters(pipeline: Grid, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of each parameter of some axes' values."""
-    for name, value in values.items():
-        axis = pipeline.axis(name)
-        if axis is not None and value in list(axis.values):
-            yield from axis.at(list(axis.values).index(value)).items()
-
-
-def _only(pipeline: Grid, name: str, parameters: Mapping[str, Any]) -> Any:
-    """Return the value of a parameter; None if the pipeline has several, and none is chosen."""
-    if name in parameters:
-        return parameters[name]
-    values = set(pipeline.values_of(name))
-    return values.pop() if len(values) == 1 else None
-
-
-def _settings_of_plugins(pipeline: Grid, kind: str, name: str) -> set[str]:
-    """Return the settings of the plug-ins of a kind that the one of this name does not have."""
-    own = pipeline.plugin(kind, name)
-    every = {each.name for plugin in pipeline.plugins if plugin.kind == kind
-             for each in plugin.settings}
-    return every - {each.name for each in own.settings} if own is not None else every
-
-
-def _unused_by_detector(pipeline: Grid, detector: str | None) -> set[str]:
-    if detector is None:
-        return set()
-    others = _settings_of_plugins(pipeline, "detector", detector)
-    return others if detector == OPENCV else {*others, *OPENCV_FIELDS}
-
-
-def _unused_by_solver(pipeline: Grid, solver: str | None) -> set[str]:
-    if solver is None:
-        return set()
-    others = _settings_of_plugins(pipeline, "estimator", solver)
-    known = SOLVERS.get(solver)
-    if known is None or not known.guarded:
-        others.add("guarded")
-    every = frozenset().union(*PIXEL_SETTINGS.values())
-    return {*others, *(every - PIXEL_SETTINGS.get(solver, frozenset()))}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -113,16 +88,14 @@ def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
     A belief that is not given is the truth, if this is a single value in one of the pipelines:
     cells that both have are its. A camera's values may be given in other words, or by a file.
     """
-    views = [_view(pipeline) for pipeline in (first, second)]
-    known = next(
-        ((pipeline, view) for pipeline, view in zip((first, second), views, strict=True)
-         if view is not None), None,
-    )
-    truth = {} if known is None else _truth(*known)
+    pair = first, second
+    views = [_view(pipeline) for pipeline in pair]
+    truth = next((_truth(pipeline, view) for pipeline, view in zip(pair, views, strict=True)
+                  if view is not None), {})
     ignored: dict[str, Any] = {"camera_file": None}
     if views[0] is not None and views[0] == views[1]:
         ignored |= {name: first.fixed[name] for name in VIEW_PARAMETERS if name not in FRAME}
-    if not any("calibration" in each.values_of("believed") for each in (first, second)):
+    if first.calibration is None and second.calibration is None:
         ignored |= dict.fromkeys(STATED, ())
     return _with(first, truth, ignored), _with(second, truth, ignored)
 
@@ -169,13 +142,13 @@ def _differs(believed: Any, truth: Any) -> bool:
 
 
 def _with(pipeline: Pipeline, truth: dict[str, Any], ignored: dict[str, Any]) -> Pipeline:
-    fixed = {name: ignored.get(name, value) for name, value in pipeline.fixed.items()}
+    fixed = {**pipeline.fixed, **{name: value for name, value in ignored.items()
+                                  if name in pipeline.fixed}}
     for name in ("distortion", "believed_distortion"):
         if fixed.get(name) is not None:
             fixed[name] = canonical_distortion(fixed[name])
-    for name, value in truth.items():
-        if name in fixed and fixed[name] is None:
-            fixed[name] = value
+    fixed |= {name: value for name, value in truth.items()
+              if name in fixed and fixed[name] is None}
     return dataclasses.replace(pipeline, fixed=fixed)
 
 

@@ -66,7 +66,6 @@ def told(capsys, line):
         ("run other", "did you mean pipelines/other.toml?"),
         ("plan other.toml", "did you mean pipelines/other.toml?"),
         ("run runs", "runs: a folder that is no store; expected a TOML file or a store"),
-        ("run small.toml --set environment=other", "then `sweep compare A.zarr B.zarr`"),
         ("run small.toml --set Tilt_Deg=3", "did you mean tilt_deg?"),
         ("run small.toml --set tilt_deg=0,45", "such as [0, 45]"),
         ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),

@@ -12,8 +12,6 @@ P = "[pose]\ndistance_m = 1\n"
 
 BROKEN = [
     (P + "[camra]\nwidth_px = 640", "camra: unknown; expected a section of title, seed,"),
-    (P + '[detector]\nenvironment = "other"',
-     "`sweep run` in each virtual environment, then `sweep compare A.zarr B.zarr`"),
     ('[pose]\ndistance_m = "near"', 'pose.distance_m = "near": expected a number above 0'),
     (P + "[camera]\nwidth_px = 640.5",
      "camera.width_px = 640.5: expected a whole number from 1 to 100000"),

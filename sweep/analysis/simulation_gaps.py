@@ -22,6 +22,7 @@ from sweep.analysis.dataset import (
     require_poses,
 )
 from sweep.analysis.estimator import (
+    INTERVAL,
     OVER_ALL,
     PREFIX,
     Arrays,
@@ -29,10 +30,15 @@ from sweep.analysis.estimator import (
     Bins,
     Columns,
     Design,
+    Layout,
+    Output,
     Rate,
     Unit,
+    Variables,
+    interval_variables,
     quantile_intervals,
     read_bins,
+    with_interval,
 )
 from sweep.analysis.intervals import (
     MIN_UNITS,
@@ -44,7 +50,6 @@ from sweep.analysis.poses import ERROR_INPUTS, INSIDE, QUANTITIES, Poses, pose_a
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE
 from sweep.errors import DatasetError
 from sweep.experiment.parameters import PARAMETERS, SIMULATED, Stage
-from sweep.experiment.schema import LABELS, cf_attributes
 from sweep.messages import label, shown
 from sweep.typing import Floats, Integers, Masks
 
@@ -104,17 +109,9 @@ class PairedUnits:
 
     def bins(self) -> Iterator[tuple[Masks, Masks]]:
         """Yield which markers (units, rows) of both lie in each combination of bins."""
-        for index in np.ndindex(*self.binning.shape):
-            first, second = (
-                np.logical_and.reduce(
-                    [np.ones(side["detection"].shape[2:], dtype=bool)] + [
-                        np.searchsorted(edges, values[name], side="right") - 1 == k
-                        for (name, edges), k in zip(self.binning.edges.items(), index, strict=True)
-                    ]
-                )
-                for side, values in zip((self.first, self.second), self.values, strict=True)
-            )
-            yield first, second
+        shapes = [side["detection"].shape[2:4] for side in (self.first, self.second)]
+        for first, second in zip(*map(self.binning.masks, self.values), strict=True):
+            yield np.broadcast_to(first, shapes[0]), np.broadcast_to(second, shapes[1])
 
 
 def paired_units(
@@ -137,7 +134,9 @@ def paired_units(
     paired = is_twin(simulated)
     first, second, names = _same_configurations(photographs, simulated, paired=paired)
     if paired:
-        first, second = _same_scenes(first, second)
+        for name in axes_of(first, Stage.scene):
+            if name != DRAWS and name in second.dims:
+                first, second = _common(first, second, name)
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
     binning, _ = read_bins(first, names, bins)
@@ -145,11 +144,15 @@ def paired_units(
     arrays = []
     for side, one in zip((first, second), single, strict=True):
         columns = pose_arrays(side, ERROR_INPUTS) | {
-            f"{PREFIX}{name}": _binned(side, name) for name in binning.edges
-        }
+            f"{PREFIX}{name}": _binned(side, name) for name in binning.edges}
         if paired and side is second and TRUTH_STD in side:
             columns[TRUTH_STD] = side[TRUTH_STD]
-        arrays.append(_in_units(side, columns, names, single=one))
+        scene = [name for name in axes_of(side, Stage.scene) if name not in names]
+        scene.sort(key=lambda name: name != DRAWS)
+        units, rows = (scene, []) if one else (scene[:1], scene[1:])
+        sizes = {name: side.sizes[name] for name in (*names, *scene)}
+        layout = Layout(sizes, names, (), tuple(units), tuple(rows))
+        arrays.append({name: layout.arranged(array) for name, array in columns.items()})
     if paired:
         trials = _trials_of(first, second)
         kept = np.flatnonzero((trials >= 0).any(axis=1))
@@ -157,14 +160,12 @@ def paired_units(
                   {name: _gathered(array, trials[kept]) for name, array in arrays[1].items()}]
         _blur_truth(arrays[1])
         single = (False, False)
-    values = [
-        {name: side.pop(f"{PREFIX}{name}")[0, 0] for name in binning.edges} for side in arrays
-    ]
+    values = [{name: side.pop(f"{PREFIX}{name}")[0, 0] for name in binning.edges}
+              for side in arrays]
     return PairedUnits(
         arrays[0], arrays[1], single, paired, names,
         {name: first.sizes[name] for name in names},
-        {name: first[name].variable for name in names}, binning, first, (values[0], values[1]),
-    )
+        {name: first[name].variable for name in names}, binning, first, (values[0], values[1]))
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -186,14 +187,12 @@ def _same_configurations(
     """
     names = list(dict.fromkeys([*configuration_axes(first), *configuration_axes(second)]))
     for name in names:
-        first, second = _with_axis(first, second, name), _with_axis(second, first, name)
-        common = [each for each in first[name].values if each in second[name].values]
-        if not common:
+        ours, theirs = _with_axis(first, second, name), _with_axis(second, first, name)
+        first, second = _common(ours, theirs, name)
+        if not first.sizes[name]:
             raise DatasetError(
-                f"no common {name}: {shown(first[name].values.tolist())} and "
-                f"{shown(second[name].values.tolist())}; measure both with the same settings"
-            )
-        first, second = first.sel({name: common}), second.sel({name: common})
+                f"no common {name}: {shown(ours[name].values.tolist())} and "
+                f"{shown(theirs[name].values.tolist())}; measure both with the same settings")
     if paired:
         own = [name for name in axes_of(second, Stage.scene)
                if name not in axes_of(first, Stage.scene)]
@@ -201,6 +200,14 @@ def _same_configurations(
             first = first.drop_vars(name, errors="ignore").expand_dims({name: second[name].values})
         names += own
     return first, second, tuple(names)
+
+
+def _common(
+    first: xr.Dataset, second: xr.Dataset, name: str
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return both at the values of an axis that both have."""
+    common = [each for each in first[name].values if each in second[name].values]
+    return first.sel({name: common}), second.sel({name: common})
 
 
 def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
@@ -217,16 +224,6 @@ def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
     return results.drop_vars(name, errors="ignore").expand_dims({name: [value]})
 
 
-def _same_scenes(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return photographs and their twins with the markers that both have."""
-    for name in axes_of(first, Stage.scene):
-        if name == DRAWS or name not in second.dims:
-            continue
-        common = [each for each in first[name].values if each in second[name].values]
-        first, second = first.sel({name: common}), second.sel({name: common})
-    return first, second
-
-
 def _trials_of(first: xr.Dataset, second: xr.Dataset) -> Integers:
     """Return the indices (photographs, repeats) of the trials of each photograph; -1 for none.
 
@@ -235,45 +232,14 @@ def _trials_of(first: xr.Dataset, second: xr.Dataset) -> Integers:
     DatasetError
         If none is of these photographs.
     """
-    files = [_files(each) for each in (first, second)]
-    trials: dict[tuple[str, str], list[int]] = {each: [] for each in files[0]}
-    for trial, each in enumerate(files[1]):
-        if each in trials:
-            trials[each].append(trial)
-    most = max(map(len, trials.values()))
+    files = [list(zip(*(side[name].values if name in side.coords else np.empty(0)
+                        for name in ("photograph", "sha256")), strict=True))
+             for side in (first, second)]
+    trials = [[k for k, other in enumerate(files[1]) if other == each] for each in files[0]]
+    most = max(map(len, trials))
     if not most:
         raise DatasetError("the simulation is the twin of other photographs")
-    return np.array([
-        some + [-1] * (most - len(some)) for some in (trials[each] for each in files[0])
-    ])
-
-
-def _files(results: xr.Dataset) -> list[tuple[str, str]]:
-    columns = [results[name].values if name in results.coords else np.empty(0)
-               for name in ("photograph", "sha256")]
-    return [(str(name), str(digest)) for name, digest in zip(*columns, strict=True)]
-
-
-def _in_units(
-    results: xr.Dataset, arrays: Mapping[str, xr.DataArray], configurations: tuple[str, ...], *,
-    single: bool,
-) -> dict[str, NDArray[Any]]:
-    """Return arrays as (configurations, 1, units, rows, ...)."""
-    scene = [name for name in axes_of(results, Stage.scene) if name not in configurations]
-    if DRAWS in scene:
-        scene = [DRAWS, *(name for name in scene if name != DRAWS)]
-    dims = (*configurations, *scene)
-    count = int(np.prod([results.sizes[name] for name in configurations]))
-    units = int(np.prod([results.sizes[name] for name in (scene if single else scene[:1])]))
-    laid_out = {}
-    for name, array in arrays.items():
-        inner = [str(dim) for dim in array.dims if dim in LABELS]
-        missing = {dim: results.sizes[dim] for dim in dims if dim not in array.dims}
-        values = array.reset_coords(drop=True).drop_vars(array.indexes, errors="ignore")
-        values = values.expand_dims(missing).transpose(*dims, *inner)
-        shape = tuple(values.sizes[dim] for dim in inner)
-        laid_out[name] = np.asarray(values).reshape(count, 1, units, -1, *shape)
-    return laid_out
+    return np.array([some + [-1] * (most - len(some)) for some in trials])
 
 
 def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
@@ -337,37 +303,28 @@ BY_PHOTOGRAPH = Design(Unit.photograph)
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """What is compared: by its ratio, or else by its difference."""
+    """What is compared: a rate, or a quantile of the errors (...) of solved poses.
+
+    By its ratio, or else by its difference.
+    """
 
     name: str
     meaning: str
     units: str = "1"
     ratio: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class GapRate(Compared):
-    """A rate of markers."""
-
-    rate: Rate[Poses]
-
-
-@dataclass(frozen=True, kw_only=True)
-class GapQuantile(Compared):
-    """A quantile of the errors (...) of solved poses."""
-
-    error: Callable[[Poses], Floats]
+    rate: Rate[Poses] | None = None
+    error: Callable[[Poses], Floats] | None = None
     percent: int = 50
 
 
-RATES = tuple(GapRate(name=each.rate.name, meaning=each.rate.meaning, rate=each.rate)
+RATES = tuple(Compared(name=each.rate.name, meaning=each.rate.meaning, rate=each.rate)
               for each in (DETECTION_RATE, FLIP_RATE))
 
 QUANTILES = (
-    GapQuantile(name="range_bias_percent", meaning="median depth error of the true depth, solved",
-                units="percent", error=lambda poses: poses.range_percent[..., 0]),
+    Compared(name="range_bias_percent", meaning="median depth error of the true depth, solved",
+             units="percent", error=lambda poses: poses.range_percent[..., 0]),
     *(
-        GapQuantile(
+        Compared(
             name=quantity.named(statistic), units=quantity.units, ratio=True, error=quantity.norm,
             meaning=f"{percent} % quantile of the absolute {quantity.words}, solved",
             percent=percent)
@@ -456,88 +413,68 @@ def simulation_gap(
 
 def _attributes() -> dict[str, dict[str, Any]]:
     """Return the attributes of the variables by their names, in their order."""
-    found = {
-        "looked_for": cf_attributes("markers that were run, visible and modelled", "1"),
-        "solved": cf_attributes("solved poses", "1"),
-        "units": cf_attributes("photographs, or simulated scenes, with a marker", "1"),
-    }
-    compared: tuple[Compared, ...] = (*RATES, *QUANTILES)
-    for each in compared:
+    outputs = [Output("looked_for", "markers that were run, visible and modelled", "1"),
+               Output("solved", "solved poses", "1"),
+               Output("units", "photographs, or simulated scenes, with a marker", "1")]
+    for each in (*RATES, *QUANTILES):
         gap = "simulated over photographs" if each.ratio else "simulated minus photographs"
-        for name, meaning, unit in (
-            (each.name, each.meaning, each.units),
-            (f"{each.name}_gap", f"{gap}: {each.meaning}", "1" if each.ratio else each.units),
-        ):
-            found[name] = cf_attributes(meaning, unit)
-            for end, word in (("low", "lower"), ("high", "upper")):
-                found[f"{name}_{end}"] = cf_attributes(
-                    f"{word} end of the 95 % interval: {meaning}", unit
-                )
-    return found
+        outputs += with_interval(each.name, each.meaning, each.units)
+        outputs += with_interval(f"{each.name}_gap", f"{gap}: {each.meaning}",
+                                 "1" if each.ratio else each.units)
+    return {output.name: output.attributes() for output in outputs}
 
 
-def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> dict[str, Any]:
+def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> Variables:
     """Return the variables of one bin: (sources, configurations) or (configurations,)."""
     arrays = pair.within(inside)
     sides = [Poses(each) for each in arrays]
-    table: dict[str, Any] = {
+    table: Variables = {
         name: np.stack([getattr(side, name).sum(axis=OVER_ALL) for side in sides])
         for name in ("looked_for", "solved")
     }
     table["units"] = np.stack([side.looked_for.any(axis=(1, 3)).sum(axis=1) for side in sides])
     for each in RATES:
-        table |= _rates(each.rate, arrays)
+        if each.rate is not None:
+            table |= _rates(each.rate, arrays)
     counts = [None if single else unit_counts(side.looked_for.shape[2])
               for side, single in zip(sides, pair.single, strict=True)]
     if pair.paired:
         counts = [counts[0], counts[0]]
-    for what in QUANTILES:
-        errors = [what.error(side) for side in sides]
-        rows = [_quantiles(what, [error[k, 0] for error in errors],
-                           [side.solved[k, 0] for side in sides], counts)
-                for k in range(len(errors[0]))]
-        for name in rows[0]:
-            table[name] = np.stack([row[name] for row in rows], axis=-1)
+    for each in QUANTILES:
+        table |= _quantiles(each, sides, counts)
     return table
 
 
-def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> dict[str, Any]:
+def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> Variables:
     """Return a rate of both, its difference, and their intervals."""
     found = [rate.variables(Columns(each, Poses), BY_PHOTOGRAPH) for each in arrays]
-    names = rate.name, f"{rate.name}_low", f"{rate.name}_high"
-    value, low, high = (np.stack([each[name] for each in found]) for name in names)
-    table = dict(zip(names, (value, low, high), strict=True))
+    value, low, high = (
+        np.stack([each[f"{rate.name}{end}"] for each in found]) for end in INTERVAL)
     gap = value[1] - value[0]
-    table[f"{rate.name}_gap"] = gap
-    table[f"{rate.name}_gap_low"] = gap - np.hypot(value[1] - low[1], high[0] - value[0])
-    table[f"{rate.name}_gap_high"] = gap + np.hypot(high[1] - value[1], value[0] - low[0])
-    return table
+    return interval_variables(rate.name, (value, low, high)) | interval_variables(
+        f"{rate.name}_gap", (gap, gap - np.hypot(value[1] - low[1], high[0] - value[0]),
+                             gap + np.hypot(high[1] - value[1], value[0] - low[0])))
 
 
-def _quantiles(
-    each: GapQuantile, errors: Sequence[Floats], solved: Sequence[Masks], counts: Sequence[Any],
-) -> dict[str, Any]:
-    """Return a quantile of both of one configuration, its gap, and their intervals.
-
-    ``errors`` and ``solved`` are (units, rows) of each.
-    """
-    values, ends, replicates, units = [], [], [], []
-    for error, some, drawn in zip(errors, solved, counts, strict=True):
-        used, share = some & np.isfinite(error), each.percent / 100.0
+def _quantiles(each: Compared, sides: Sequence[Poses], counts: Sequence[Any]) -> Variables:
+    """Return a quantile of both, its gap, and their intervals; ``counts`` are of the bootstrap."""
+    intervals, replicates, units = [], [], []
+    for side, drawn in zip(sides, counts, strict=True):
+        errors = each.error(side) if each.error else np.empty(0)
+        used = side.solved & np.isfinite(errors)
+        units.append(used.any(axis=(1, 3)).sum(axis=1))
         interval = quantile_intervals(
-            np.where(used, error, np.nan)[None, None], used.sum(axis=1)[None, None],
-            [each.percent], BY_PHOTOGRAPH)[0, 0].tolist()
-        values.append(interval[0])
-        replicates.append(resampled_quantiles(error, used, drawn, share))
-        units.append(int(used.any(axis=1).sum()))
-        ends.append(interval[1:] if units[-1] >= MIN_UNITS else (np.nan, np.nan))
+            np.where(used, errors, np.nan), used.sum(axis=3), [each.percent], BY_PHOTOGRAPH)[:, 0]
+        interval[units[-1] < MIN_UNITS, 1:] = np.nan
+        intervals.append(interval)
+        replicates.append(np.stack([
+            resampled_quantiles(values[0], some[0], drawn, each.percent / 100.0)
+            for values, some in zip(errors, used, strict=True)]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        gaps = replicates[1] / replicates[0] if each.ratio else replicates[1] - replicates[0]
-        gap = np.divide(values[1], values[0]) if each.ratio else values[1] - values[0]
-    low, high = percentile_interval(gaps, min(units))
-    name = each.name
-    return {
-        name: np.array(values), f"{name}_low": np.array([end[0] for end in ends]),
-        f"{name}_high": np.array([end[1] for end in ends]), f"{name}_gap": np.asarray(gap),
-        f"{name}_gap_low": np.asarray(low), f"{name}_gap_high": np.asarray(high),
-    }
+        compare = np.divide if each.ratio else np.subtract
+        gaps, values = compare(replicates[1], replicates[0]), np.moveaxis(
+            np.array(intervals), -1, 0)
+        ends = np.array([percentile_interval(row, least)
+                         for row, least in zip(gaps, np.minimum(*units).tolist(), strict=True)])
+        return interval_variables(each.name, [*values]) | interval_variables(
+            f"{each.name}_gap", (compare(values[0][1], values[0][0]), ends[:, 0], ends[:, 1]))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -201,22 +202,17 @@ def outcome_of(
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
     groups = failure_groups(cells)
-    stages = [
-        _Counts("detections", DetectionStatus, detection),
-        _Counts("estimates", EstimateStatus, estimate),
-    ]
-    warnings = [stage.line() for stage in stages if stage.lost]
+    stages = _by_name(DetectionStatus, detection), _by_name(EstimateStatus, estimate)
+    shares, lines = zip(*map(_lost, ("detections", "estimates"), stages), strict=True)
+    warnings = list(filter(None, lines))
     advice = ""
     if groups:
         warnings += _listed(groups)
         advice = repro_command(url, [group.at for group in groups])
-    if nothing := _nothing_found(*stages):
+    if 1.0 not in shares and (nothing := _nothing_found(*stages)):
         warnings.append(nothing)
         advice = advice or f"{repro_command(url, [first])} -o scene.png"
-    return Outcome(
-        any(stage.nothing_computed for stage in stages), max(stage.share for stage in stages),
-        groups, warnings, advice,
-    )
+    return Outcome(1.0 in shares, max(shares), groups, warnings, advice)
 
 
 def outcome_of_finished(store: RunStore) -> Outcome:
@@ -229,10 +225,12 @@ def outcome_of_finished(store: RunStore) -> Outcome:
     """
     detection, estimate = (store.run_metadata["counts"][name] for name in ("detection", "estimate"))
     any_lost = any(
-        _Counts("", flags, counts).lost
+        _by_name(flags, counts)[kind] for kind in ("failed", "crashed")
         for flags, counts in ((DetectionStatus, detection), (EstimateStatus, estimate))
     )
-    cells = _recorded_failures(store) if any_lost else ()
+    cells = [
+        cell for _, receipt in receipts(store, committed(store)) for cell in receipt.failures
+    ] if any_lost else []
     found = outcome_of(store.url, detection, estimate, cells, first_cell(store))
     processors = store.run_metadata["counts"].get("processors") or {}
     found.warnings.extend(differing_processors(processors, "blocks"))
@@ -244,68 +242,26 @@ def first_cell(store: RunStore) -> str:
     return selection_text({axis.name: axis.values[0] for axis in store.pipeline.axes})
 
 
-def _recorded_failures(store: RunStore) -> Iterator[FailedCell]:
-    """Yield the failed cells that the receipts of a store record."""
-    for _, receipt in receipts(store, committed(store)):
-        yield from receipt.failures
+def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:
+    """Return the counts of the flags that occur, by name."""
+    return Counter({
+        flag.name: count for flag, count in zip(flags, counts, strict=False) if count})
 
 
-@dataclass(frozen=True, slots=True)
-class _Counts:
-    """Cells of a stage by flag."""
-
-    name: str
-    flags: type[Flag]
-    counts: Sequence[int]
-
-    def of(self, *names: str) -> int:
-        return sum(
-            count for flag, count in zip(self.flags, self.counts, strict=False)
-            if flag.name in names
-        )
-
-    @property
-    def lost(self) -> int:
-        return self.of("failed", "crashed")
-
-    @property
-    def tried(self) -> int:
-        return sum(self.counts) - self.of(*NOT_TRIED)
-
-    @property
-    def share(self) -> float:
-        return self.lost / self.tried if self.tried else 0.0
-
-    @property
-    def nothing_computed(self) -> bool:
-        return 0 < self.lost == self.tried
-
-    def line(self) -> str:
-        kinds = " and ".join(
-            f"{self.of(kind):,} {kind}" for kind in ("failed", "crashed") if self.of(kind)
-        )
-        if self.nothing_computed:
-            return f"nothing computed: all {self.lost:,} {self.name} {_verb(self)}"
-        loud = "warning: " if self.share > LOUD_SHARE else ""
-        return f"{loud}{kinds} of {self.tried:,} {self.name} ({_percent(self.share)})"
-
-    def most(self) -> tuple[Flag, int] | None:
-        """Return the most frequent flag and its count; None if there are no cells."""
-        counted = [
-            (flag, count) for flag, count in zip(self.flags, self.counts, strict=False)
-            if count and flag.name != "not_needed"
-        ]
-        return max(counted, key=lambda pair: pair[1]) if counted else None
-
-
-def _verb(stage: _Counts) -> str:
-    if not stage.of("crashed"):
-        return "failed"
-    return "failed or crashed" if stage.of("failed") else "crashed"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.4g} %"
+def _lost(cells: str, counts: Counter[str]) -> tuple[float, str]:
+    """Return the share of ``cells`` that failed or crashed, and a line on them if there are any."""
+    kinds = [kind for kind in ("failed", "crashed") if counts[kind]]
+    lost = counts["failed"] + counts["crashed"]
+    tried = counts.total() - sum(counts[flag] for flag in NOT_TRIED)
+    if not lost:
+        return 0.0, ""
+    if lost == tried:
+        return 1.0, f"nothing computed: all {lost:,} {cells} {' or '.join(kinds)}"
+    share = lost / tried
+    loud = "warning: " if share > LOUD_SHARE else ""
+    listed = " and ".join(f"{counts[kind]:,} {kind}" for kind in kinds)
+    percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
+    return share, f"{loud}{listed} of {tried:,} {cells} ({percent})"
 
 
 def _listed(groups: Sequence[FailureGroup]) -> list[str]:
@@ -329,16 +285,17 @@ def repro_command(url: str, cells: Sequence[str]) -> str:
     return " ".join(["sweep repro", shlex.quote(url), *chosen])
 
 
-def _nothing_found(detection: _Counts, estimate: _Counts) -> str:
+def _nothing_found(detection: Counter[str], estimate: Counter[str]) -> str:
     """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
-    if not detection.of("detected"):
-        stage, what = detection, "nothing was detected"
-    elif not estimate.of(*(flag.name for flag in EstimateStatus if flag.present)):
-        stage, what = estimate, "no pose was estimated"
+    if not detection["detected"]:
+        flags: type[Flag] = DetectionStatus
+        counts, what = detection, "nothing was detected"
+    elif not any(estimate[flag.name] for flag in EstimateStatus if flag.present):
+        flags, counts, what = EstimateStatus, estimate, "no pose was estimated"
     else:
         return ""
-    most = stage.most()
-    if most is None or stage.nothing_computed:
+    needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
+    if not needed:
         return ""
-    flag, count = most
-    return f"warning: {what}: {count:,} {flag.name} ({flag.meaning.rstrip('.')})"
+    ((name, count),) = needed.most_common(1)
+    return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"

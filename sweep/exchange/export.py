@@ -7,6 +7,7 @@ import functools
 import hashlib
 import json
 import multiprocessing
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -74,8 +75,8 @@ class Export:
     images, invisible
         Scenes with an image, and scenes without: the marker is not visible, or the lens folds.
     written, kept, damaged
-        Images that were rendered now; that were there, with their digest; and that were there and
-        were not what had been written, of those rendered now.
+        Images that were rendered now; that were there; and of those rendered now, those that an
+        earlier export had listed, and that were missing or had been changed.
     bytes
         Size of the images.
     cameras
@@ -106,8 +107,8 @@ def export(
 ) -> Export:
     """Write the images of an experiment, their truth and camera files into a folder.
 
-    A folder with an unfinished export of the same experiment is continued; images that are there
-    are compared with their digests, and rendered again if they differ.
+    A folder with an unfinished export of the same experiment is continued: images are written
+    whole, so that those that are there are done, unless a finished export listed other digests.
 
     Parameters
     ----------
@@ -153,22 +154,20 @@ def export(
         if not begun:
             _write_experiment(pipeline, target)
             write_whole(target / MARK, json.dumps(mark, indent=2).encode() + b"\n")
-        known = _read_checksums(target / CHECKSUMS)
-        rendering = _rendered_parts(pipeline, target, windowed, known, workers)
-        totals = np.zeros(4, dtype=np.int64)
-        done = 0
-        _write_sorted(target / CHECKSUMS, known)  # a file of its own, whatever lay there
-        with (target / CHECKSUMS).open("a", encoding="utf-8") as checksums:
-            for part in rendering:
-                checksums.writelines(part.lines)
-                checksums.flush()
-                totals += (part.written, part.kept, part.damaged, part.bytes)
-                done += part.scenes
-                if progress is not None:
-                    progress(done, count)
+        damaged = _remove_changed(target)
+        digests: dict[str, str] = {}
+        written = size = done = 0
+        for part in _rendered_parts(pipeline, target, windowed, workers):
+            digests |= part.digests
+            written += part.written
+            size += part.bytes
+            done += part.scenes
+            if progress is not None:
+                progress(done, count)
+        write_whole(target / CHECKSUMS, "".join(
+            f"{digest}  {name}\n" for name, digest in sorted(digests.items())).encode())
         tables = TruthTables(pipeline, windowed)
         tables.write(target)
-        _write_sorted(target / CHECKSUMS)
         cameras = target / "cameras"
         cameras.mkdir(exist_ok=True)
         for camera, name in tables.cameras.items():
@@ -178,10 +177,9 @@ def export(
             title=pipeline.heading, images=tables.images, invisible=tables.invisible,
             windowed=windowed, target=target_word(pipeline),
         ).encode())
-    written, kept, damaged, size = totals.tolist()
     return Export(
-        str(folder), tables.images, tables.invisible, written, kept, damaged, size,
-        len(tables.cameras), time.perf_counter() - started,
+        str(folder), tables.images, tables.invisible, written, len(digests) - written, damaged,
+        size, len(tables.cameras), time.perf_counter() - started,
     )
 
 
@@ -254,48 +252,51 @@ def _write_experiment(pipeline: Pipeline, folder: Path) -> None:
     write_whole(home / "pipeline.toml", pipeline.text.encode())
 
 
+def _remove_changed(folder: Path) -> int:
+    """Delete the images that differ from the digests of an export that was finished here.
+
+    Returns how many of the listed images were missing or had been changed.
+    """
+    try:
+        text = (folder / CHECKSUMS).read_text(encoding="utf-8")
+    except (FileNotFoundError, ValueError):
+        return 0
+    count = 0
+    for digest, name in re.findall(r"^([0-9a-f]{64})  (images/[^/\n]+)$", text, re.MULTILINE):
+        path = folder / name
+        if not path.exists() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            path.unlink(missing_ok=True)
+            count += 1
+    return count
+
+
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What became of a run of scenes: lines of checksums that are new, counts, and bytes."""
+    """What became of a run of scenes: its images' paths and digests, counts, and bytes."""
 
-    lines: list[str]
+    digests: dict[str, str]
     scenes: int
     written: int
-    kept: int
-    damaged: int
     bytes: int
 
 
 def _rendered_parts(
-    pipeline: Pipeline, folder: Path, windowed: bool, known: dict[str, str], workers: int | None
+    pipeline: Pipeline, folder: Path, windowed: bool, workers: int | None
 ) -> Iterator[_Part]:
     """Yield the parts of an export, in this process or from several."""
     count = scene_count(pipeline)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
+    work = functools.partial(write_images, pipeline, folder, windowed)
     if workers is None or workers == 1 or len(parts) == 1:
-        for numbers in parts:
-            yield write_images(pipeline, folder, windowed, numbers, known)
+        yield from map(work, parts)
         return
-    digests: list[dict[str, str]] = [{} for _ in parts]
-    for name, digest in known.items():
-        if 0 <= _number(name) < count:
-            digests[_number(name) // BATCH][name] = digest
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(
-            functools.partial(write_images, pipeline, folder, windowed), parts, digests)
+        yield from pool.map(work, parts)
 
 
-def _number(name: str) -> int:
-    """Return the number of the scene of an image's path; -1 if it has none."""
-    written = name.removeprefix("images/").partition("-")[0]
-    return int(written) if written.isdecimal() else -1
-
-
-def write_images(
-    pipeline: Pipeline, folder: Path, windowed: bool, numbers: range, known: dict[str, str]
-) -> _Part:
-    """Write the images of scenes by their numbers that are missing, or differ from their digests.
+def write_images(pipeline: Pipeline, folder: Path, windowed: bool, numbers: range) -> _Part:
+    """Write the images of scenes by their numbers that are missing.
 
     Raises
     ------
@@ -304,28 +305,20 @@ def write_images(
     """
     batch = image_batch(pipeline, np.array(numbers, dtype=np.intp), windowed=windowed)
     names = batch.names
-    lines: list[str] = []
-    written = kept = damaged = size = 0
+    digests = {}
+    written = size = 0
     for row in np.flatnonzero(batch.visible).tolist():
-        path = f"images/{names[row]}.png"
-        target = folder / path
-        digest = known.get(path)
-        if digest is not None:
-            with contextlib.suppress(OSError):
-                content = target.read_bytes()
-                if hashlib.sha256(content).hexdigest() == digest:
-                    kept += 1
-                    size += len(content)
-                    continue
-            damaged += 1
-        content = encoded_image(batch, row)
-        write_whole(target, content)
-        new = hashlib.sha256(content).hexdigest()
-        if new != digest:
-            lines.append(f"{new}  {path}\n")
-        written += 1
+        name = f"images/{names[row]}.png"
+        path = folder / name
+        if path.exists():
+            content = path.read_bytes()
+        else:
+            content = encoded_image(batch, row)
+            write_whole(path, content)
+            written += 1
+        digests[name] = hashlib.sha256(content).hexdigest()
         size += len(content)
-    return _Part(lines, len(numbers), written, kept, damaged, size)
+    return _Part(digests, len(numbers), written, size)
 
 
 def encoded_image(batch: ImageBatch, row: int) -> bytes:
@@ -338,29 +331,6 @@ def encoded_image(batch: ImageBatch, row: int) -> bytes:
     except (ValueError, ArithmeticError, np.linalg.LinAlgError, cv2.error) as error:
         raise RunError(f"image {batch.names[row]}: {plain(error, 300)}") from None
     return bytes(encoded.tobytes())
-
-
-def _read_checksums(path: Path) -> dict[str, str]:
-    """Return path -> digest of the lines that are whole; of several the last counts."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (FileNotFoundError, ValueError):
-        return {}
-    known = {}
-    for line in text.splitlines(keepends=True):
-        digest, _, name = line.rstrip("\n").partition("  ")
-        if line.endswith("\n") and len(digest) == 64 and name.startswith("images/"):
-            known[name] = digest
-    if not text.endswith("\n"):  # a kill left half a line
-        _write_sorted(path, known)
-    return known
-
-
-def _write_sorted(path: Path, known: dict[str, str] | None = None) -> None:
-    digests = _read_checksums(path) if known is None else known
-    write_whole(path, "".join(
-        f"{digest}  {name}\n" for name, digest in sorted(digests.items())
-    ).encode())
 
 
 def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) -> None:

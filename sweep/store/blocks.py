@@ -16,6 +16,7 @@ from typing import Any, cast
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import Store
+from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
 from sweep.experiment.grid import Block, Blocks
@@ -220,11 +221,11 @@ def drop_block(store: RunStore, block: Block) -> None:
 
 def check_not_replaced(store: RunStore) -> None:
     """Raise StoreReplacedError if another run has replaced the store since it was opened."""
-    try:
-        current = (remote_run_id(store.url) if is_remote(store.url)
-                   else store.run_metadata["run_id"])
-    except KeyError:
-        current = None
+    if is_remote(store.url):
+        current = remote_run_id(store.url)
+    else:
+        root = read_json(LocalStore(store.url, read_only=True), "zarr.json")
+        current = run_metadata_in(root["attributes"]).get("run_id") if root else None
     if current != store.run_id:
         raise StoreReplacedError(
             f"{store.url}: moved, or replaced by another run, while this run was in progress"

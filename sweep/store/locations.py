@@ -8,8 +8,10 @@ import re
 import sys
 import tempfile
 import uuid
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 from urllib.parse import unquote, urlsplit
 
 import zarr
@@ -34,8 +36,9 @@ def check_zarr() -> None:
 # --------------------------------------------------------------------------------------------------
 # Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
 #
-# A remote store's data lie under the run's id, to which the store's URL points, so that no key is
-# written by two runs.
+# No path is written by two runs. On this machine, a run holds its store by the folder that it
+# opened, wherever that is moved; a remote store's data lie under the run's id, to which the
+# store's URL points.
 
 POINTER = "sweep_run"
 """Attribute at a remote store's URL: the id of the run whose data are the store's."""
@@ -197,6 +200,9 @@ def exists(url: str) -> bool:
 def open_storage(url: str, mode: str = "r") -> Store:
     """Return the storage that holds a store's files.
 
+    With ``mode`` "r+" a local store is held by its folder: writes go to that folder even if
+    another store has since taken its path.
+
     Raises
     ------
     StoreError
@@ -210,7 +216,10 @@ def open_storage(url: str, mode: str = "r") -> Store:
     try:
         if not Path(url).is_dir():
             raise StoreError(not_a_store(url))
-        return storage_at(url, read_only=mode == "r")
+        if mode == "r":
+            return storage_at(url, read_only=True)
+        check_zarr()
+        return _HeldStore(_HeldFolder(url))
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
 
@@ -224,6 +233,26 @@ def _similar(url: str) -> str:
         if similar := nearest_file(url) or nearest_file(Path("runs") / Path(url).name):
             return similar
     return "; create one with `sweep run`"
+
+
+class _HeldFolder:
+    """A folder that is held open as long as this object lives."""
+
+    def __init__(self, path: str) -> None:
+        self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        weakref.finalize(self, os.close, self.descriptor)
+
+
+class _HeldStore(LocalStore):
+    """A local storage that holds its folder."""
+
+    def __init__(self, folder: _HeldFolder, *, read_only: bool = False) -> None:
+        super().__init__(f"/proc/self/fd/{folder.descriptor}", read_only=read_only)
+        self._folder = folder
+
+    def with_read_only(self, read_only: bool = False) -> Self:
+        """Return the same folder's storage, to be read only."""
+        return type(self)(self._folder, read_only=read_only)
 
 
 def enclosing_store(path: Path) -> Path | None:

@@ -1,6 +1,5 @@
 """Stores that fit no pipeline, or lead elsewhere: refused in a line, nothing touched outside."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -59,28 +58,21 @@ def see_refused(url, capsys):
     assert "damaged" in said.out if code == 1 else (code, said.err.count("\n")) == (2, 1)
 
 
-SCHEMAS = {
-    "type": lambda c: c.update(data_type="float64"),
-    "huge shape": lambda c: c.update(shape=[2, 1 << 60, 3]),
-    "chunks": lambda c: c["chunk_grid"]["configuration"].update(chunk_shape=[2, 4, 3]),
-    "fill value": lambda c: c.update(fill_value=0.0),
-    "no checksum": lambda c: c.update(codecs=c["codecs"][:2]),
-    "bytes the other way round": lambda c: c["codecs"][0].update(configuration={"endian": "big"}),
-    "dimensions": lambda c: c.update(dimension_names=["trial", "tilt_deg", "xyz"]),
-    "scaled": lambda c: c["attributes"].update(scale_factor=1000.0),
-    "a group": lambda _: {"zarr_format": 3, "node_type": "group", "attributes": {}},
-    "a list": lambda _: [1, 2],
-    "nested too deeply": lambda _: None,
+CHANGED = {
+    "type": lambda text: text.replace('"float32"', '"float64"'),
+    "chunks": lambda text: text.replace('"chunk_shape"', '"chunkshape"'),
+    "scaled": lambda text: text.replace('"attributes":', '"attributes": {"scale_factor": 9}, "x":'),
+    "a list": lambda _: "[1, 2]",
+    "nested too deeply": lambda _: "[" * 100_000,
 }
 
 
-@pytest.mark.parametrize("change", SCHEMAS.values(), ids=SCHEMAS)
-def test_array_of_another_schema_is_refused(change, copied, capsys):
+@pytest.mark.parametrize("change", CHANGED.values(), ids=CHANGED)
+def test_array_whose_metadata_was_changed_is_refused(change, copied, capsys):
     path = copied / "translation_error_m/zarr.json"
-    content = json.loads(path.read_text())
-    changed = change(content)
-    path.write_text("[" * 100_000 if change is SCHEMAS["nested too deeply"]
-                    else json.dumps(content if changed is None else changed))
+    before = path.read_text()
+    path.write_text(change(before))
+    assert path.read_text() != before
     see_refused(copied, capsys)
 
 

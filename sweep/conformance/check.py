@@ -456,10 +456,11 @@ class DetectorTrial:
         setting = self.scenes.setting
         self.record = setting.record() if isinstance(setting, PluginSetting) else None
         self.faults: list[str] = []
-        self.first = self.results(range(len(self.scenes.images)))
-        self.asked, self.found = len(self.first), sum(map(bool, self.first))
+        self.markers_found = self.search(range(SCENES))
+        self.first = [_bits(found) for found in self.markers_found]
+        self.asked, self.found = SCENES, sum(map(bool, self.first))
 
-    def results(self, rows: Sequence[int]) -> list[Found]:
+    def search(self, rows: Sequence[int]) -> list[Found]:
         """Search scenes in an order; return the markers of each."""
         found: list[Found] = []
         for row in rows:
@@ -470,6 +471,10 @@ class DetectorTrial:
                 found.append([])
         return found
 
+    def results(self, rows: Sequence[int]) -> list[bytes]:
+        """Search scenes in an order; return the bits of each result."""
+        return [_bits(found) for found in self.search(rows)]
+
     def markers(self, image: NDArray[np.uint8]) -> Found:
         """Return the markers of an image."""
         corners, ids, _ = self.find(image, self.scenes.dictionary, max(image.shape))
@@ -479,27 +484,9 @@ class DetectorTrial:
             for number, quad in zip(numbers, corners, strict=True)
         ]
 
-    def differing(self, rows: Sequence[int], second: list[Found]) -> int:
-        """Return of how many of some scenes the second results differ by a bit."""
-        return sum(
-            [number for number, _ in self.first[row]] != [number for number, _ in other]
-            or any((a != b).any() for (_, a), (_, b) in zip(self.first[row], other, strict=True))
-            for row, other in zip(rows, second, strict=True)
-        )
-
-    def in_order(self) -> int:
-        """Return how many results differ when all are searched again."""
-        return self.differing(range(self.asked), self.results(range(self.asked)))
-
-    def out_of_order(self) -> int:
-        """Return how many results differ in reverse order, after images of noise."""
-        self.odd()
-        backwards = range(self.asked)[::-1]
-        return self.differing(backwards, self.results(backwards))
-
     def judged(self) -> Outcome:
         """Demand IDs, order of corners and centre of the first pixel as they are declared."""
-        result = conventions(self.first, self.scenes.marker_id, self.scenes.corners_px)
+        result = conventions(self.markers_found, self.scenes.marker_id, self.scenes.corners_px)
         if result is None:
             return FAULT, "no marker was found"
         declared, center = (None, None) if self.record is None else (
@@ -541,20 +528,29 @@ class SolverTrial:
 
     def __init__(self, pipeline: Pipeline, steep: Pipeline) -> None:
         self.pipeline, self.steep = pipeline, steep
-        self.first = self.results(range(SCENES))
-        self.faults = _raised(self.first) or self._faults_of_all()
+        self.cells = run_cells(pipeline.experiment, [np.arange(SCENES)])
+        self.first = self.bits(self.cells)
+        self.faults = _raised(self.cells) or self._faults_of_all()
         self.solved = self.column("estimate") == EstimateStatus.solved
         self.asked = int((self.column("detection") == DetectionStatus.detected).sum())
         self.found = int(self.solved.sum())
 
-    def results(self, rows: Sequence[int]) -> CellsResult:
-        """Return results of scenes that are solved together."""
-        return run_cells(self.pipeline.experiment, [np.array(rows, dtype=np.intp)])
+    def results(self, rows: Sequence[int]) -> list[bytes]:
+        """Solve scenes together; return the bits of each result."""
+        return self.bits(run_cells(self.pipeline.experiment, [np.array(rows, dtype=np.intp)]))
+
+    @staticmethod
+    def bits(cells: CellsResult) -> list[bytes]:
+        """Return the bits of the estimate of each scene."""
+        columns = [column for name, (column,) in cells.columns.items()
+                   if VARIABLES[name].stage is Stage.estimation]
+        return [b"".join(np.asarray(value).tobytes() for value in values)
+                for values in zip(*columns, strict=True)]
 
     def column(self, name: str) -> NDArray[Any]:
         """Return a variable of all scenes."""
-        column: NDArray[Any] = self.first.columns[name][0]
-        return column
+        values: NDArray[Any] = self.cells.columns[name][0]
+        return values
 
     def _faults_of_all(self) -> list[str]:
         """Return what is raised if all detected targets are solved in one call.
@@ -573,26 +569,6 @@ class SolverTrial:
             return [str(error)]
         return []
 
-    def differing(self, rows: Sequence[int], second: CellsResult) -> int:
-        """Return of how many of some scenes the second results differ by a bit."""
-        differ = np.zeros(len(rows), dtype=bool)
-        for name, (column,) in second.columns.items():
-            if VARIABLES[name].stage is Stage.estimation:
-                first = self.column(name)[list(rows)]
-                unlike = (first != column) & ~((first != first) & (column != column))  # noqa: PLR0124
-                differ |= unlike.reshape(len(rows), -1).any(axis=1)
-        return int(differ.sum())
-
-    def in_order(self) -> int:
-        """Return how many results differ when all are solved again."""
-        return self.differing(range(SCENES), self.results(range(SCENES)))
-
-    def out_of_order(self) -> int:
-        """Return how many results differ in reverse order, or alone."""
-        backwards = range(SCENES)[::-1]
-        alone = sum(self.differing([row], self.results([row])) for row in range(SCENES))
-        return max(alone, self.differing(backwards, self.results(backwards)))
-
     def judged(self) -> Outcome:
         """Demand poses of the marker in the camera's frame, in metres."""
         if not self.solved.any():
@@ -609,6 +585,12 @@ class SolverTrial:
     def odd(self) -> list[str]:
         """Solve markers that are seen nearly from the side; return what is raised."""
         return _raised(run_cells(self.steep.experiment, [np.arange(SCENES)]))
+
+
+def _bits(found: Found) -> bytes:
+    """Return the bits of the markers of an image."""
+    return b"".join(number.to_bytes(8, "big", signed=True) + quad.tobytes()
+                    for number, quad in found)
 
 
 def _raised(result: CellsResult) -> list[str]:
@@ -641,12 +623,21 @@ def keeps_conventions(trial: Trial) -> Outcome:
 
 def repeats_itself(trial: Trial) -> Outcome:
     """Demand the same bits for the same input."""
-    return _same(trial.in_order(), "again")
+    return _same(_differing(trial, range(SCENES)), "again")
 
 
 def ignores_order(trial: Trial) -> Outcome:
-    """Demand the same bits in another order, and among other input."""
-    return _same(trial.out_of_order(), trial.order)
+    """Demand the same bits in another order, alone, and after other input."""
+    trial.odd()
+    different = _differing(trial, range(SCENES)[::-1])
+    alone = sum(_differing(trial, [row]) for row in range(SCENES))
+    return _same(max(different, alone), trial.order)
+
+
+def _differing(trial: Trial, rows: Sequence[int]) -> int:
+    """Return how many results differ by a bit when scenes are tried again in an order."""
+    again = trial.results(rows)
+    return sum(trial.first[row] != bits for row, bits in zip(rows, again, strict=True))
 
 
 def survives_odd_input(trial: Trial) -> Outcome:

@@ -272,18 +272,6 @@ def versions_of(kind: str, name: str, record: Plugin) -> tuple[tuple[str, str], 
 # --------------------------------------------------------------------------------------------------
 # Calls of plug-ins: whatever one raises is an error of its own, in one line.
 
-_forks = 0
-"""How often this process was forked by Python's own function."""
-
-
-def _count_fork() -> None:
-    global _forks  # noqa: PLW0603  (the process has one count)
-    _forks += 1
-
-
-os.register_at_fork(after_in_parent=_count_fork)
-
-
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function of the plug-in ``name``; what it prints goes to stderr.
 
@@ -292,29 +280,23 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     Raises
     ------
     PluginError
-        For whatever it raises, also for an attempt to exit, and if it forks; not if memory runs
-        out, or the user interrupts. Workers ignore interrupts: there it raised that itself.
+        For whatever it raises, also for an attempt to exit; not if memory runs out, or the user
+        interrupts. Workers ignore interrupts: there it raised that itself.
     """
-    process, forks = os.getpid(), _forks
+    process = os.getpid()
     try:
         with contextlib.redirect_stdout(sys.stderr):
-            returned = function(*arguments)
+            return function(*arguments)
     except MemoryError:
         raise
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) and not _ignores_interrupts():
+        ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        if isinstance(error, KeyboardInterrupt) and not ignored:
             raise  # the user's
         raise PluginError(f"{name}: raises {exception_line(error)}") from error
     finally:
         if os.getpid() != process:
             os._exit(1)
-    if forks != _forks:
-        raise PluginError(f"{name}: forks the process that it runs in; start a program instead")
-    return returned
-
-
-def _ignores_interrupts() -> bool:
-    return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def real_numbers(name: str, what: str, returned: Any) -> Floats:

@@ -49,18 +49,11 @@ changes = at(lambda image: (image.fill(0), ([], []))[1])
 raises = at(lambda image: open("model.onnx"))
 exits = at(lambda image: os.sys.exit(3))
 
-def forking(image):
-    if os.fork() == 0:
-        os._exit(0)
-    os.wait()
-    return [], []
-
 def talking(image):
     print("found nothing")
     return [], []
 
 aborts = at(lambda image: os.abort())
-forks = at(forking)
 prints = at(talking)
 never_made = lambda settings, family: 1 / 0
 no_function = lambda settings, family: 3
@@ -101,7 +94,6 @@ def pipeline(tmp_path):
     ("changes", "changed the image that it was given; copy it first"),
     ("raises", "raises FileNotFoundError"),
     ("exits", "raises SystemExit: 3"),
-    ("forks", "forks the process that it runs in"),
 ])
 def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, name, told):
     bad = pipeline(name)

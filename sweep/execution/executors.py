@@ -21,9 +21,9 @@ from sweep.isolation.child_process import (
     ChildDiedError,
     ChildRaisedError,
     Interrupts,
+    explained,
     last_line,
 )
-from sweep.isolation.machine import explained
 from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------

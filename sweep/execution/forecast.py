@@ -27,8 +27,13 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs, shows_photographs
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import bytes_per_block
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.isolation.machine import default_workers
+from sweep.isolation.child_process import (
+    Child,
+    ChildDiedError,
+    ChildRaisedError,
+    default_workers,
+    last_line,
+)
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule

@@ -23,7 +23,7 @@ from sweep.execution.block_task import compute_blocks
 from sweep.execution.executors import MAX_ATTEMPTS, Executor, Failed
 from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.machine import ADVICE
+from sweep.isolation.child_process import ADVICE
 from sweep.messages import notice
 from sweep.processor import differing_processors, processor
 from sweep.store.provenance import changes, fingerprint

@@ -52,9 +52,8 @@ from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import MAX_TRIALS
-from sweep.isolation.child_process import Child, Interrupts
+from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
-from sweep.isolation.machine import default_workers
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks

@@ -8,7 +8,6 @@ import json
 import os
 import pickle
 import signal
-import struct
 import subprocess
 import sys
 import threading
@@ -16,15 +15,15 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, wait
+from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Self, TypeVar
+from typing import IO, Any, Self, TypeVar, cast
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
-from sweep.isolation.machine import be_killed_before_others
 
 # --------------------------------------------------------------------------------------------------
-# Child processes: started on one thread each, and how they ended.
+# Child processes: how many, on one thread each, and how they ended.
 
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -37,6 +36,15 @@ SINGLE_THREADED = {
 OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
 """Signals that the system or its users send, too little memory or space among their reasons: what
 a scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status."""
+
+ADVICE = "use fewer workers, or give them more memory"
+
+
+def default_workers() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def ending(code: int) -> str:
@@ -51,6 +59,15 @@ def ending(code: int) -> str:
     return f"exit status {code}"
 
 
+def explained(death: object) -> str:
+    """Return how a child process ended; of SIGKILL, what that may mean.
+
+    >>> explained("SIGKILL")
+    'SIGKILL, as where memory runs out: use fewer workers, or give them more memory'
+    """
+    return f"SIGKILL, as where memory runs out: {ADVICE}" if str(death) == "SIGKILL" else str(death)
+
+
 # --------------------------------------------------------------------------------------------------
 # Function calls in a child process, which may crash or never return.
 #
@@ -60,7 +77,8 @@ def ending(code: int) -> str:
 GRACE_S = 30.0
 """How long after its limit a child that did not end itself is killed."""
 
-_LENGTH = struct.Struct("<Q")
+PARENT_S = 1.0
+"""How often a child looks whether its caller still lives."""
 
 
 class ChildDiedError(Exception):
@@ -113,13 +131,14 @@ class Child:
         self._start()
 
     def _start(self) -> None:
-        self._killed_late = False
         self._process = subprocess.Popen(  # noqa: S603  (this program)
             [sys.executable, "-P", "-c", _START, json.dumps(sys.path), self._module],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, **SINGLE_THREADED},
             start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
         )
+        self._pipes = cast(
+            "tuple[IO[bytes], IO[bytes]]", (self._process.stdin, self._process.stdout))
 
     def restart(self) -> None:
         """Start another process in place of one that ended."""
@@ -155,42 +174,36 @@ class Child:
             If the call raised; a `SweepError` is raised as it is, and a fault of the machine as
             `MachineFaultError`.
         """
+        requests, answers = self._pipes
         started = time.monotonic()
-        killer = threading.Timer(limit_s + grace_s, self._kill_late)
+        killer = threading.Timer(limit_s + grace_s, self._process.kill)
         killer.daemon = True
         killer.start()
+        request = pickle.dumps((function, arguments, limit_s), pickle.HIGHEST_PROTOCOL)
         try:
-            _send(self._process.stdin, (function, arguments, limit_s))
-            raised, result = _receive(self._process.stdout)
+            requests.write(request)
+            requests.flush()
+            raised, result = pickle.load(answers)  # noqa: S301  (from this program's own child)
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise self._death(time.monotonic() - started, limit_s) from None
+            took_s, code = time.monotonic() - started, self._process.wait()
+            self.close()
+            # The child ends itself with status 1 (`watchdog.ending_after`).
+            if took_s >= limit_s + (0.0 if code == 1 else grace_s):
+                raise ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True) from None
+            raise ChildDiedError(ending(code)) from None
         finally:
             killer.cancel()
         if raised:
             raise result if isinstance(result, SweepError) else ChildRaisedError(result)
         return result
 
-    def _kill_late(self) -> None:
-        self._killed_late = True
-        self._process.kill()
-
-    def _death(self, took_s: float, limit_s: float) -> ChildDiedError:
-        """Return the error that says how the process ended; wait until it did."""
-        code = self._process.wait()
-        self.close()
-        # The child ends itself with status 1 (`watchdog.ending_after`).
-        if self._killed_late or (code == 1 and took_s >= limit_s):
-            return ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True)
-        return ChildDiedError(ending(code))
-
     def close(self) -> None:
         """End the child."""
         self._process.kill()
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    pipe.close()
+        for pipe in self._pipes:
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
 
 
 _START = (
@@ -201,10 +214,12 @@ _START = (
 
 def serve(module: str) -> None:
     """Import a module, then answer calls until the caller closes the pipe; what the child runs."""
+    threading.Thread(target=_end_after, args=(os.getppid(),), daemon=True).start()
     # What libraries print must not mix with the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    be_killed_before_others(1000)
+    with contextlib.suppress(OSError):  # it is killed before others if memory runs out
+        Path("/proc/self/oom_score_adj").write_text("1000")
     # It has a session of its own: whoever interrupts, the caller ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(Exception):
@@ -212,46 +227,26 @@ def serve(module: str) -> None:
     # Numba is slow to import, and the caller needs none of it.
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 
-    while True:
+    while sys.stdin.buffer.peek(1):
         answer: tuple[bool, Any]
         try:
-            request = _message(sys.stdin.buffer)
-            if request is None:
-                return
-            function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (from the parent)
+            function, arguments, limit_s = pickle.load(  # noqa: S301  (from the parent)
+                sys.stdin.buffer)
             with ending_after(limit_s):
                 answer = (False, function(*arguments))
         except SweepError as error:
             answer = (True, error)
         except Exception as error:
             answer = (True, machine_fault(error) or traceback.format_exc())
-        _send(answers, answer)
+        answers.write(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
+        answers.flush()
 
 
-def _send(pipe: IO[bytes] | None, content: Any) -> None:
-    encoded = pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
-    if pipe is None:
-        raise EOFError
-    pipe.write(_LENGTH.pack(len(encoded)))
-    pipe.write(encoded)
-    pipe.flush()
-
-
-def _receive(pipe: IO[bytes] | None) -> Any:
-    encoded = None if pipe is None else _message(pipe)
-    if encoded is None:
-        raise EOFError
-    return pickle.loads(encoded)  # noqa: S301  (from this program's own child)
-
-
-def _message(pipe: IO[bytes]) -> bytes | None:
-    """Return the next message; None if the pipe was closed."""
-    header = pipe.read(_LENGTH.size)
-    if len(header) < _LENGTH.size:
-        return None
-    (length,) = _LENGTH.unpack(header)
-    encoded = pipe.read(length)
-    return encoded if len(encoded) == length else None
+def _end_after(parent: int) -> None:
+    """End this process when its parent has ended, whatever it computes."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_S)
+    os._exit(1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -261,11 +256,6 @@ Result = TypeVar("Result")
 
 POLL_S = 0.2
 """How often Ctrl-C is checked while a result is awaited."""
-
-
-def in_main_thread() -> bool:
-    """Return whether this is the thread in which Python handles signals."""
-    return threading.current_thread() is threading.main_thread()
 
 
 class Interrupts:
@@ -283,7 +273,8 @@ class Interrupts:
         self._before: Any = None
 
     def __enter__(self) -> Self:
-        if in_main_thread() and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
             self._before = signal.signal(signal.SIGINT, self._note)
         return self
 

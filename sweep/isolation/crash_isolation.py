@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,16 +15,20 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
-from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.experiment import scene_plugins
-from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.isolation.machine import explained
+from sweep.isolation.child_process import (
+    Child,
+    ChildDiedError,
+    ChildRaisedError,
+    explained,
+    last_line,
+)
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plugins.declared import PluginSetting
+from sweep.store.outcome import selected
 
 # --------------------------------------------------------------------------------------------------
 # Scenes that crash their process or never return, isolated in child processes.
@@ -32,15 +37,11 @@ from sweep.plugins.declared import PluginSetting
 # that never returns keeps within it:
 #
 # - T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
-# - 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each
-# (:data:`PIECE`);
+# - 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
 # - T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering,
-# each
-#   detector setting, each estimator; the limit is halved each time one runs out, and such a part
-# is
-#   tried once more;
-# - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while
-# code
+#   each detector setting, each estimator; the limit is halved each time one runs out, and such a
+#   part is tried once more;
+# - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
 #   is compiled or loaded.
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
@@ -50,7 +51,8 @@ LOADING, LOADING_S = 1 / 16, 15.0
 """Additional time of the first call in a child: a share of the limit, at most so many seconds."""
 
 DEATHS = 3
-"""How many fresh processes a part of a scene must end, one after another, to be flagged."""
+"""How many fresh processes a part of a scene must end, one after another, to be flagged; one that
+never returns counts for two."""
 
 MIN_S = 1.0
 """Least time limit of a part of a scene."""
@@ -78,8 +80,9 @@ class _IsolatedCells:
 
     def __init__(self, pipeline: Pipeline, limit_s: float) -> None:
         self._pipeline = pipeline
-        self.limit_s = limit_s
+        self._limit_s = limit_s
         self._child: Child | None = None
+        self._share = PART
         self.chances: list[str] = []
         """Deaths that did not come again when the same part of a scene was repeated."""
 
@@ -93,20 +96,16 @@ class _IsolatedCells:
         MachineFaultError
             If a child cannot be started, or raises what no scene's data can cause.
         """
-        limit_s = share * self.limit_s
+        limit_s = max(share * self._limit_s, MIN_S)
         if self._child is None:
             with machine_faults_raised():
-                child = Child()
+                self._child = Child()
             try:
-                child.call(_hold, self._pipeline, limit_s=HOLD_S)
+                self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except (ChildDiedError, ChildRaisedError) as error:
-                child.close()
-                how = explained(last_line(error))
-                raise local_fault(
-                    f"a child process ended before it computed anything: {how}"
-                ) from None
-            self._child = child
-            limit_s += min(LOADING * self.limit_s, LOADING_S)
+                raise local_fault("a child process ended before it computed anything: "
+                                  f"{explained(last_line(error))}") from None
+            limit_s += min(LOADING * self._limit_s, LOADING_S)
         try:
             result: CellsResult = self._child.call(_run_held, *arguments, limit_s=limit_s)
         except ChildDiedError:
@@ -114,33 +113,97 @@ class _IsolatedCells:
             raise
         return result
 
-    def fault(self, death: ChildDiedError, indices: Sequence[NDArray[np.intp]]) -> Exception:
-        """Return the machine's fault that ended the child again while it computed one scene."""
-        return local_fault(
-            f"two processes that computed one scene were ended by {explained(death)}; "
-            f"it is --at {self.selected(indices)}"
-        )
+    def scene(self, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_]) -> CellsResult:
+        """Return the cells of a scene that crashes its process, never returns, or raises.
 
-    def selected(
-        self, indices: Sequence[NDArray[np.intp]], setting: int | None = None,
-        estimator: int | None = None,
-    ) -> str:
-        """Return a scene, and what of it is computed, in the form that `--at` takes."""
-        pipeline = self._pipeline
-        values = [
-            axis.values[int(index[0])]
-            for axis, index in zip(pipeline.experiment.scene_axes, indices, strict=True)
-        ]
-        names = (axis.name for axis in pipeline.experiment.scene_axes)
-        named = dict(zip(names, values, strict=True))
-        for stage, number in ((Stage.detection, setting), (Stage.estimation, estimator)):
-            axes = pipeline.axes_of(stage)
-            if number is not None and axes:
-                steps = np.unravel_index(number, [len(axis) for axis in axes])
-                named |= {
-                    axis.name: axis.values[int(i)] for axis, i in zip(axes, steps, strict=True)
-                }
-        return selection_text(named)
+        Its parts are computed one after another, each in addition to those that it depends on:
+        rendering, each detector setting, each estimator. The results of those that work are
+        joined, the others are flagged.
+        """
+        estimators = need.shape[2]
+        result = self._part(Failure(0, "scene", ""), indices, need)
+        rendered = isinstance(result, CellsResult)
+        failures = [] if isinstance(result, CellsResult) else [result]
+        joined = result if isinstance(result, CellsResult) else CellsResult.not_run(
+            self._pipeline.experiment, 1)
+
+        def works(stage: str, number: int, setting: int, estimator: int | None = None) -> bool:
+            part = self._part(Failure(0, stage, "", setting, estimator), indices, need)
+            if isinstance(part, Failure):
+                failures.append(part)
+                flags = DetectionStatus if estimator is None else EstimateStatus
+                name = "detection" if estimator is None else "estimate"
+                joined.columns[name][number][:] = flags["crashed" if part.crashed else "failed"]
+                return False
+            for variable in self._pipeline.experiment.variables:
+                if variable.stage.name == stage:
+                    column = part.columns[variable.name][number]
+                    joined.columns[variable.name][number] = column
+            joined.seconds[stage][number] = part.seconds[stage][number]
+            joined.row_seconds += part.row_seconds
+            known = {(each.stage, each.setting, each.estimator) for each in failures}
+            failures.extend(each for each in part.failures
+                            if (each.stage, each.setting, each.estimator) not in known)
+            return True
+
+        failures += joined.failures
+        for k in np.flatnonzero(need[0].any(axis=1)).tolist():
+            searched = rendered and works("detection", k, k)
+            if not rendered:
+                crashed = failures[0].crashed
+                joined.columns["detection"][k][:] = DetectionStatus[
+                    "crashed" if crashed else "failed"]
+            for j in np.flatnonzero(need[0, k]).tolist():
+                number = k * estimators + j
+                if not searched:
+                    joined.columns["estimate"][number][:] = EstimateStatus.no_detection
+                if not (searched and works("estimation", number, k, j)):
+                    joined.columns["flipped"][number][:] = Flipped.no_estimate
+        joined.failures = failures
+        return joined
+
+    def _part(
+        self, part: Failure, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_]
+    ) -> CellsResult | Failure:
+        """Compute a part of a scene, named as its failure would be; else return why not.
+
+        Raises
+        ------
+        MachineFaultError
+            If two processes are ended by signals from outside, which is no chance.
+        """
+        solve, search = np.zeros_like(need), np.zeros_like(need[..., 0])
+        if part.estimator is not None:
+            solve[0, part.setting, part.estimator] = True
+        elif part.setting is not None:
+            search[0, part.setting] = True
+        deaths: list[ChildDiedError] = []
+        outside = 0
+        while len(deaths) + sum(death.timed_out for death in deaths) < DEATHS:
+            try:
+                result = self.run(self._share, indices, solve, search)
+            except ChildRaisedError as error:
+                return dataclasses.replace(part, text=str(error))
+            except ChildDiedError as death:
+                outside += death.from_outside
+                if outside > 1:
+                    raise local_fault(
+                        f"two processes that computed one scene were ended by {explained(death)}; "
+                        f"it is --at {self._selected(part, indices)}") from None
+                if death.timed_out:
+                    self._share /= 2
+                if not death.from_outside:
+                    deaths.append(death)
+            else:
+                if deaths:
+                    self.chances.append(f"--at {self._selected(part, indices)} ended a process by "
+                                        f"{deaths[0]}, and not when it was repeated")
+                return result
+        return dataclasses.replace(part, text=str(deaths[0]), crashed=True)
+
+    def _selected(self, part: Failure, indices: Sequence[NDArray[np.intp]]) -> str:
+        """Return a part of a scene in the form that `--at` takes."""
+        return selected(self._pipeline, [int(index[0]) for index in indices], part)
 
     def close(self) -> None:
         """End the child process."""
@@ -192,8 +255,7 @@ def run_cells_isolated(
                 if len(rows) > 1:
                     waiting.extendleft(reversed(_pieces(rows)))
                 else:
-                    scene = _Scene(isolated, pipeline, chosen, need[rows])
-                    done[int(rows[0])] = scene.compute()
+                    done[int(rows[0])] = isolated.scene(chosen, need[rows])
     finally:
         isolated.close()
     cells = concatenate([done[start] for start in sorted(done)])
@@ -208,136 +270,6 @@ def run_cells_isolated(
 
 def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     return list(np.array_split(rows, min(PIECES, len(rows))))
-
-
-class _Scene:
-    """One scene that crashes its process, never returns, or raises as a whole.
-
-    Its parts are computed one after another, each in addition to those that it depends on:
-    rendering, each detector setting, each estimator. The results of those that work are joined.
-    """
-
-    def __init__(
-        self, isolated: _IsolatedCells, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]],
-        need: NDArray[np.bool_],
-    ) -> None:
-        self._isolated = isolated
-        self._pipeline = pipeline
-        self._indices = indices
-        self._need = need
-        self._share = PART
-        self._failures: list[Failure] = []
-        self._result = CellsResult.not_run(pipeline.experiment, 1)
-
-    def compute(self) -> CellsResult:
-        """Return the scene's cells; those that do not work are flagged."""
-        estimators = self._need.shape[2]
-        rendered = self._works(Stage.scene)
-        for k in np.flatnonzero(self._need[0].any(axis=1)).tolist():
-            searched = rendered and self._works(Stage.detection, k)
-            if not searched:
-                self._flag("detection", k, DetectionStatus, k if rendered else None)
-            for j in np.flatnonzero(self._need[0, k]).tolist():
-                number = k * estimators + j
-                if not searched:
-                    self._set("estimate", number, EstimateStatus.no_detection)
-                elif not self._works(Stage.estimation, k, j):
-                    self._flag("estimate", number, EstimateStatus, k, j)
-                else:
-                    continue
-                self._set("flipped", number, Flipped.no_estimate)
-        self._result.failures = self._failures
-        return self._result
-
-    def _works(
-        self, stage: Stage, setting: int | None = None, estimator: int | None = None
-    ) -> bool:
-        """Compute a part of the scene and take its results; else note why it does not work."""
-        solve, search = np.zeros_like(self._need), np.zeros_like(self._need[..., 0])
-        if estimator is not None:
-            solve[0, setting, estimator] = True
-        elif setting is not None:
-            search[0, setting] = True
-        deaths: list[str] = []
-        while True:
-            try:
-                part = self._undisturbed(solve, search)
-            except ChildRaisedError as error:
-                self._failures.append(Failure(0, stage.name, str(error), setting, estimator))
-                return False
-            except ChildDiedError as death:
-                deaths.append(str(death))
-                if death.timed_out:
-                    self._share = max(self._share / 2, MIN_S / self._isolated.limit_s)
-                if len(deaths) == (DEATHS - 1 if death.timed_out else DEATHS):
-                    self._failures.append(
-                        Failure(0, stage.name, deaths[0], setting, estimator, crashed=True)
-                    )
-                    return False
-            else:
-                break
-        if deaths:
-            at = self._isolated.selected(self._indices, setting, estimator)
-            self._isolated.chances.append(
-                f"--at {at} ended a process by {deaths[0]}, and not when it was repeated"
-            )
-        self._take(part, stage, setting, estimator)
-        return True
-
-    def _undisturbed(
-        self, solved: NDArray[np.bool_], searched: NDArray[np.bool_]
-    ) -> CellsResult:
-        """Compute parts of the scene, again if a signal from outside ends it.
-
-        Raises
-        ------
-        MachineFaultError
-            If one does so again, which is no chance.
-        """
-        for last in (False, True):
-            try:
-                return self._isolated.run(self._share, self._indices, solved, searched)
-            except ChildDiedError as death:
-                if not death.from_outside:
-                    raise
-                if last:
-                    raise self._isolated.fault(death, self._indices) from None
-        raise AssertionError(solved)
-
-    def _take(
-        self, part: CellsResult, stage: Stage, setting: int | None, estimator: int | None
-    ) -> None:
-        """Take the columns, seconds and failures of a part that was computed alone."""
-        if stage is Stage.scene:  # of the other stages nothing was run
-            self._result = part
-        else:
-            number = (setting or 0) * (1 if estimator is None else self._need.shape[2])
-            number += estimator or 0
-            for variable in self._pipeline.experiment.variables:
-                if variable.stage is stage:
-                    column = part.columns[variable.name][number]
-                    self._result.columns[variable.name][number] = column
-            self._result.seconds[stage.name][number] = part.seconds[stage.name][number]
-            self._result.row_seconds += part.row_seconds
-        noted = {(failure.stage, failure.setting, failure.estimator) for failure in self._failures}
-        self._failures += [
-            failure for failure in part.failures
-            if (failure.stage, failure.setting, failure.estimator) not in noted
-        ]
-
-    def _flag(
-        self, name: str, number: int, flags: type[DetectionStatus | EstimateStatus],
-        setting: int | None, estimator: int | None = None,
-    ) -> None:
-        """Flag a cell as the failure of the part that it lacks says."""
-        crashed = any(
-            failure.crashed for failure in self._failures
-            if (failure.setting, failure.estimator) == (setting, estimator)
-        )
-        self._set(name, number, flags["crashed" if crashed else "failed"])
-
-    def _set(self, name: str, number: int, flag: int) -> None:
-        self._result.columns[name][number][:] = flag
 
 
 # --------------------------------------------------------------------------------------------------

@@ -53,13 +53,13 @@ def recorded(
             continue
         left[kind] -= 1
         kept.append(FailedCell(
-            _at(pipeline, block.cell(rows[failure.scene]), failure), kind, failure.stage,
+            selected(pipeline, block.cell(rows[failure.scene]), failure), kind, failure.stage,
             failure.text[-MAX_CHARACTERS:],
         ))
     return tuple(kept)
 
 
-def _at(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
+def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
     """Return the coordinates of a failure's cell, as ``sweep repro --at`` takes them."""
     indices = {axis.name: k for axis, k in zip(pipeline.experiment.scene_axes, cell, strict=True)}
     for number, stage in (

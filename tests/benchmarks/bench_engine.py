@@ -28,7 +28,7 @@ from sweep.execution.forecast import forecast, seconds_of
 from sweep.execution.runner import execute
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.machine import default_workers
+from sweep.isolation.child_process import default_workers
 
 GRID = """
 seed = 1

@@ -227,11 +227,11 @@ def serve(module: str) -> None:
     # Numba is slow to import, and the caller needs none of it.
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 
-    while sys.stdin.buffer.peek(1):
+    requests: Any = sys.stdin.buffer
+    while requests.peek(1):
         answer: tuple[bool, Any]
         try:
-            function, arguments, limit_s = pickle.load(  # noqa: S301  (from the parent)
-                sys.stdin.buffer)
+            function, arguments, limit_s = pickle.load(requests)  # noqa: S301  (from the parent)
             with ending_after(limit_s):
                 answer = (False, function(*arguments))
         except SweepError as error:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
@@ -20,7 +19,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import alike
 from sweep.experiment.schema import Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.scene import build_scenes
 from sweep.store.blocks import RunStore, check_whole, receipts, region
 from sweep.store.provenance import changes, fingerprint
 from sweep.typing import Masks
@@ -28,44 +26,19 @@ from sweep.typing import Masks
 # --------------------------------------------------------------------------------------------------
 # Where the cells of a new grid lie in an old one: cells agree where all parameter values do.
 #
-# Whether a parameter is fixed, an axis of its own, or goes together with others does not matter.
-# Axes of both grids that share parameters are matched together, by the key of each cell: the
-# values of these parameters.
+# Whether a parameter is fixed, an axis of its own, or goes together with others does not matter:
+# a cell of the new grid gives every parameter a value, and these are looked up in the old grid.
 
-@dataclass(slots=True)
-class Group:
-    """Axes of two grids that share parameters.
+class Key(NamedTuple):
+    """Parameters that are looked up together, and what finds a row of their values.
 
-    Attributes
-    ----------
-    new, old
-        The axes of either grid.
+    Those of an axis of the old grid: the index along it, None if it has no such row. Or one that
+    the old grid keeps fixed: 0 if it is the same.
     """
 
-    new: list[Axis] = field(default_factory=list)
-    old: list[Axis] = field(default_factory=list)
-
-    @property
-    def parameters(self) -> set[str]:
-        """The parameters of its axes."""
-        return {name for axis in (*self.new, *self.old) for name in axis.columns}
-
-    @property
-    def names(self) -> str:
-        """Its axes in words."""
-        return ", ".join(dict.fromkeys(axis.name for axis in (*self.new, *self.old)))
-
-
-def groups(new: Pipeline, old: Pipeline) -> list[Group]:
-    """Return the axes of two grids, those together that share parameters."""
-    found: list[Group] = []
-    for axis, is_new in [*((a, True) for a in new.axes), *((a, False) for a in old.axes)]:
-        merged = Group([axis] if is_new else [], [] if is_new else [axis])
-        for group in [group for group in found if group.parameters & axis.columns.keys()]:
-            found.remove(group)
-            merged = Group(group.new + merged.new, group.old + merged.old)
-        found.append(merged)
-    return found
+    axis: str | None
+    parameters: tuple[str, ...]
+    find: Callable[[tuple[Any, ...]], int | None]
 
 
 def fixed_value(pipeline: Pipeline, name: str) -> Any:
@@ -73,78 +46,63 @@ def fixed_value(pipeline: Pipeline, name: str) -> Any:
     return 0 if name == TRIAL else pipeline.fixed.get(name)
 
 
-def row_index(axis: Axis) -> Callable[[tuple[Any, ...]], int | None]:
-    """Return what gives the index along an axis of a row of its columns' values, or None."""
+def _axis_key(axis: Axis) -> Key:
+    names = tuple(axis.columns)
     first, *others = axis.columns.values()
     if isinstance(first, range) and not others:  # of trials, which may be many
-        return lambda row: first.index(row[0]) if row[0] in first else None
-    return {row: k for k, row in enumerate(zip(first, *others, strict=True))}.get
+        return Key(axis.name, names, lambda row: first.index(row[0]) if row[0] in first else None)
+    rows = {row: k for k, row in enumerate(zip(first, *others, strict=True))}
+    return Key(axis.name, names, rows.get)
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An old store, and where the cells of a new grid lie in it.
+    """An old store, and how the cells of a new grid are found in it.
 
     Attributes
     ----------
     store
         The old store.
-    new, old
-        Both grids, with values in the same words.
-    groups
-        Their axes that share parameters.
+    new
+        The new grid, with values in the old one's words.
     done
         Numbers of the old store's committed blocks.
+    keys
+        What is looked up of each cell.
     """
 
     store: RunStore
     new: Pipeline
-    old: Pipeline
-    groups: list[Group]
     done: frozenset[int]
-    _rows: dict[str, Callable[[tuple[Any, ...]], int | None]]
+    keys: tuple[Key, ...]
 
     @staticmethod
     def of(new: Pipeline, store: RunStore, done: frozenset[int]) -> Source:
-        """Return where the cells of a new grid lie in a store."""
+        """Return how the cells of a new grid are found in a store."""
         new, old = alike(new, store.pipeline)
-        rows = {axis.name: row_index(axis) for axis in old.axes}
-        return Source(store, new, old, groups(new, old), done, rows)
+        keys = [_axis_key(axis) for axis in old.axes]
+        owned = {name for key in keys for name in key.parameters}
+        keys += [Key(None, (name,), {(fixed_value(old, name),): 0}.get)
+                 for axis in new.axes for name in axis.columns if name not in owned]
+        return Source(store, new, done, tuple(keys))
 
-    def cells_in(
-        self, group: Group, along: Sequence[range]
-    ) -> Iterator[tuple[int, tuple[int, ...]]]:
-        """Yield the cells of a group that both grids have.
+    def axes_of(self, key: Key) -> list[Axis]:
+        """Return the new axes that have a key's parameters."""
+        return [axis for axis in self.new.axes
+                if not axis.columns.keys().isdisjoint(key.parameters)]
 
-        Parameters
-        ----------
-        group
-            The group.
-        along
-            The indices along each new axis that are looked for.
-
-        Yields
-        ------
-        The number of the new cell within ``along``, the last axis fastest; its index along each
-        old axis.
-        """
-        owned = {name for axis in group.old for name in axis.columns}
-        fixed = {name: fixed_value(self.new, name) for name in group.parameters}
-        others = [(name, fixed_value(self.old, name)) for name in group.parameters - owned]
-        for number, chosen in enumerate(itertools.product(*along)):
+    def found(self, key: Key, along: Sequence[range]) -> Iterator[int | None]:
+        """Yield what a key finds for each combination of indices along its new axes, in order."""
+        fixed = {name: fixed_value(self.new, name) for name in key.parameters}
+        axes = self.axes_of(key)
+        for chosen in itertools.product(*along):
             values = dict(fixed)
-            for axis, index in zip(group.new, chosen, strict=True):
+            for axis, index in zip(axes, chosen, strict=True):
                 values |= axis.at(index)
-            if any(values[name] != value for name, value in others):
-                continue
-            at = [self._rows[axis.name](tuple(values[name] for name in axis.columns))
-                  for axis in group.old]
-            found = tuple(index for index in at if index is not None)
-            if len(found) == len(at):
-                yield number, found
+            yield key.find(tuple(values[name] for name in key.parameters))
 
     def located(
-        self, order: Sequence[str], cuts: dict[str, range]
+        self, order: Sequence[str], cuts: Mapping[str, range]
     ) -> tuple[Masks, dict[str, NDArray[np.intp]]]:
         """Return which cells of a box of the new grid the old one has, and where.
 
@@ -162,21 +120,16 @@ class Source:
         shape = tuple(len(cuts[name]) for name in order)
         exists = np.ones(shape, dtype=bool)
         indices: dict[str, NDArray[np.intp]] = {}
-        for group in self.groups:
-            names = [axis.name for axis in group.new]
+        for key in self.keys:
+            names = [axis.name for axis in self.axes_of(key)]
             along = [cuts[name] for name in names]
-            found = np.zeros([len(part) for part in along], dtype=bool)
-            at = np.zeros([len(group.old), *found.shape], dtype=np.intp)
-            flat = at.reshape(len(group.old), found.size)
-            for number, index in self.cells_in(group, along):
-                found.reshape(-1)[number] = True
-                flat[:, number] = index
-            within = [name for name in order if name in names]
-            axes = [names.index(name) for name in within]
-            spread = tuple(slice(None) if name in names else None for name in order)
-            exists &= found.transpose(axes)[spread]
-            for axis, part in zip(group.old, at, strict=True):
-                indices[axis.name] = np.broadcast_to(part.transpose(axes)[spread], shape)
+            at = np.array([-1 if index is None else index for index in self.found(key, along)])
+            axes = [names.index(name) for name in order if name in names]
+            spread = at.reshape([len(part) for part in along]).transpose(axes)[
+                tuple(slice(None) if name in names else None for name in order)]
+            exists &= spread >= 0
+            if key.axis is not None:
+                indices[key.axis] = np.broadcast_to(spread, shape)
         return exists, indices
 
 
@@ -206,21 +159,23 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     old = store.pipeline
     mine, theirs = fingerprint(pipeline), store.fingerprint
     # A file that only one of them refers to is a value that only one of them has.
-    for key in ("files", "plugins"):  # as of a plug-in
-        shared = mine.get(key, {}).keys() & theirs.get(key, {}).keys()
+    for part in ("files", "plugins"):  # as of a plug-in
+        shared = mine.get(part, {}).keys() & theirs.get(part, {}).keys()
         for stamp in (mine, theirs):
-            stamp[key] = {name: stamp[key][name] for name in sorted(shared)}
+            stamp[part] = {name: stamp[part][name] for name in sorted(shared)}
     faults = [
-        f"{key}: the store has {json.dumps(old_value)}, this run {json.dumps(value)}"
-        for key, old_value, value in changes(theirs, mine)
+        f"{part}: the store has {json.dumps(old_value)}, this run {json.dumps(value)}"
+        for part, old_value, value in changes(theirs, mine)
     ]
     present = {variable.name for variable in store.variables}
     faults += [
         f"{variable.name}: not a variable of the store"
         for variable in pipeline.experiment.variables
-        if variable.name not in present and not _follows(variable)
+        if variable.name not in present and not variable.drawn_as
     ]
+    source = Source.of(pipeline, store, frozenset(check_whole(store)))
     pipeline, old = alike(pipeline, old)
+    drawn = pipeline.distributions.keys() | old.distributions.keys()
     for name in dict.fromkeys((*pipeline.parameters, *old.parameters, TRIAL)):
         if pipeline.distributions.get(name) != old.distributions.get(name):
             faults.append(f"{name}: not drawn from the same distribution in both")
@@ -229,17 +184,16 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
             and pipeline.fixed[name] != old.fixed[name]
         ):
             faults.append(_difference(pipeline, old, name))
-    source = Source.of(pipeline, store, frozenset(check_whole(store)))
-    for group in source.groups:
-        if len(group.new) > 1 or len(group.old) > 1 or group.parameters & (
-                pipeline.distributions.keys() | old.distributions.keys()):
-            continue  # matched cell by cell, or a fault that is noted already
-        whole = [range(len(axis)) for axis in group.new]
-        if next(source.cells_in(group, whole), None) is None:
-            first, *others = sorted(group.parameters)
+    for key in source.keys:
+        axes = source.axes_of(key)
+        if len(axes) > 1 or drawn.intersection(key.parameters):
+            continue  # looked up cell by cell, or a fault that is noted already
+        if all(index is None for index in source.found(key, [range(len(axis)) for axis in axes])):
+            names = dict.fromkeys([*(axis.name for axis in axes), key.axis or key.parameters[0]])
             faults.append(
-                f"{group.names}: no values of {', '.join([first, *others])} go together in both"
-                if others else _difference(pipeline, old, first)
+                f"{', '.join(names)}: no values of {', '.join(sorted(key.parameters))} go together "
+                "in both" if len(key.parameters) > 1
+                else _difference(pipeline, old, key.parameters[0])
             )
     if faults:
         listed = "\n".join(f"  {fault}" for fault in faults)
@@ -318,8 +272,13 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
             cells = np.nonzero(wanted & (numbers == number))
             taken[_copied(source, number, variables, order, cells, at, values)] = True
         present = {variable.name for variable in source.store.variables}
-        scenes = np.asarray(taken.reshape(len(block), -1).any(axis=1))
-        _compute(pipeline, block, [v for v in variables if v.name not in present], scenes, values)
+        lacking = [variable for variable in variables if variable.name not in present]
+        rows = np.flatnonzero(taken.reshape(len(block), -1).any(axis=1))
+        if lacking and len(rows):  # what follows from the parameters alone
+            indices = [index[rows] for index in block_indices(block)]
+            drawn = pipeline.experiment.scene_values(indices)
+            for v in lacking:
+                values[v.name].reshape(-1)[rows] = drawn[v.drawn_as].broadcast(len(rows))
         used = np.unique(numbers[taken]).tolist()
         for _, receipt in receipts(source.store, used):
             processors.update(receipt.processors)
@@ -335,7 +294,7 @@ def _block_numbers(
     blocks = source.store.blocks
     numbers = np.zeros(shape, dtype=np.intp)
     for axis, extent, count in zip(
-        source.old.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
+        source.store.pipeline.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
     ):
         numbers = numbers * count + at[axis.name] // extent
     return numbers
@@ -378,25 +337,3 @@ def _copied(
                 target = tuple(finished[order.index(name)] for name in names)
                 values[variable.name][target] = read(variable)
     return finished
-
-
-def _follows(variable: Variable) -> bool:
-    """Return whether a variable follows from the scene's values, without its image."""
-    return bool(variable.drawn_as) or variable.name in GEOMETRY
-
-
-def _compute(
-    pipeline: Pipeline, block: Block, variables: Sequence[Variable], scenes: Masks,
-    values: dict[str, NDArray[Any]],
-) -> None:
-    """Compute variables that an old store lacks in some scenes, where it has their truth."""
-    has_truth = np.isfinite(values["true_tvec_m"]).all(axis=-1)
-    rows = np.flatnonzero(scenes & has_truth.reshape(-1))
-    if not (variables and len(rows)):
-        return
-    drawn = pipeline.experiment.scene_values([index[rows] for index in block_indices(block)])
-    built = build_scenes(drawn, len(rows))
-    for variable in variables:
-        values[variable.name].reshape(-1)[rows] = (
-            drawn[variable.drawn_as].broadcast(len(rows)) if variable.drawn_as
-            else GEOMETRY[variable.name](built))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,11 +30,10 @@ from sweep.experiment.schema import Variable
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.processor import processor
-from sweep.sampling.rules import Decider, Decision, scenes_needed
+from sweep.sampling.rules import Decider, Decision
 from sweep.store.blocks import (
     RunStore,
     begin_block,
-    commit_block,
     receipt_of,
     withdraw_block,
     write_block,
@@ -49,6 +49,28 @@ from sweep.store.receipt import Receipt
 
 FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 """Rows of failures that a receipt may hold of each kind."""
+
+
+def other_here(pipeline: Pipeline, begun: Mapping[str, Any]) -> list[str]:
+    """Return what this process has otherwise than a run began with: versions, plug-ins, files.
+
+    Parameters
+    ----------
+    pipeline
+        What is computed.
+    begun
+        The fingerprint of the process that began.
+    """
+    # What a camera file says is in the pipeline's text.
+    images = pipeline.values_of("background")
+    return [
+        *(f"{name} is {own}, the run began with {value}" for name, value, own in changes(
+            {"builds": {}, **begun}, fingerprint(pipeline))),
+        *lacking_plugins(pipeline.plugins, pipeline.folder),
+        *(f"{path} is not in {pipeline.folder} as it was when the run began"
+          for path, digest in begun["files"].items()
+          if path in images and file_digest(Path(pipeline.folder) / path) != digest),
+    ]
 
 
 @lru_cache(maxsize=4)
@@ -74,21 +96,8 @@ def _opened(url: str, run_id: str) -> RunStore:
     store = open_store(url, "r+")
     if store.run_id != run_id:
         raise StoreReplacedError(f"{url}: replaced by another run while this one was going on")
-    for key, value, own_value in changes(store.fingerprint, fingerprint(store.pipeline)):
-        raise StoreError(
-            f"a worker has {key} {own_value}, the store was begun with {value}; "
-            "install the same version on every machine"
-        )
-    # What a camera file says is in the pipeline's text.
-    images = store.pipeline.values_of("background")
-    if lacking := lacking_plugins(store.pipeline.plugins, store.pipeline.folder):
-        raise StoreError(f"a worker lacks what the run began with: {lacking[0]}")
-    for path, digest in store.fingerprint["files"].items():
-        if path in images and file_digest(Path(store.pipeline.folder) / path) != digest:
-            raise StoreError(
-                f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
-                "every machine needs the same file there"
-            )
+    if lines := other_here(store.pipeline, store.fingerprint):
+        raise StoreError(f"on a worker {lines[0]}; every machine needs the same")
     warm_up(store.pipeline)
     return store
 
@@ -210,43 +219,41 @@ def _compute_begun(
     start = time.perf_counter()
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
-    reused: ReusedCells | None = None
     need = np.broadcast_to(needed[:, None, None], shape).copy()
     sources = [_source(url, store.run_id, old) for old in reuse]
     if before is not None:
-        if (needed == scenes_needed(store, block)).all():
-            return commit_block(
-                store, block, dataclasses.replace(before, basis=basis, computed=_NOTHING))
         own = frozenset([store.blocks.number(block)])
         sources.insert(0, dataclasses.replace(_itself(url, store.run_id), done=own))
-    if sources and need.any():
-        reused = read_cells(pipeline, block, sources)
+    reused = read_cells(pipeline, block, sources) if sources and need.any() else None
+    if reused is not None:
         need &= ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
-    cells = None
+    cells, seconds, failures = CellsResult.not_run(pipeline.experiment, len(block)), _NO_SECONDS, []
     if len(rows):
         indices = [index[rows] for index in block_indices(block)]
-        cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
+        computed = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
+        for name, columns in computed.columns.items():
+            cells.columns[name][:, rows] = columns
+        seconds, failures = computed.seconds, computed.failures
     values = {
-        v.name: to_dataset_layout(
-            v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))
-        )
+        v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
         for v in store.variables
     }
     if reused is not None:
         values = {v.name: _merged(v, values, reused) for v in store.variables}
-    if not needed.all():
-        for v in store.variables:
-            lengths = dict(zip(
-                (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
-            mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
-            values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
-    seconds = _NO_SECONDS if cells is None else cells.seconds
+    for v in store.variables:
+        lengths = dict(zip(
+            (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
+        mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
+        values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
+    if before is not None:
+        seconds = {stage: [sum(both) for both in itertools.zip_longest(
+            before.seconds[stage], seconds[stage], fillvalue=0.0)] for stage in seconds}
     receipt = Receipt(
         run_id=store.run_id,
         processors=tuple(sorted({
-            *(() if cells is None else [processor()]),
+            *([processor()] if len(rows) else []),
             *(() if reused is None else reused.processors),
         })),
         scenes=len(block),
@@ -257,9 +264,8 @@ def _compute_begun(
         },
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
-        seconds=seconds if before is None else _summed(before.seconds, seconds),
-        failures=recorded(
-            pipeline, block, [] if cells is None else cells.failures, rows.tolist(), quota),
+        seconds=seconds,
+        failures=recorded(pipeline, block, failures, rows.tolist(), quota),
         wall_s=time.perf_counter() - start,
         written=time.time(),
         basis=basis,
@@ -298,33 +304,6 @@ def _computed_here(
 
 _NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
 """The cost of a block of which nothing was computed."""
-
-_NOTHING = {"scenes": 0, "detections": 0, "estimates": 0}
-
-
-def _summed(
-    first: Mapping[str, Sequence[float]], second: Mapping[str, Sequence[float]]
-) -> dict[str, list[float]]:
-    """Return the seconds of a block that was computed in two parts."""
-    return {
-        stage: [a + b for a, b in zip(first[stage], second[stage], strict=True)]
-        if first[stage] and second[stage] else [*first[stage], *second[stage]]
-        for stage in first
-    }
-
-
-def _columns(
-    variable: Variable, cells: CellsResult | None, rows: NDArray[np.intp], pipeline: Pipeline,
-    count: int,
-) -> NDArray[Any]:
-    """Return a variable (configurations, N, ...): computed in ``rows``, else its fill value."""
-    columns = np.full(
-        (variable.configurations(pipeline), count, *variable.inner_shape), variable.fill,
-        dtype=variable.dtype,
-    )
-    if cells is not None:
-        columns[:, rows] = cells.columns[variable.name]
-    return columns
 
 
 def _merged(

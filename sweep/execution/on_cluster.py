@@ -19,14 +19,13 @@ from distributed.core import rpc
 
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
 from sweep.evaluation.machine_faults import exception_line, machine_fault
-from sweep.execution.block_task import compute_blocks
+from sweep.execution.block_task import compute_blocks, other_here
 from sweep.execution.executors import MAX_ATTEMPTS, Executor, Failed
-from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE
 from sweep.messages import notice
 from sweep.processor import differing_processors, processor
-from sweep.store.provenance import changes, fingerprint
+from sweep.store.provenance import fingerprint
 from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
@@ -154,21 +153,17 @@ def _name(client: object) -> str:
     return f"{type(client).__name__}({address})"
 
 
-class WorkerIdentity(NamedTuple):
-    """What the numbers of a process depend on, and which process it is."""
+class Worker(NamedTuple):
+    """A process that is to compute: what it has otherwise than this one, and which it is."""
 
-    versions: dict[str, Any]
+    other: list[str]
     process: tuple[str, int]
-    lacking_plugins: list[str]
     processor: str
 
 
-def worker_identity(pipeline: Pipeline) -> WorkerIdentity:
-    """Return what numbers depend on in this process."""
-    return WorkerIdentity(
-        fingerprint(pipeline), (socket.gethostname(), os.getpid()),
-        lacking_plugins(pipeline.plugins, pipeline.folder), processor(),
-    )
+def this_process(pipeline: Pipeline, begun: dict[str, Any]) -> Worker:
+    """Return what the numbers of the process that calls this depend on."""
+    return Worker(other_here(pipeline, begun), (socket.gethostname(), os.getpid()), processor())
 
 
 def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) -> None:
@@ -183,16 +178,16 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
     ArgumentError
         If a worker cannot compute the pipeline as this process would, or none answers.
     """
-    own = worker_identity(pipeline)
+    begun = fingerprint(pipeline)
     try:
         # A task that any worker may take, so that a cluster that adapts to work starts one.
         first = client.submit(os.getpid, pure=False)
         first.result(timeout=WORKERS_S)
         asked = {
-            worker: client.submit(worker_identity, pipeline, workers=[worker], pure=False)
+            worker: client.submit(this_process, pipeline, begun, workers=[worker], pure=False)
             for worker in client.nthreads()
         }
-        identities: dict[str, WorkerIdentity] = {}
+        identities: dict[str, Worker] = {}
         deadline = time.monotonic() + WORKERS_S
         for worker, answer in asked.items():
             with contextlib.suppress(TimeoutError):
@@ -203,21 +198,15 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
     except Exception as error:
         raise ArgumentError(
             argument, name, f"its workers cannot run sweep: {exception_line(error)}") from None
-    if any(worker.process == own.process for worker in identities.values()):
+    own = socket.gethostname(), os.getpid()
+    if any(worker.process == own for worker in identities.values()):
         raise ArgumentError(
             argument, name,
             "its workers are threads of this process, which a scene may end; "
             "start it with processes=True",
         )
-    lines = [
-        f"  {address}: {line}"
-        for address, worker in sorted(identities.items())
-        for line in (
-            *(f"{key} {theirs}, here {ours}" for key, theirs, ours in changes(
-                {"builds": {}, **worker.versions}, own.versions)),
-            *worker.lacking_plugins,
-        )
-    ]
+    lines = [f"  {address}: {line}" for address, worker in sorted(identities.items())
+             for line in worker.other]
     if lines:
         raise ArgumentError(
             argument, name,

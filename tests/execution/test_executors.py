@@ -18,8 +18,9 @@ from support.here import Here
 from support.stores import by_hand, same
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
 from sweep.execution import executors, on_cluster
+from sweep.execution.block_task import other_here
 from sweep.execution.executors import Children
-from sweep.execution.on_cluster import OnCluster, WorkerIdentity, connected
+from sweep.execution.on_cluster import OnCluster, Worker, connected
 from sweep.execution.progress import Tally
 from sweep.execution.runner import compute, execute, recompute
 from sweep.execution.waves import AnyOrder
@@ -28,7 +29,6 @@ from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
 from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.lock import writing
-from sweep.store.provenance import fingerprint
 
 PIPELINE = Pipeline.from_text(
     "seed = 3\npose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }\n"
@@ -174,13 +174,9 @@ def local_cluster(workers=1, **options):
         yield cluster
 
 
-def other_in_threads(pipeline):
-    """Return what numbers depend on; in other threads as if in another process, of other versions.
-    """
-    versions = fingerprint(pipeline)
-    if threading.current_thread() is threading.main_thread():
-        return WorkerIdentity(versions, ("here", 1), [], "AVX2")
-    return WorkerIdentity(versions | {"opencv": "0.0"}, ("elsewhere", 1), [], "AVX2")
+def elsewhere(pipeline, begun):
+    """Return what a thread says, as if it were another process, of other versions."""
+    return Worker(other_here(pipeline, begun | {"opencv": "0.0"}), ("elsewhere", 1), "AVX2")
 
 
 def refusal(client):
@@ -210,9 +206,9 @@ def test_workers_that_are_threads_of_the_caller_or_have_other_versions_are_refus
     # A scene that crashes, and the time limit, end the process of a worker.
     with local_cluster(1, processes=False, protocol="tcp://") as cluster:
         assert "its workers are threads of this process" in refusal(cluster)
-        monkeypatch.setattr(on_cluster, "worker_identity", other_in_threads)
+        monkeypatch.setattr(on_cluster, "this_process", elsewhere)
         for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
-            with pytest.raises(ArgumentError, match=r"tcp://.*: opencv 0\.0, here"):
+            with pytest.raises(ArgumentError, match=r"tcp://.*: opencv is .*, the run began"):
                 execute(PIPELINE, tmp_path / "other.zarr", **given)
     assert not (tmp_path / "other.zarr").exists()
 

@@ -11,13 +11,14 @@ import pytest
 import sweep
 from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
-from sweep.execution.on_cluster import worker_identity
+from sweep.execution.block_task import other_here
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child
 from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.loading import call
+from sweep.store.provenance import fingerprint
 from sweep.tradeoff.costs import clock_of
 from tests.support.here import Here
 
@@ -310,12 +311,13 @@ def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
 
 def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
     bad = pipeline("nan")
-    assert worker_identity(bad)[2] == []
+    begun = fingerprint(bad)
+    assert other_here(bad, begun) == []
     (tmp_path / "bad.py").rename(tmp_path / "gone.py")
-    (line,) = worker_identity(bad)[2]
+    (line,) = other_here(bad, begun)
     assert line.startswith(f"detector bad:nan: expected the file bad.py in {tmp_path}")
     (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
-    (line,) = worker_identity(bad)[2]
+    (line,) = other_here(bad, begun)
     assert "bad.py as it was when the run began" in line
 
 

@@ -50,7 +50,7 @@ def test_another_build_of_the_same_version_is_refused_by_run_reuse_and_workers(
         execute(PIPELINE, url)
     with pytest.raises(StoreError, match=r"builds\.opencv: the store has"):
         match(PIPELINE, open_store(url))
-    with pytest.raises(MachineFaultError, match=f"a worker has builds.opencv {here}") as raised:
+    with pytest.raises(MachineFaultError, match=f"on a worker builds.opencv is {here}") as raised:
         compute_block(url, store.run_id, store.blocks[0])
     assert len(str(raised.value).splitlines()) == 1
 

@@ -13,14 +13,17 @@ from scipy import interpolate, special
 from sweep.analysis.intervals import LEVEL, TAIL
 from sweep.errors import ArgumentError
 from sweep.fitting.photograph_fit import (
+    ALONG_MODULES,
     AMOUNT,
     BLOOM,
     CORNERS,
+    OWN,
     START,
     VARIANCE,
+    EdgeShifts,
     MarkerState,
     PhotographFit,
-    PhotographNoise,
+    edge_shifts,
     fit_photograph,
     photograph_noise,
     products,
@@ -154,6 +157,79 @@ def _fitted(
 
 
 # --------------------------------------------------------------------------------------------------
+# Shifts of single edges: a field whose reach is about a module.
+#
+# Its covariance is s² exp(-d² / (2 l²)), as of ``edge_px`` in scenes. An edge's shift is the
+# field's mean along a module. Its variance, and the covariance with the next edge on the same line,
+# say s and l.
+
+@dataclass(frozen=True, slots=True)
+class EdgeField:
+    """The field of shifts of edges: its variance in px², and its correlation length."""
+
+    variance: Estimate
+    length_px: Estimate
+
+    def covariance(self, distances: Floats, cell_px: float) -> Floats:
+        """Return the covariance in px² of means over cells at squared distances (px²).
+
+        Means over two squares are, nearly, the field smoothed by a Gaussian of their variance.
+        """
+        if not self.variance.value > 0:
+            return np.zeros_like(distances)
+        square = self.length_px.value**2
+        wide = square + cell_px**2 / 6
+        return np.asarray(
+            self.variance.value * square / wide * np.exp(-0.5 * distances / wide)
+        )
+
+
+EDGE_LENGTHS = np.geomspace(0.1, 3.0, 60)
+"""Correlation lengths that are compared, in modules."""
+
+
+def _edge_means() -> tuple[Floats, Floats]:
+    """Return variance and covariance of the means along a module, and along it and the next one.
+
+    For each of :data:`EDGE_LENGTHS`, for a field of variance 1.
+    """
+    t = ALONG_MODULES * ((np.arange(16) + 0.5) / 8 - 1)
+    apart = np.array([0.0, 1.0])[:, None, None, None]
+    correlation = np.exp(
+        -0.5 * ((t[:, None] - t - apart) / EDGE_LENGTHS[:, None, None]) ** 2
+    )
+    variance, covariance = correlation.mean(axis=(2, 3))
+    return variance, covariance
+
+
+def edge_field(shifts: Sequence[EdgeShifts], module_px: float) -> EdgeField:
+    """Return the field of shifts of n photographs' edges; ``module_px`` is a module's length."""
+    sums = np.array([[each.squares, each.edges, each.products, each.pairs] for each in shifts])
+    sums = sums[(sums[:, 1] > 0) & (sums[:, 3] > 0)]
+    variance, covariance = _edge_means()
+
+    def length(rows: Floats) -> float:
+        squares, edges, products, pairs = rows.sum(axis=0).tolist()
+        ratio = products / pairs / (squares / edges) if squares > 0 else 0.0
+        return float(np.interp(ratio, covariance / variance, EDGE_LENGTHS))
+
+    if not len(sums):
+        return EdgeField(Estimate(math.nan), Estimate(math.nan))
+    whole, count = length(sums), len(sums)
+    # Jackknife: pseudo-values of the photographs.
+    each = np.array([
+        count * whole - (count - 1) * length(np.delete(sums, k, axis=0)) for k in range(count)
+    ]) if count > 1 else np.array([whole])
+    spread = estimate(each)
+    share = float(np.interp(whole, EDGE_LENGTHS, variance))
+    return EdgeField(
+        estimate(sums[:, 0] / sums[:, 1] / share),
+        Estimate(whole, max(spread.low, EDGE_LENGTHS[0]), min(spread.high, EDGE_LENGTHS[-1]))
+        .mapped(lambda modules: max(modules * module_px, 1.0)),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
 # Shifts of markers beside the camera's model: how large they are, and how far they reach.
 #
 # The fitted corners of a photograph's markers minus those of the board's pose, fitted to the same
@@ -221,44 +297,35 @@ class _Corners:
     weights: Floats
 
 
-def _corners(state: MarkerState, noise: PhotographNoise) -> _Corners:
-    """Return a marker's corners.
-
-    The noise is that of flat pixels, raised to what the residuals of all pixels are.
-    """
-    marker, used = state.marker, state.marker.used
-    inverse = np.linalg.pinv(products(state.own), hermitian=True)
-    influence = state.own @ inverse[:, :CORNERS]
-    share = np.clip(state.share[used], 0.0, 1.0)
-    black, white = noise.black_variance, noise.white_variance
-    black, white = (value if np.isfinite(value) else other
-                    for value, other in ((black, white), (white, black)))
+def _corners(state: MarkerState, noise: Floats) -> _Corners:
+    """Return a marker's corners; ``noise`` (2,) has the variances of pixels on black and white."""
+    marker = state.marker
+    own = state.jacobian[:, :OWN]
+    influence = own @ np.linalg.pinv(products(own), hermitian=True)[:, :CORNERS]
+    black, white = np.where(np.isfinite(noise), noise, noise[::-1])
+    share = np.clip(state.share, 0.0, 1.0)
     variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
-    fields = np.zeros((CORNERS, *used.shape))
-    fields[:, used] = influence.T * np.sqrt(variance) * max(noise.edge_ratio, 1.0)
-    cells = np.clip(marker.modules_at[:, used] * CELLS, 0, CELLS - 1).astype(np.int64)
+    cells = np.clip(state.at * CELLS, 0, CELLS - 1).astype(np.int64)
     number = cells[1] * CELLS + cells[0]
-    moved = (state.scale * state.slope)[:, used]
     weights = np.array([
-        [np.bincount(number, one * each, minlength=CELLS**2) for each in moved]
+        [np.bincount(number, one * each, minlength=CELLS**2) for each in state.slope]
         for one in influence.T
     ])
     # A cell's point is where its edges are, most of them at a side of the marker.
-    edge = (moved**2).sum(axis=0) + 1e-12
+    edge = (state.slope**2).sum(axis=0) + 1e-12
     mass = np.bincount(number, edge, minlength=CELLS**2)
-    rows, columns = np.nonzero(used)
+    rows, columns = np.nonzero(marker.used)
     points = np.array([
         np.bincount(number, edge * each, minlength=CELLS**2) for each in (columns, rows)
     ]) / np.maximum(mass, 1e-12)
     return _Corners(
-        np.tensordot(fields, fields, axes=([1, 2], [1, 2])),
-        points.T + marker.frame_px, weights,
+        influence.T @ (influence * variance[:, None]), points.T + marker.frame_px, weights
     )
 
 
 def residuals_of(
-    states: Sequence[MarkerState], noise: PhotographNoise, shifts: Floats, explained: Floats,
-    width_px: float,
+    states: Sequence[MarkerState], noise: Floats, edges: EdgeField, shifts: Floats,
+    explained: Floats, width_px: float,
 ) -> Residuals | None:
     """Return the residuals of a photograph's n markers; None if they say nothing.
 
@@ -266,6 +333,8 @@ def residuals_of(
     ----------
     states, noise
         Of the photograph.
+    edges
+        Shifts of single edges, which move corners as noise does.
     shifts
         (n, 4, 2) px of the fitted corners from the true ones.
     explained
@@ -287,16 +356,23 @@ def residuals_of(
     for k, each in enumerate(corners):
         noises[k, :, k, :] = each.noise
         weights[:, k, :, k] = np.moveaxis(each.weights, 1, 0)
-    added, moved = noises.reshape(size, size), weights.reshape(2, size, -1)
+    moved = weights.reshape(2, size, -1)
     points = np.concatenate([each.points for each in corners])
     distances = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+
+    def shifted(covariance: Floats) -> Floats:
+        return np.asarray(sum(each @ covariance @ each.T for each in moved))
+
+    cell_px = float(np.mean([
+        state.marker.modules * state.marker.module_px for state in states
+    ])) / CELLS
+    added = noises.reshape(size, size) + shifted(edges.covariance(distances, cell_px))
     forms = [part.T @ part for part in parts]
     by_noise = [form @ added for form in forms]
     fields, covariance = np.empty((2, len(LENGTHS))), np.empty((3, len(LENGTHS), 2, 2))
     for k, length in enumerate(LENGTHS * width_px):
-        field = np.exp(-0.5 * distances / length**2)
-        shifted = sum(each @ field @ each.T for each in moved)
-        by_field = [form @ shifted for form in forms]
+        moving = shifted(np.exp(-0.5 * distances / length**2))
+        by_field = [form @ moving for form in forms]
         fields[:, k] = [np.trace(each) for each in by_field]
         mixed = _traces(by_noise, by_field)
         covariance[:, k] = (
@@ -613,9 +689,19 @@ def fit_scene(
             "board, the camera and the poses",
         )
     noises = [photograph_noise(fit.states) for fit in camera.fits]
+    module_px = float(np.mean([
+        state.marker.module_px for fit in camera.fits for state in fit.states
+    ]))
+    edges = edge_field(
+        [edge_shifts(fit.states, noise) for fit, noise in zip(camera.fits, noises, strict=True)],
+        module_px,
+    )
+    ragged = _edges(edges)
+    # The mean profile of edges that are shifted is wider by the variance of their shifts.
+    widened = edges.variance.value if ragged[0].kept and "edge_px" not in refused else 0.0
     terms = [
-        *_levels(camera), *_optics(camera), *_noise(camera, noises),
-        *_geometry(camera, noises, taken, board),
+        *_levels(camera), *_optics(camera, widened), *_noise(camera, noises), *ragged,
+        *_geometry(camera, noises, edges, taken, board),
     ]
     terms = [
         each.left_out(refused[switch])
@@ -624,7 +710,7 @@ def fit_scene(
     ]
     return SceneFit(
         tuple(terms), len(camera.fits), sum(len(fit.states) for fit in camera.fits),
-        tuple(_lines(camera, noises)), camera.tested_fits,
+        tuple(_lines(camera, terms)), camera.tested_fits,
     )
 
 
@@ -643,11 +729,13 @@ def _levels(camera: CameraFit) -> list[Term]:
     ]
 
 
-def _optics(camera: CameraFit) -> list[Term]:
+def _optics(camera: CameraFit, widened: float) -> list[Term]:
+    """Return blur, sharpening and bloom; ``widened`` px² of the point spread's variance is none."""
     variance, amount, bloom = camera.estimates
     of_variance, of_amount, of_bloom = camera.tested
     return [
-        judged("blur", "blur_px", variance, 0.0, of_variance, lambda v: v.mapped(_root)),
+        judged("blur", "blur_px", variance, 0.0, of_variance,
+               lambda each: each.mapped(lambda square: _root(square - widened))),
         judged("sharpening", "sharpening", amount, 0.0, of_amount),
         judged("bloom (tone)", "bloom", bloom, 0.0, of_bloom),
     ]
@@ -657,7 +745,7 @@ def _root(square: float) -> float:
     return math.sqrt(square) if square > 0 else (math.nan if math.isnan(square) else 0.0)
 
 
-def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
+def _noise(camera: CameraFit, noises: Sequence[Floats]) -> list[Term]:
     """Return the noise as a table of two levels."""
     level = [
         estimate(np.array([
@@ -665,10 +753,7 @@ def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
             for fit in camera.fits
         ])).value for share in (0.0, 1.0)
     ]
-    variances = [
-        estimate(np.array([getattr(each, name) for each in noises]))
-        for name in ("black_variance", "white_variance")
-    ]
+    variances = [estimate(each) for each in np.transpose(noises)]
     deviations = [each.mapped(_root) for each in variances]
     table: list[float] = []
     for at, each in sorted(zip(level, deviations, strict=True), key=lambda pair: pair[0]):
@@ -685,62 +770,91 @@ def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
     ]
 
 
+def _with_reach(term: Term, length_px: Estimate) -> list[Term]:
+    """Return the term of a field of shifts, and that of its reach, which is kept with it."""
+    if term.kept and not term.estimate.value > 0:
+        term = term.left_out("smaller than the noise")
+    return [term, Term(
+        f"reach of {term.name}", term.parameter.replace("_px", "_length_px"), length_px, term.kept,
+        "" if term.kept else f"no {term.name}", of=term.parameter,
+    )]
+
+
+def _edges(edges: EdgeField) -> list[Term]:
+    term = judged(
+        "ragged edges", "edge_px", edges.variance, 0.0, convert=lambda each: each.mapped(_root)
+    )
+    return _with_reach(term, edges.length_px)
+
+
 def _geometry(
-    camera: CameraFit, noises: Sequence[PhotographNoise], taken: PhotographScenes,
+    camera: CameraFit, noises: Sequence[Floats], edges: EdgeField, taken: PhotographScenes,
     board: Board | None,
 ) -> list[Term]:
+    """Return the print's size beside the file's, and the field of shifts of markers."""
     sources = set(taken.source[taken.shown].tolist())
+    unknown = Estimate(math.nan)
     names = ("geometry", "geometry_px"), ("reach of geometry", "geometry_length_px")
-    known = {TruthSource.board_without_this_marker, TruthSource.poses_file}
-    if not sources <= known or not np.isfinite(noises[0].edge_ratio):
+    if not sources <= {TruthSource.board_without_this_marker, TruthSource.poses_file}:
         return [
-            Term(*name, Estimate(math.nan), False, "only beside a board or exact poses", 0.0)
-            for name in names
+            Term(*name, unknown, False, "only beside a board or exact poses", 0.0)
+            for name in (("print's size", "marker_scale"), *names)
         ]
+    scales = np.array([np.mean([_scale(state) for state in fit.states]) for fit in camera.fits])
+    size = judged("print's size", "marker_scale", estimate(scales), 1.0)
     residuals = []
     for fit, noise in zip(camera.fits, noises, strict=True):
         fixed = TruthSource.poses_file in sources
-        compared = _beside_truth(fit) if fixed else _beside_board(fit, taken, board)
-        one = None if compared is None else residuals_of(
-            fit.states, noise, *compared, float(taken.frame[0])
-        )
+        compared = _beside_truth(fit) if fixed else _beside_board(
+            fit, taken, board, float(scales.mean()))
+        if compared is None or not np.isfinite(noise).any():
+            continue
+        one = residuals_of(fit.states, noise, edges, *compared, float(taken.frame[0]))
         if one is not None:
             residuals.append(one)
     if len(residuals) < MIN_PHOTOGRAPHS:
-        return [
-            Term(*name, Estimate(math.nan), False, "too few photographs or markers", 0.0)
-            for name in names
-        ]
+        return [size, *(
+            Term(*name, unknown, False, "too few photographs or markers", 0.0) for name in names
+        )]
     shifts = shifts_of(residuals, float(taken.frame[0]))
-    term = judged("geometry", "geometry_px", shifts.size_px, 0.0, estimate(shifts.squares))
-    if term.kept and estimate(shifts.squares).value < 0:
+    squares = estimate(shifts.squares)
+    term = judged("geometry", "geometry_px", shifts.size_px, 0.0, squares)
+    if term.kept and squares.value < 0:
         term = term.left_out("smaller than the noise")
-    return [term, Term(
-        "reach of geometry", "geometry_length_px", shifts.length_px, term.kept,
-        "" if term.kept else "no geometry", of="geometry_px",
-    )]
+    return [size, *_with_reach(term, shifts.length_px)]
+
+
+def _scale(state: MarkerState) -> float:
+    """Return the size of a marker over the board's or the file's, by its corners."""
+    arms = state.marker.corners_px - state.marker.corners_px.mean(axis=0)
+    return 1.0 + float((state.shifts * arms).sum() / (arms**2).sum())
 
 
 def _beside_truth(fit: PhotographFit) -> tuple[Floats, Floats]:
     """Return the shifts (n, 4, 2) of corners beside poses that are exact."""
-    shifts = [each.corners_px - each.marker.corners_px for each in fit.states]
-    return np.array(shifts), np.empty((CORNERS * len(shifts), 0))
+    return (
+        np.array([state.shifts for state in fit.states]), np.empty((CORNERS * len(fit.states), 0))
+    )
 
 
 def _beside_board(
-    fit: PhotographFit, taken: PhotographScenes, board: Board | None
+    fit: PhotographFit, taken: PhotographScenes, board: Board | None, scale: float
 ) -> tuple[Floats, Floats] | None:
     """Return the shifts (n, 4, 2) of corners beside one pose of the board, fitted to all of them.
 
-    And how the corners change with that pose, (8 n, 6). None without such a pose.
+    Its markers are ``scale`` times as large. And how the corners change with that pose, (8 n, 6).
+    None without such a pose.
     """
     if board is None:
         return None
     scenes = taken.scenes
     rows = [state.marker.row for state in fit.states]
     numbers = [board.marker_ids.index(scenes.marker_id[row]) for row in rows]
-    points = board.corners_m[numbers]
-    pixels = np.array([state.corners_px + state.marker.frame_px for state in fit.states])
+    centres = board.corners_m[numbers].mean(axis=1, keepdims=True)
+    points = centres + scale * (board.corners_m[numbers] - centres)
+    pixels = np.array([
+        state.marker.corners_px + state.shifts + state.marker.frame_px for state in fit.states
+    ])
     axes, centre = marker_frames(board)[numbers[0]]
     rotation = scenes.rotation[rows[0]] @ axes.T
     camera = taken.lens(rows[0])
@@ -754,16 +868,21 @@ def _beside_board(
     return -pose.residuals.reshape(-1, 4, 2), np.asarray(explained.reshape(-1, POSE))
 
 
-def _lines(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[str]:
+def _lines(camera: CameraFit, terms: Sequence[Term]) -> list[str]:
     lines = []
     if len(camera.fits) < MIN_PHOTOGRAPHS:
         lines.append(
             f"photographs that could be fitted: {len(camera.fits)}; from {MIN_PHOTOGRAPHS} on "
             "values have intervals, and effects that are not there are left out"
         )
-    ratios = [each.edge_ratio for each in noises if math.isfinite(each.edge_ratio)]
-    if ratios:
+    size = next(each for each in terms if each.parameter == "marker_scale")
+    if size.kept and size.estimate.judged:
+        low, value, high = (
+            100.0 * (each - 1.0)
+            for each in (size.estimate.low, size.estimate.value, size.estimate.high)
+        )
         lines.append(
-            f"residuals of all pixels are {np.median(ratios):.2g} times those far from edges"
+            f"markers are larger than their file says by {value:.2f} % [{low:.2f}, {high:.2f}]: "
+            "measure the print"
         )
     return lines

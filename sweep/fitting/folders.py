@@ -41,8 +41,7 @@ from sweep.typing import Floats, Integers
 # The markers of the held-out photographs are simulated at their poses with the scene that the
 # others gave, and with each of its effects left out in turn. An effect is worth having if it
 # narrows the gap between the errors of photographs and simulation by more than other random
-# numbers do, or moves a statistic of the simulated errors by more than its interval by
-# photograph.
+# numbers do.
 
 MIN_HELD_OUT = 5
 """Held-out photographs from which errors have intervals."""
@@ -85,40 +84,20 @@ class HeldOut:
         execute(twin_pipeline(self.pipeline, scene, REPEATS), store, overwrite=True)
         return simulation_gap(self.results, open_dataset(store)).load()
 
-    def worth(
-        self, full: xr.Dataset, scene: Mapping[str, Any], effects: Mapping[str, Sequence[str]]
-    ) -> dict[str, bool]:
-        """Return which effects narrow the gap, or move the simulated errors.
+    def worth(self, full: xr.Dataset, rest: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:
+        """Return which effects narrow the gap.
 
         Parameters
         ----------
         full
             The gap with the whole scene.
-        scene
-            Its parameters.
-        effects
-            Switch of an effect -> all its parameters.
+        rest
+            Switch of an effect -> the scene without it.
         """
-        found = {}
-        for switch, names in effects.items():
-            rest = {name: value for name, value in scene.items() if name not in names}
-            without = self.gap(rest, switch)
-            gain = gap_size(without, full) - gap_size(full, full)
-            found[switch] = gain > MIN_GAIN or is_moved(full, without)
-        return found
-
-
-def is_moved(full: xr.Dataset, without: xr.Dataset) -> bool:
-    """Return whether an error statistic of a simulation is outside its interval in the first."""
-    for each in QUANTILES:
-        low, high, other = (
-            gap.sel(source="simulated")[name].values for gap, name in (
-                (full, f"{each.name}_low"), (full, f"{each.name}_high"), (without, each.name)
-            )
-        )
-        if ((other < low) | (other > high)).any():
-            return True
-    return False
+        return {
+            switch: gap_size(self.gap(scene, switch), full) - gap_size(full, full) > MIN_GAIN
+            for switch, scene in rest.items()
+        }
 
 
 def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
@@ -292,7 +271,7 @@ OF_MARKERS = ("dictionary", "size_m")
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
 """What the check compares unless it is set."""
 
-SWITCHES = ("sharpening", "bloom", "geometry_px")
+SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
 """Effects that are kept where the errors of photographs that were not fitted say so."""
 
 NOT_NEEDED = "brings the errors no nearer to those of photographs that were not fitted"
@@ -389,17 +368,15 @@ def _checked(
     """
     others, held = views[::2], np.array([each.number for each in views[1::2]])
     photographs = held_out(pipeline, taken, held, record, home)
-    half = fit_scene(others, taken, board, known=found.tested_fits)
+    known = found.tested_fits
+    half = fit_scene(others, taken, board, known=known)
     gap = photographs.gap(half.scene, "whole")
-    kept = {each.parameter for each in half.terms if each.kept}
-    effects = {
-        switch: [each.parameter for each in half.terms if switch in (each.parameter, each.of)]
-        for switch in SWITCHES if switch in kept
-    }
-    worth = photographs.worth(gap, half.scene, effects)
+    worth = photographs.worth(gap, {
+        switch: fit_scene(others, taken, board, {switch: NOT_NEEDED}, known).scene
+        for switch in SWITCHES if switch in half.scene
+    })
     refused = {switch: NOT_NEEDED for switch, needed in worth.items() if not needed}
     if refused:
-        known = found.tested_fits
         found = fit_scene(views, taken, board, refused, known)
         half = fit_scene(others, taken, board, refused, known)
         gap = photographs.gap(half.scene, "final")

@@ -1,4 +1,4 @@
-"""The fit of the simulator's own image to one photograph, and the noise of its residuals."""
+"""The fit of the simulator's own image to one photograph, and what its residuals say."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import optimize
 
-from sweep.compilation import compiled
-from sweep.fitting.views import FittedMarker, FittedPhotograph, module_plane, shares
+from sweep.fitting.views import FittedMarker, FittedPhotograph, drawn
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.typing import Floats, Masks
 
@@ -23,7 +23,11 @@ from sweep.typing import Floats, Masks
 # s being the exact share of white through a Gaussian point spread, and s_wide that through one that
 # is wider by the radius of the sharpening: what the simulator makes of black, white, blur,
 # sharpening and bloom before it adds noise. Each marker has its own corners and levels; point
-# spread, amount and bloom are the photograph's.
+# spread, amount and bloom are the photograph's. All are one vector: the shifts of the corners from
+# their true places, right and down in turn, then b and c, then the photograph's.
+
+CORNERS, OWN, ALL = 8, 10, 13
+"""Parameters of a marker: the shifts of its four corners, then b and c; with the photograph's."""
 
 VARIANCE, AMOUNT, BLOOM = range(3)
 """Parameters of a photograph: variance of the point spread in px², amount of sharpening, bloom."""
@@ -31,194 +35,146 @@ VARIANCE, AMOUNT, BLOOM = range(3)
 RADIUS_PX = 1.0
 """Radius of the sharpening: what ``sharpening_px`` is unless it is given."""
 
-CORNERS, OWN = 8, 10
-"""Parameters of a marker: the shifts of its four corners, then b and c."""
+MAX_SHIFT_PX = 2.0
+"""Markers whose corners end farther than this from the truth are left out: they are covered, or
+their true pose is wrong."""
 
-STEP_PX = 0.25
-"""Step of differences along x and y. They are inexact by (step / point spread)² / 6, which changes
-the directions of steps, not where the fit ends."""
+LOW = np.array([*[-2 * MAX_SHIFT_PX] * CORNERS, -np.inf, -np.inf, 0.02, -0.95, -0.95])
+HIGH = np.array([*[2 * MAX_SHIFT_PX] * CORNERS, np.inf, np.inf, 100.0, 10.0, 0.95])
+"""Range of the parameters."""
 
-WHITE_SHARE = np.array([0.0, 0.0, 1.0])
-"""Values of outside, black and white in the image of the share of white."""
+START = np.array([0.5, 0.0, 0.0])
+"""The photograph's parameters at which a fit starts."""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class MarkerState:
-    """A marker's parameters, and what its pixels say at them.
+    """A marker's and its photograph's parameters, and what the n fitted pixels say at them.
 
     Attributes
     ----------
     marker
         What is fitted.
-    corners_px
-        (4, 2) in the box.
-    levels
-        (2,) b and c.
+    parameters
+        (13,) of the marker, then of the photograph.
     residuals
-        (h, w) levels minus the model; 0 where no pixel is fitted.
-    images
-        (2, h, w) s and s_wide.
+        (n,) levels minus the model.
     share
-        (h, w) F(s).
-    scale
-        (h, w) derivative of the level by F(s); 0 where it is cut off at 0 or 255.
+        (n,) F(s).
+    jacobian
+        (n, 13) derivatives of the model's levels.
     slope
-        (2, h, w) slopes of F(s) when it is moved right and down, per px.
-    own, shared
-        (n, OWN) and (n, 3) derivatives of the n fitted pixels.
-    uneven
-        (n, 4) derivatives by shifts that grow with the square of the position on the marker, which
-        corners cannot take up.
+        (2, n) slopes of the level when the image is moved right and down, per px; 0 where it is
+        cut off at 0 or 255.
     """
 
     marker: FittedMarker
-    corners_px: Floats
-    levels: Floats
+    parameters: Floats
     residuals: Floats
-    images: Floats
     share: Floats
-    scale: Floats
+    jacobian: Floats
     slope: Floats
-    own: Floats
-    shared: Floats
-    uneven: Floats
 
     @property
-    def squares(self) -> float:
-        """Sum of squared residuals."""
-        return float((self.residuals**2).sum())
+    def shifts(self) -> Floats:
+        """Shifts of the corners from their true places, (4, 2) px."""
+        return self.parameters[:CORNERS].reshape(4, 2)
+
+    @property
+    def levels(self) -> Floats:
+        """Levels b and c, (2,)."""
+        return self.parameters[CORNERS:OWN]
+
+    @property
+    def at(self) -> Floats:
+        """Column and row of the pixels as shares of the square's side, (2, n)."""
+        return self.marker.at[:, self.marker.used]
 
     @property
     def noise(self) -> float:
         """Standard deviation of the residuals."""
-        freedom = max(int(self.marker.used.sum()) - OWN, 1)
-        return float(np.sqrt(self.squares / freedom))
+        freedom = max(len(self.residuals) - OWN, 1)
+        return float(np.sqrt((self.residuals**2).sum() / freedom))
 
 
-def _rendered(
-    marker: FittedMarker, corners_px: Floats, parameters: Floats,
-    shift: tuple[float, float] = (0.0, 0.0),
-) -> Floats:
-    """Return s and s_wide of a marker, (2, h, w), moved by ``shift`` px."""
-    plane = module_plane(corners_px, marker.modules, marker.optics)
-    variance = max(parameters[VARIANCE], 0.0)
-    return np.stack([
-        shares(
-            marker.edges, WHITE_SHARE, plane, marker.optics, marker.used.shape, float(blur), shift
-        )
-        for blur in np.sqrt([variance, variance + RADIUS_PX**2])
-    ])
+def _of_corners(at: Floats) -> Floats:
+    """Return the shares (..., 4) of the corners TL, TR, BR, BL in a shift at (..., 2)."""
+    x, y = at[..., 0], at[..., 1]
+    return np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=-1)
 
 
-def _tone(share: Floats) -> Floats:
-    """Return s (1 - s), 0 beyond black and white, where rounding may lead."""
-    bounded = np.clip(share, 0.0, 1.0)
-    return bounded * (1.0 - bounded)
-
-
-def _combined(images: Floats, parameters: Floats) -> Floats:
-    """Return F(s) from s and s_wide, (2, ..., h, w)."""
-    share, wide = images
-    return np.asarray(
-        share + parameters[AMOUNT] * (share - wide) + parameters[BLOOM] * _tone(share)
+def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
+    """Return a marker's residuals and derivatives at its and the photograph's parameters."""
+    black, contrast, variance, amount, bloom = parameters[CORNERS:]
+    used = marker.used
+    ends = marker.ends + _of_corners(marker.ends_at) @ parameters[:CORNERS].reshape(4, 2)
+    sharp, wide = (
+        np.stack(drawn(ends, marker.sides, used.shape, float(np.sqrt(variance + radius**2)))[:4])[
+            :, used]
+        for radius in (0.0, RADIUS_PX)
     )
-
-
-def fresh_state(marker: FittedMarker, parameters: Floats) -> MarkerState:
-    """Return the state of a marker at its true corners, its levels by least squares."""
-    share = _combined(_rendered(marker, marker.corners_px, parameters), parameters)
-    white = share[marker.used]
-    sums = products(np.stack([np.ones_like(white), white, marker.levels[marker.used]], axis=1))
-    levels = solved_normal(sums[:-1, :-1], sums[:-1, -1])
-    return state_at(marker, marker.corners_px, levels, parameters)
-
-
-def state_at(
-    marker: FittedMarker, corners_px: Floats, levels: Floats, parameters: Floats,
-) -> MarkerState:
-    """Return a marker's residuals at its and the photograph's parameters, without derivatives."""
-    images = _rendered(marker, corners_px, parameters)
-    share = _combined(images, parameters)
-    level = levels[0] + levels[1] * share
-    residuals = np.where(marker.used, marker.levels - np.clip(level, 0.0, 255.0), 0.0)
-    scale = np.where((level > 0.0) & (level < 255.0), levels[1], 0.0)
-    none = np.empty(0)
+    # Rounding may lead beyond black and white.
+    bounded = np.clip(sharp[0], 0.0, 1.0)
+    tone = bounded * (1 - bounded)
+    share = sharp[0] + amount * (sharp[0] - wide[0]) + bloom * tone
+    gain = 1 + amount + bloom * (1 - 2 * bounded)
+    level = black + contrast * share
+    inside = (level > 0.0) & (level < 255.0)
+    scale = contrast * inside
+    along = scale * (gain * sharp[1:] - amount * wide[1:])
+    slope = -along[:2]
+    corners = slope[:, :, None] * _of_corners(marker.at[:, used].T)
     return MarkerState(
-        marker, corners_px, levels, residuals, images, share, scale, none, none, none, none
+        marker, parameters, marker.levels[used] - np.clip(level, 0.0, 255.0), share,
+        np.column_stack([
+            corners.transpose(1, 2, 0).reshape(-1, CORNERS), inside, share * inside, along[2],
+            scale * (sharp[0] - wide[0]), scale * tone,
+        ]),
+        slope,
     )
 
 
-def differentiate(state: MarkerState, parameters: Floats) -> None:
-    """Compute the derivatives of a state.
+def fresh_state(marker: FittedMarker, shared: Floats) -> MarkerState:
+    """Return the state of a marker at its true corners, its levels by least squares."""
+    parameters = np.concatenate([np.zeros(CORNERS), [0.0, 1.0], shared])
+    share = state_at(marker, parameters).share
+    design = np.stack([np.ones_like(share), share], axis=1)
+    parameters[CORNERS:OWN] = np.linalg.lstsq(design, marker.levels[marker.used], rcond=None)[0]
+    return state_at(marker, parameters)
 
-    Those by the point spread's variance follow from the heat equation: half the Laplacian.
-    """
-    marker, used = state.marker, state.marker.used
-    sides = np.stack([
-        _rendered(marker, state.corners_px, parameters, shift)
-        for shift in ((STEP_PX, 0.0), (-STEP_PX, 0.0), (0.0, STEP_PX), (0.0, -STEP_PX))
-    ], axis=1)
-    combined = _combined(sides, parameters)
-    along = np.stack([combined[0] - combined[1], combined[2] - combined[3]]) / (2 * STEP_PX)
-    state.slope = along
-    inside = (state.scale != 0)[used]
-    moved = [
-        (state.scale * along[axis] * marker.shape[k])[used] for k in range(4) for axis in range(2)
-    ]
-    x, y = marker.modules_at
-    state.uneven = np.stack([
-        (state.scale * along[axis] * at * (1 - at))[used] for at in (x, y) for axis in range(2)
-    ], axis=1)
-    state.own = np.stack([*moved, inside, state.share[used] * inside], axis=1)
-    share, wide = state.images
-    half, half_wide = (sides.sum(axis=1) - 4 * state.images) / (2 * STEP_PX**2)
-    amount = parameters[AMOUNT]
-    sharpened = 1 + amount + parameters[BLOOM] * (1 - 2 * np.clip(share, 0.0, 1.0))
-    derivatives = (
-        sharpened * half - amount * half_wide, share - wide, _tone(share)
+
+def fitted_state(state: MarkerState, moved: Masks) -> MarkerState:
+    """Return the state of least squares; ``moved`` (13,) says which parameters are moved."""
+    at = state
+
+    def residuals(values: Floats) -> Floats:
+        nonlocal at
+        parameters = state.parameters.copy()
+        parameters[moved] = values
+        at = state_at(state.marker, np.clip(parameters, LOW, HIGH))
+        return -at.residuals
+
+    # MINPACK: in one thread, unlike LAPACK's factors of so small matrices.
+    found = optimize.least_squares(
+        residuals, state.parameters[moved],
+        lambda _: at.jacobian[:, moved],  # of the values for which residuals were computed last
+        method="lm", x_scale="jac", ftol=1e-6, xtol=1e-6, max_nfev=MAX_STEPS,
     )
-    state.shared = np.stack([(state.scale * each)[used] for each in derivatives], axis=1)
+    residuals(found.x)
+    return at
 
 
-@compiled
 def products(columns: Floats) -> Floats:
     """Return the products (k, k) of columns (n, k), in one thread."""
-    count, size = columns.shape
-    sums = np.zeros((size, size))
-    for p in range(count):
-        row = columns[p]
-        for i in range(size):
-            first = row[i]
-            for j in range(i + 1):
-                sums[i, j] += first * row[j]
-    for i in range(size):
-        for j in range(i):
-            sums[j, i] = sums[i, j]
-    return sums
-
-
-def solved_normal(matrix: Floats, right: Floats) -> Floats:
-    """Return the solution of normal equations; 0 for what nothing depends on."""
-    scale = np.sqrt(np.diag(matrix))
-    scale[scale == 0] = 1.0
-    scaled = matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(matrix))
-    return (np.linalg.solve(scaled, (right.T / scale).T).T / scale).T
+    return np.asarray(np.einsum("ni,nj->ij", columns, columns))
 
 
 # --------------------------------------------------------------------------------------------------
-# The fit of the simulator's own image to one photograph: Gauss-Newton over all its markers.
-#
-# Each marker has its own corners and levels; point spread, amount of sharpening and bloom are the
-# photograph's.
+# The fit of one photograph: each marker by itself, then the photograph's parameters by Gauss-Newton
+# steps with all markers' own ones eliminated.
 
-MAX_STEPS = 12
-
-CONVERGED = 1e-3
-"""Squared standard deviations of a last step."""
-
-MAX_SHIFT_PX = 2.0
-"""Markers whose corners end farther than this from the truth are left out: they are covered, or
-their true pose is wrong."""
+MAX_STEPS, ROUNDS = 30, 2
+"""Most steps of a marker's fit, and steps of the photograph's parameters."""
 
 OUTLIER = 2.5
 """Markers whose residuals are so many times those of the photograph's median marker are left out;
@@ -226,11 +182,6 @@ something lies on them."""
 
 MIN_CONTRAST = 5.0
 """Difference of white and black in grey levels below which there is no marker in the pixels."""
-
-LOW, HIGH = np.array([0.0, -0.95, -0.95]), np.array([100.0, 10.0, 0.95])
-"""Range of the parameters of a photograph."""
-
-START = np.array([0.5, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,36 +205,8 @@ class PhotographFit:
     states: tuple[MarkerState, ...]
 
 
-Reduced = tuple[Floats, Floats, list[tuple[Floats, Floats]]]
-"""Information and gradient of the moved parameters, and of each marker how its own ones follow."""
-
-
-def _reduced(
-    states: Sequence[MarkerState], moved: Masks, *, uneven: bool = False
-) -> Reduced:
-    """Return the normal equations of the photograph's parameters, the markers' own eliminated.
-
-    ``uneven`` shifts of parts of markers are eliminated, too.
-    """
-    size = int(moved.sum())
-    information, gradient, own = np.zeros((size, size)), np.zeros(size), []
-    for state in states:
-        residual = state.residuals[state.marker.used]
-        local = np.hstack([state.own, state.uneven]) if uneven else state.own
-        count = local.shape[1]
-        sums = products(np.hstack([local, state.shared[:, moved], residual[:, None]]))
-        inner, outer = sums[:count, count:], sums[count:, count:]
-        solved = solved_normal(sums[:count, :count], inner)
-        rest = outer - inner.T @ solved
-        information += rest[:-1, :-1]
-        gradient += rest[:-1, -1]
-        own.append((solved[:, :-1], solved[:, -1]))
-    return information, gradient, own
-
-
 def fit_photograph(
-    photograph: FittedPhotograph, moved: Masks, start: Floats = START,
-    states: Sequence[MarkerState] | None = None,
+    photograph: FittedPhotograph, moved: Masks, start: Floats = START
 ) -> PhotographFit | None:
     """Return the fit of a photograph; None if no marker fits.
 
@@ -295,103 +218,64 @@ def fit_photograph(
         (3,) which of the photograph's parameters are moved; the others stay as at the start.
     start
         (3,) the parameters at which it starts.
-    states
-        The states of an earlier fit, in the place of the true corners.
     """
-    parameters = start.copy()
-    if states is None:
-        first = moved & (np.arange(len(start)) == VARIANCE)
-        current = [fresh_state(each, parameters) for each in photograph.markers]
-        current = _good([each for each in current if abs(each.levels[1]) > MIN_CONTRAST])
-        if not current:
-            return None
-        parameters, current = _descend(current, parameters, first)
-        current = _good(current)
-        if not current:
-            return None
-    else:
-        current = [
-            state_at(each.marker, each.corners_px, each.levels, parameters) for each in states
-        ]
-    parameters, current = _descend(current, parameters, moved)
-    if len(_good(current)) < len(current):
-        current = _good(current)
-        if not current:
-            return None
-        parameters, current = _descend(current, parameters, moved)
-    result = parameters.copy()
+    own, shared = np.arange(ALL) < OWN, start.copy()
+    states = [fresh_state(each, shared) for each in photograph.markers]
+    states = _good([
+        fitted_state(each, np.append(own[:OWN], moved)) for each in states
+        if abs(each.levels[1]) > MIN_CONTRAST
+    ])
+    if not states:
+        return None
+    shared[moved] = np.median([state.parameters[OWN:][moved] for state in states], axis=0)
+    for _ in range(ROUNDS if moved.any() else 0):
+        states = [_with_shared(state, shared, own) for state in states]
+        shared[moved] += _shared_step(states, moved)
+        shared = np.clip(shared, LOW[OWN:], HIGH[OWN:])
+    states = [_with_shared(state, shared, own) for state in states]
+    result = shared.copy()
     if moved.any():
-        information, gradient, _ = _reduced(current, moved, uneven=True)
-        result[moved] += solved_normal(information, gradient)
-    return PhotographFit(photograph.number, result, tuple(current))
+        result[moved] += _shared_step(states, moved, uneven=True)
+    return PhotographFit(photograph.number, result, tuple(states))
+
+
+def _with_shared(state: MarkerState, shared: Floats, own: Masks) -> MarkerState:
+    """Return the fit of a marker's own parameters at the photograph's ones."""
+    parameters = np.concatenate([state.parameters[:OWN], shared])
+    return fitted_state(state_at(state.marker, parameters), own)
+
+
+def _shared_step(
+    states: Sequence[MarkerState], moved: Masks, *, uneven: bool = False
+) -> Floats:
+    """Return the step of the photograph's moved parameters, the markers' own ones eliminated.
+
+    ``uneven`` shifts of parts of markers are eliminated, too: those that grow with the square of
+    the position, which corners cannot take up.
+    """
+    size = int(moved.sum())
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    for state in states:
+        own = state.jacobian[:, :OWN]
+        if uneven:
+            own = np.hstack([own, *((state.slope * at * (1 - at)).T for at in state.at)])
+        count = own.shape[1]
+        sums = products(np.column_stack([own, state.jacobian[:, OWN:][:, moved], state.residuals]))
+        inner, outer = sums[:count, count:], sums[count:, count:]
+        rest = outer - inner.T @ np.linalg.lstsq(sums[:count, :count], inner, rcond=None)[0]
+        information += rest[:-1, :-1]
+        gradient += rest[:-1, -1]
+    return np.asarray(np.linalg.lstsq(information, gradient, rcond=None)[0])
 
 
 def _good(states: Sequence[MarkerState]) -> list[MarkerState]:
     """Return the states of markers that are no outliers."""
-    if not states:
-        return []
-    limit = OUTLIER * float(np.median([each.noise for each in states]))
+    limit = OUTLIER * float(np.median([each.noise for each in states])) if states else 0.0
     return [
         each for each in states
         if each.noise <= max(limit, 1.0) and abs(each.levels[1]) > MIN_CONTRAST
-        and np.abs(each.corners_px - each.marker.corners_px).max() < MAX_SHIFT_PX
+        and np.abs(each.shifts).max() < MAX_SHIFT_PX
     ]
-
-
-def _descend(
-    states: list[MarkerState], parameters: Floats, moved: Masks
-) -> tuple[Floats, list[MarkerState]]:
-    """Return parameters and states at the least squares."""
-    squares = sum(each.squares for each in states)
-    pixels = sum(int(each.marker.used.sum()) for each in states)
-    for _ in range(MAX_STEPS):
-        for state in states:
-            differentiate(state, parameters)
-        step, own_steps = _step(_reduced(states, moved), parameters, moved)
-        variance = squares / max(pixels - OWN * len(states), 1)
-        length = 1.0
-        for _attempt in range(6):
-            trial = parameters.copy()
-            trial[moved] = np.clip(
-                parameters[moved] + length * step, LOW[moved], HIGH[moved]
-            )
-            trial_states = [
-                _moved_state(state, length * own, trial)
-                for state, own in zip(states, own_steps, strict=True)
-            ]
-            trial_squares = sum(each.squares for each in trial_states)
-            if trial_squares < squares * (1 + 1e-9):
-                break
-            length /= 4
-        else:
-            return parameters, states
-        gain = squares - trial_squares
-        parameters, states, squares = trial, trial_states, trial_squares
-        if gain < CONVERGED * variance or squares == 0:
-            break
-    for state in states:
-        differentiate(state, parameters)
-    return parameters, states
-
-
-def _step(reduced: Reduced, parameters: Floats, moved: Masks) -> tuple[Floats, list[Floats]]:
-    """Return the step of the moved parameters, and those of each marker's own."""
-    information, gradient, own = reduced
-    step = np.zeros(len(gradient))
-    if len(step):
-        at, low, high = parameters[moved], LOW[moved], HIGH[moved]
-        free = ~(((at <= low) & (gradient < 0)) | ((at >= high) & (gradient > 0)))
-        step[free] = solved_normal(information[np.ix_(free, free)], gradient[free])
-        largest = np.array([max(0.5, parameters[VARIANCE]), 1.0, 0.5])[moved]
-        step *= min(1.0, float((largest / np.maximum(np.abs(step), 1e-12)).min()))
-    return step, [pull - crossed @ step for crossed, pull in own]
-
-
-def _moved_state(state: MarkerState, step: Floats, parameters: Floats) -> MarkerState:
-    shift = np.clip(step[:CORNERS].reshape(4, 2), -1.0, 1.0)
-    return state_at(
-        state.marker, state.corners_px + shift, state.levels + step[CORNERS:], parameters
-    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -407,45 +291,117 @@ MIN_PIXELS = 100
 """Flat pixels of a photograph, of one colour, from which its noise is estimated."""
 
 
+def photograph_noise(states: Sequence[MarkerState]) -> Floats:
+    """Return the variances (2,) of pixels on black and on white, from a photograph's markers.
+
+    In squared grey levels, without that of rounding; NaN where too few pixels are flat.
+    """
+    squares, counts, freedom = np.zeros(2), np.zeros(2), np.zeros(2)
+    for state in states:
+        inverse = np.linalg.pinv(products(state.jacobian), hermitian=True)
+        explained = np.einsum("ni,ij,nj->n", state.jacobian, inverse, state.jacobian)
+        steepness = np.hypot(*state.slope) / abs(state.levels[1])
+        flat = (steepness < FLAT_PER_PX) & state.jacobian[:, CORNERS].astype(bool)
+        for k in range(2):
+            area = flat & (np.abs(state.share - k) < FLAT_SHARE)
+            squares[k] += (state.residuals[area] ** 2).sum()
+            counts[k] += area.sum()
+            freedom[k] += area.sum() - explained[area].sum()
+    variance = squares / np.maximum(freedom, 1.0) - QUANTISATION_VARIANCE
+    return np.where(counts >= MIN_PIXELS, variance, np.nan)
+
+
+# --------------------------------------------------------------------------------------------------
+# Shifts of single edges beside the marker's corners, from the residuals of pixels near edges.
+#
+# A module's edge that is shifted by d along the unit vector n leaves the residuals d (n · slope).
+# Edges of both polarities that are shifted alike are a field of shifts; edges that all move
+# towards white are the marker's own bloom, which is taken off.
+
+REACH_MODULES, ALONG_MODULES = 0.5, 0.4
+"""Half widths across and along the edge of the pixels that say where a module's edge is."""
+
+STEP_SHARE = 0.6
+"""Share of the whole step from black to white from which pixels are those of an edge."""
+
+
 @dataclass(frozen=True, slots=True)
-class PhotographNoise:
-    """The noise of one photograph.
+class EdgeShifts:
+    """Sums of products of the shifts of a photograph's edges, in px².
 
     Attributes
     ----------
-    black_variance, white_variance
-        Of pixels on black and white, in squared grey levels, without that of rounding; NaN where
-        too few pixels are flat.
-    edge_ratio
-        Root mean square of all residuals over that of flat pixels.
+    squares, edges
+        Sum of squares beyond what the noise of pixels adds, and the degrees of freedom.
+    products, pairs
+        Sum of products of two edges on one line of modules that follow on each other, and their
+        number.
     """
 
-    black_variance: float
-    white_variance: float
-    edge_ratio: float
+    squares: float
+    edges: float
+    products: float
+    pairs: float
 
 
-def photograph_noise(states: Sequence[MarkerState]) -> PhotographNoise:
-    """Return the noise of a photograph from the fits of its markers."""
-    squares, counts, freedom = np.zeros(2), np.zeros(2), np.zeros(2)
+def edge_shifts(states: Sequence[MarkerState], noise: Floats) -> EdgeShifts:
+    """Return the shifts of edges; ``noise`` (2,) is that of pixels on black and on white."""
+    variance = float(np.nanmean(noise)) + QUANTISATION_VARIANCE
+    sums = np.zeros(4)
     for state in states:
-        used, residuals = state.marker.used, state.residuals[state.marker.used]
-        columns = np.hstack([state.own, state.shared])
-        columns = columns[:, np.abs(columns).max(axis=0) > 0]
-        columns /= np.sqrt((columns**2).sum(axis=0))
-        inverse = np.linalg.pinv(products(columns), rcond=1e-9, hermitian=True)
-        explained = ((columns @ inverse) * columns).sum(axis=1)
-        flat = ((np.hypot(*state.slope) < FLAT_PER_PX) & (state.scale != 0))[used]
-        for k in range(2):
-            area = flat & (np.abs(state.share[used] - k) < FLAT_SHARE)
-            squares[k] += (residuals[area] ** 2).sum()
-            counts[k] += area.sum()
-            freedom[k] += area.sum() - explained[area].sum()
-    if counts.max() < MIN_PIXELS:
-        return PhotographNoise(np.nan, np.nan, np.nan)
-    variance = np.where(counts >= MIN_PIXELS, squares / np.maximum(freedom, 1.0), np.nan)
-    every = np.concatenate([state.residuals[state.marker.used] for state in states])
-    flat_rms = np.sqrt(squares.sum() / counts.sum())
-    black, white = (variance - QUANTISATION_VARIANCE).tolist()
-    ratio = float(np.sqrt(np.mean(every**2)) / flat_rms) if flat_rms > 0 else np.nan
-    return PhotographNoise(black, white, ratio)
+        shifts = [_edges_along(state, axis) for axis in range(2)]
+        bright = np.concatenate([each[0].ravel() for each in shifts])
+        information = np.concatenate([each[2].ravel() for each in shifts])
+        if np.isfinite(bright).sum() <= OWN:
+            continue
+        own, count = float(np.nanmean(bright)), int(np.isfinite(bright).sum())
+        # Corners and bloom took up as much of the squares as of independent shifts' ones, and,
+        # being smooth, about as much of the products of neighbours.
+        taken = (CORNERS + 1) / count
+        squares = float(np.nansum((bright - own) ** 2 - variance / information))
+        sums[:2] += squares, count * (1 - taken)
+        for towards_white, direction, _ in shifts:
+            shifted = (towards_white - own) * direction
+            products = shifted[:, :-1] * shifted[:, 1:]
+            pairs = np.isfinite(products).sum()
+            sums[2:] += (
+                np.nansum(products) + pairs * taken * squares / (count * (1 - taken)), pairs
+            )
+    return EdgeShifts(*sums.tolist())
+
+
+def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]:
+    """Return the edges on lines of constant column (``axis`` 0) or row of a marker.
+
+    (lines, modules) each, NaN where there is no edge: shifts towards white in px, the sign of that
+    direction along the axis, and the information of the shifts.
+    """
+    marker = state.marker
+    across, along = marker.modules * state.at[axis], marker.modules * state.at[1 - axis]
+    line, module = np.rint(across), np.floor(along)
+    near = (
+        (np.abs(across - line) < REACH_MODULES) & (np.abs(along - module - 0.5) < ALONG_MODULES)
+        & (line >= 0) & (line <= marker.modules) & (module >= 0) & (module < marker.modules)
+    )
+    shape = marker.modules + 1, marker.modules
+    number = (line * marker.modules + module)[near].astype(np.int64)
+    slope, residuals = state.slope[:, near], state.residuals[near]
+
+    def total(values: Floats) -> Floats:
+        return np.asarray(np.bincount(number, values, shape[0] * shape[1]), dtype=np.float64)
+
+    steps = np.stack([total(each) for each in slope])
+    length = np.hypot(*steps)
+    normal = steps / np.maximum(length, 1e-12)
+    by_shift = (normal[:, number] * slope).sum(axis=0)
+    information = total(by_shift**2)
+    whole = abs(state.levels[1]) * 2 * ALONG_MODULES * marker.module_px
+    edge = length > STEP_SHARE * whole
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shifts = np.where(edge, total(by_shift * residuals) / information, np.nan)
+    corners = marker.corners_px
+    positive = corners[1] - corners[0] if axis == 0 else corners[3] - corners[0]
+    return tuple(  # type: ignore[return-value]
+        np.where(edge, each, np.nan).reshape(shape)
+        for each in (shifts, np.sign(positive @ normal), information)
+    )

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import compiled
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
+from sweep.measure.photograph_model import add_plane, slope_space
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
-from sweep.model import coverage
 from sweep.model.board import Board
 from sweep.model.camera import Column
 from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image
-from sweep.model.lens import undistort
 from sweep.model.marker import OUTSIDE, module_count, overhang
-from sweep.model.polygon import Optics, Projection
+from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.model.pose import angles_of_rotation
 from sweep.model.scene import Scenes, build_scenes
 from sweep.photographs.folder import find_corners, reference_detector
@@ -116,59 +115,44 @@ def _by_board(
 
 
 # --------------------------------------------------------------------------------------------------
-# The simulator's exact image of what is printed, drawn from the corners of a marker.
+# The image of printed edges in pixels, and its slopes.
 
-@compiled
-def _rays(pixels: Floats, optics: Optics) -> Floats:
-    """Return the undistorted directions x/z, y/z (n, 2) of pixels (n, 2)."""
-    rays = np.empty_like(pixels)
-    fx, fy, cx, cy = optics.intrinsics
-    for k in range(len(pixels)):
-        x, y = (pixels[k, 0] - cx) / fx, (pixels[k, 1] - cy) / fy
-        if optics.distorted:
-            x, y, _ = undistort(x, y, optics.lens)
-        rays[k, 0], rays[k, 1] = x, y
-    return rays
+WHITE_SHARE = np.array([0.0, 0.0, 1.0])
+"""Values of outside, black and white in the image of the share of white."""
 
+IN_PIXELS = Projection(
+    np.eye(3), Optics(np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(24), distorted=False)
+)
+"""The projection of edges that are given in pixels."""
 
-def module_plane(corners_px: Floats, modules: int, optics: Optics) -> Floats:
-    """Return a plane (3, 3) that takes a square of modules to four corners (4, 2) in pixels."""
-    rays = _rays(np.ascontiguousarray(corners_px), optics)
-    square = modules * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    rows = []
-    for (u, v), (x, y) in zip(square.tolist(), rays.tolist(), strict=True):
-        rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v])
-        rows.append([0, 0, 0, u, v, 1, -y * u, -y * v])
-    solution = np.linalg.solve(np.array(rows), rays.ravel())
-    return np.append(solution, 1.0).reshape(3, 3)
+PANEL_PX = 0.4
+"""Least length of the pieces in which edges are integrated."""
 
 
-def module_points(plane: Floats, optics: Optics, height: int, width: int) -> Floats:
-    """Return the column and row in modules (2, height, width) of the pixels of a box."""
-    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    rays = _rays(np.stack([columns.ravel(), rows.ravel()], axis=1), optics)
-    flat = cv2.perspectiveTransform(rays[None], np.linalg.inv(plane))[0]
-    return np.asarray(flat.T.reshape(2, height, width), dtype=np.float64)
+class Drawn(NamedTuple):
+    """The share of white (h, w), its slopes along x, along y and by the point spread's variance.
 
-
-def shares(
-    edges: MarkerEdges, values: Floats, plane: Floats, optics: Optics, size: tuple[int, int],
-    blur_px: float, shift: tuple[float, float] = (0.0, 0.0),
-) -> Floats:
-    """Return the image (height, width) of values (3,) of outside, black and white.
-
-    ``shift`` moves it right and down, in px. Beyond the edges is the value of black.
+    And the share of what is outside the print.
     """
+
+    white: Floats
+    by_x: Floats
+    by_y: Floats
+    by_variance: Floats
+    outside: Floats
+
+
+def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float) -> Drawn:
+    """Return the image (height, width) of edges in pixels, (E, 2, 2), through a point spread."""
     height, width = size
-    intrinsics = optics.intrinsics.copy()
-    intrinsics[2:] += shift
-    cover, image = np.zeros((height, width + 2)), np.empty(size)
-    coverage.accumulate(
-        cover, edges, values, Projection(plane, Optics(intrinsics, optics.lens, optics.distorted)),
-        0, 0, blur_px,
+    space = slope_space(height, width)
+    edges = MarkerEdges(np.ascontiguousarray(ends.reshape(-1, 4)), sides)
+    add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px, PANEL_PX)
+    steps = space.rates.reshape(height, width + 1, 4)[:, :width]
+    return Drawn(
+        np.cumsum(steps[..., 0], axis=1), steps[..., 1], steps[..., 2], steps[..., 3],
+        np.cumsum(space.outside[:, :width], axis=1),
     )
-    coverage.sum_levels(cover, float(values[1]), image)
-    return image
 
 
 # --------------------------------------------------------------------------------------------------
@@ -203,16 +187,16 @@ class FittedMarker:
     ----------
     levels, used
         (h, w) grey levels of a box, and which pixels are fitted.
-    optics
-        The camera; its principal point is relative to the box.
-    edges
-        What is printed, in modules; black beyond.
-    modules
-        Along the side of the black square.
+    ends, sides
+        (E, 2, 2) start and end of the edges of what is printed at its true pose, in px of the box,
+        none longer than a module; (E, 2) the areas beside them. Black beyond.
+    ends_at, at
+        (E, 2, 2) of these points and (2, h, w) of the pixels: column and row as shares of the black
+        square's side.
     corners_px
         (4, 2) the true corners of the black square in the box: TL, TR, BR, BL.
-    shape
-        (4, h, w) the share of each corner in the shift of a pixel.
+    modules, module_px
+        Along the side of the black square, and the mean length of one in the image.
     frame_px
         (2,) first pixel of the box in the frame.
     row
@@ -223,19 +207,16 @@ class FittedMarker:
 
     levels: Floats
     used: Masks
-    optics: Optics
-    edges: MarkerEdges
-    modules: int
+    ends: Floats
+    sides: Integers
+    ends_at: Floats
+    at: Floats
     corners_px: Floats
-    shape: Floats
+    modules: int
+    module_px: float
     frame_px: Integers
     row: int
     ground: float
-
-    @property
-    def modules_at(self) -> Floats:
-        """Column and row of the pixels as shares of the black square's side, (2, h, w)."""
-        return np.stack([self.shape[1] + self.shape[2], self.shape[2] + self.shape[3]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,7 +242,7 @@ def photograph_views(
         image = photograph_image(str(scenes.background[rows[0]]))
         fitted = [
             view for row in _spread(scenes, rows, most)
-            if (view := marker_view(scenes, row, board, image)) is not None
+            if (view := marker_view(taken, row, board, image)) is not None
         ]
         if fitted:
             views.append(FittedPhotograph(number, tuple(fitted)))
@@ -271,8 +252,8 @@ def photograph_views(
 def _spread(scenes: Scenes, rows: Integers, most: int) -> list[int]:
     """Return at most ``most`` of some scenes, the farthest from one another in the frame."""
     corners = scenes.corners_px[rows]
-    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-    rows, corners = rows[side >= MIN_SIDE_PX], corners[side >= MIN_SIDE_PX]
+    rows, corners = (each[side_lengths(corners).min(axis=1) >= MIN_SIDE_PX]
+                     for each in (rows, corners))
     if len(rows) <= most:
         return list(map(int, rows))
     centres = corners.mean(axis=1)
@@ -285,57 +266,70 @@ def _spread(scenes: Scenes, rows: Integers, most: int) -> list[int]:
 
 
 def marker_view(
-    scenes: Scenes, row: int, board: Board | None, image: Grey
+    taken: PhotographScenes, row: int, board: Board | None, image: Grey
 ) -> FittedMarker | None:
     """Return the pixels of the marker of a scene in a photograph (height, width); None for few."""
-    marker = scenes.target(row)
+    scenes, lens = taken.scenes, taken.lens(row)
+    marker, corners = scenes.target(row), scenes.corners_px[row]
     dictionary, marker_id = marker.dictionary, marker.marker_ids[0]
     modules = module_count(dictionary)
+    module_px = float(side_lengths(corners[None]).mean()) / modules
     on_board = None
     if board is not None and marker_id in board.marker_ids:
         on_board = BoardMarker(board, board.marker_ids.index(marker_id))
-    corners = scenes.corners_px[row]
-    side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
     clear = marker.margin or 0.0 if on_board is None else clear_modules(on_board)
     ring = min(max(clear, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
-    extent = np.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
+    extent = np.ceil(4.0 * (ring + MODELLED_PX / module_px)) / 4.0
     edges = (
-        edges_alone(marker, extent) if on_board is None
-        else surroundings(on_board, extent)
+        edges_alone(marker, extent) if on_board is None else surroundings(on_board, extent)
     )
-    to_pixels = cv2.getPerspectiveTransform(
-        (modules * SQUARE).astype(np.float32), corners.astype(np.float32)
-    )
+
+    def pixels(points: Floats) -> Floats:
+        """Return the true images (n, 2) of columns and rows (n, 2) in modules."""
+        flat = (points / modules - 0.5) * scenes.size_m[row] * [1.0, -1.0]
+        return lens.project(
+            np.column_stack([flat, np.zeros(len(flat))]), scenes.rotation[row],
+            scenes.translation[row],
+        )
+
     outline, beyond = (
-        cv2.perspectiveTransform((modules * SQUARE + wide * (2 * SQUARE - 1))[None], to_pixels)[0]
-        for wide in (ring, clear + 1.0)
+        pixels(modules * SQUARE + wide * (2.0 * SQUARE - 1.0)) for wide in (ring, clear + 1.0)
     )
-    frame = np.array(image.shape[::-1])
     low = np.maximum(np.floor(outline.min(axis=0)).astype(np.int64) - 1, 0)
-    high = np.minimum(np.ceil(outline.max(axis=0)).astype(np.int64) + 2, frame)
+    high = np.minimum(np.ceil(outline.max(axis=0)).astype(np.int64) + 2, image.shape[::-1])
     if (high - low < 4).any():
         return None
-    optics = scenes.cameras.optics(row)
-    local = optics.intrinsics.copy()
-    local[2:] -= low
-    optics = Optics(local, optics.lens, optics.distorted)
     width, height = (high - low).tolist()
-    plane = module_plane(corners - low, modules, optics)
-    points = module_points(plane, optics, height, width)
-    used = np.asarray(((points > -ring) & (points < modules + ring)).all(axis=0))
-    if (edges.sides == OUTSIDE).any():
-        values = np.zeros(3)
-        values[OUTSIDE] = 1.0
-        outer = shares(edges, values, plane, optics, (height, width), OUTSIDE_BLUR_PX)
-        used &= outer < OUTSIDE_SHARE
+    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    rays = cv2.undistortPoints(
+        np.stack([columns, rows], axis=2).reshape(-1, 1, 2).astype(np.float64), lens.matrix,
+        lens.distortion,
+    )
+    to_modules = np.linalg.inv(scenes.plane[row])
+    at = cv2.perspectiveTransform(rays, to_modules).reshape(height, width, 2)
+    used = np.asarray(((at > -ring) & (at < modules + ring)).all(axis=2))
+    pieces, sides = _split(edges)
+    ends = pixels(pieces.reshape(-1, 2)).reshape(-1, 2, 2) - low
+    if (sides == OUTSIDE).any():
+        used &= drawn(ends, sides, used.shape, OUTSIDE_BLUR_PX).outside < OUTSIDE_SHARE
     if used.sum() < MIN_SIDE_PX**2:
         return None
-    x, y = points / modules
-    shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y])
     return FittedMarker(
-        image[low[1] : high[1], low[0] : high[0]].astype(np.float64), used, optics, edges, modules,
-        corners - low, shape, low, row, _along(image, beyond),
+        image[low[1] : high[1], low[0] : high[0]].astype(np.float64), used, ends, sides,
+        pieces / modules, np.moveaxis(at, 2, 0) / modules, corners - low, modules, module_px, low,
+        row, _along(image, beyond),
     )
+
+
+def _split(edges: MarkerEdges) -> tuple[Floats, Integers]:
+    """Return the pieces (E, 2, 2) of edges, none longer than a module, and their sides (E, 2)."""
+    start, stop = edges.ends[:, :2], edges.ends[:, 2:]
+    count = np.ceil(np.linalg.norm(stop - start, axis=1)).astype(np.int64).clip(min=1)
+    edge = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    t = np.stack([number, number + 1], axis=1) / count[edge, None]
+    pieces = start[edge, None] + t[..., None] * (stop - start)[edge, None]
+    return pieces, np.ascontiguousarray(edges.sides[edge])
 
 
 def _along(image: Grey, outline: Floats) -> float:

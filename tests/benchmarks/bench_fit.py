@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, terms_of
 
-ABSENT = ("sharpening", "bloom", "geometry_px")
+ABSENT = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
 
 
 def repeated(effects, repetitions, photographs, first):

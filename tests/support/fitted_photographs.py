@@ -14,7 +14,8 @@ CAMERA = {"width_px": 360, "height_px": 270, "fx_px": 390.0}
 LEVELS = {"black": 60.0, "white": 175.0, "background": 100.0}
 TRUTH = {
     "blur_px": 0.6, "sharpening": 0.6, "bloom": 0.15,
-    "geometry_px": 0.15, "geometry_length_px": 60.0, **LEVELS,
+    "geometry_px": 0.15, "geometry_length_px": 60.0, "edge_px": 0.1, "edge_length_px": 4.0,
+    "marker_scale": 1.004, **LEVELS,
 }
 EFFECTS = TRUTH | {"noise_grey": 2.0}
 PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0}

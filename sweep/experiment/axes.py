@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,21 +39,17 @@ class Axis:
         Its values, without repeats; labels if parameters go together.
     zipped
         The parameters that go together, each with its values; empty for an axis of one parameter.
-    plugged
-        Those of its parameters that plug-ins declare.
+    parameters
+        Its parameters; none of ``trial``.
     """
 
     name: str
     values: Sequence[Any]
     zipped: tuple[tuple[str, Sequence[Any]], ...] = ()
-    plugged: tuple[Parameter, ...] = ()
+    parameters: tuple[Parameter, ...] = field(default=(), compare=False)
 
     def __len__(self) -> int:
         return len(self.values)
-
-    def parameter(self, name: str) -> Parameter:
-        """Return one of its parameters; not of ``trial``."""
-        return next((each for each in self.plugged if each.name == name), None) or PARAMETERS[name]
 
     @property
     def columns(self) -> dict[str, Sequence[Any]]:
@@ -86,22 +83,19 @@ class Axis:
     @property
     def stage(self) -> Stage:
         """The first stage that the axis touches."""
-        first = next(iter(self.columns))
-        return Stage.scene if first == TRIAL else self.parameter(first).stage
+        return self.parameters[0].stage if self.parameters else Stage.scene
 
     @property
     def unit(self) -> str:
         """The unit of its values; empty if they have none."""
-        return "" if self.zipped or self.name == TRIAL else self.parameter(self.name).unit
+        return "" if self.zipped or not self.parameters else self.parameters[0].unit
 
     @property
     def meaning(self) -> str:
         """Meaning of the values, in words."""
         if self.zipped:
             return f"{', '.join(self.columns)}, which go together"
-        return "number of the draw" if self.name == TRIAL else (
-            self.parameter(self.name).declaration.meaning
-        )
+        return self.parameters[0].declaration.meaning if self.parameters else "number of the draw"
 
     @property
     def labelled(self) -> bool:
@@ -182,15 +176,10 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if not parameter.declaration.drawable:
         drawable = ", ".join(p.name for p in PARAMETERS.values() if p.declaration.drawable)
         raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
-    if (
-        not isinstance(ends, list) or len(ends) != 2
-        or not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        or not all(abs(end) < 1e300 for end in ends)
-    ):
+    sound = isinstance(ends, list) and len(ends) == 2 and _are_numbers(ends)
+    if not sound or not ends[1] > (ends[0] if kind == "uniform" else 0):
         raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
-    a, b = float(ends[0]), float(ends[1])
-    if (kind == "uniform" and not a < b) or (kind == "normal" and not b > 0):
-        raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
+    a, b = map(float, ends)
     if kind == "uniform":
         parameter.check(a)
         parameter.check(b)
@@ -198,6 +187,11 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
         extent = parameter.declaration.range_text()
         raise ValueError(f"mean - {MAX_DEVIATIONS} sd and mean + {MAX_DEVIATIONS} sd {extent}")
     return Distribution(kind, a, b)
+
+
+def _are_numbers(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool)
+               and abs(value) < 1e300 for value in values)
 
 
 def parse_trial(value: Any) -> Axis:
@@ -251,34 +245,26 @@ def parse_axis(
         raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
     if not isinstance(ends, list):
         raise ValueError(f"{form} = {AXIS_FORMS[form]}")  # noqa: TRY004  (a fault of the file)
-    values = _bounded(ends, quota) if form == "values" else _expand(form, ends, quota)
+    values = ends if form == "values" else _expand(form, ends, quota)
     if len(values) == 0:
         raise ValueError("at least one value")
-    if isinstance(values, range):
-        if parameter.types == (int,):
-            for end in (values[0], values[-1]):
-                parameter.check(end)
-            return Axis(parameter.name, values, plugged=_plugged(parameter))
-        values = [float(value) for value in _bounded(values, quota)]
+    if isinstance(values, range) and parameter.types == (int,):
+        for end in (values[0], values[-1]):
+            parameter.check(end)
+        return Axis(parameter.name, values, parameters=(parameter,))
+    if len(values) > quota:
+        raise _too_many()
     if form != "values" and float in parameter.types:
         # All are numbers: if the least and the largest are admitted, all are.
         for end in (min(values), max(values)):
             _checked(parameter, end)
-        checked = values
+        checked = list(map(float, values))
     else:
         checked = [_checked(parameter, value) for value in values]
-    if not repeats and len(set(checked)) < len(checked):
-        seen: set[Any] = set()
-        for value in checked:
-            if value in seen:
-                raise ValueError(f"each value once ({shown(value)} is repeated)")
-            seen.add(value)
-    return Axis(parameter.name, tuple(checked), plugged=_plugged(parameter))
-
-
-def _plugged(*parameters: Parameter) -> tuple[Parameter, ...]:
-    """Return those of parameters that plug-ins declare."""
-    return tuple(each for each in parameters if each.name not in PARAMETERS)
+    counts = collections.Counter(checked)
+    if not repeats and len(counts) < len(checked):
+        raise ValueError(f"each value once ({shown(counts.most_common(1)[0][0])} is repeated)")
+    return Axis(parameter.name, tuple(checked), parameters=(parameter,))
 
 
 def zipped_axis(
@@ -306,17 +292,16 @@ def zipped_axis(
     if len(set(stages.values())) > 1:
         listed = ", ".join(f"{parameter} is of the {stage}" for parameter, stage in stages.items())
         raise ValueError(f"parameters of one stage: {listed}")
-    rows = list(zip(*columns.values(), strict=True))
+    rows = collections.Counter(zip(*columns.values(), strict=True))
     labels = tuple(", ".join(map(_short, row)) for row in rows)
-    first_of = {row: k for k, row in reversed(list(enumerate(rows)))}
-    repeated = next((k for k, row in enumerate(rows) if first_of[row] != k), None)
-    if repeated is not None:
-        raise ValueError(f"each combination once ({plain(labels[repeated])} is repeated)")
+    if len(rows) < next(iter(lengths.values())):
+        repeated = labels[list(rows.values()).index(max(rows.values()))]
+        raise ValueError(f"each combination once ({plain(repeated)} is repeated)")
     if len(set(labels)) < len(labels):
         labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
     return Axis(
         name, labels, tuple((key, tuple(values)) for key, values in columns.items()),
-        _plugged(*(parameters[key] for key in columns)),
+        tuple(parameters[key] for key in columns),
     )
 
 
@@ -334,21 +319,13 @@ def _checked(parameter: Parameter, value: Any) -> Any:
         raise ValueError(f"{expected} (not {shown(value)}){semicolon}{hint}") from None
 
 
-def _bounded(values: Sequence[Any], quota: int) -> Sequence[Any]:
-    if len(values) > quota:
-        raise _too_many()
-    return values
-
-
 def _too_many() -> ValueError:
     return ValueError(f"at most {MAX_LISTED:,} values, all axes together")
 
 
 def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
     """Return the values of a form that generates them."""
-    numbers = all(isinstance(end, (int, float)) and not isinstance(end, bool) and abs(end) < 1e300
-                  for end in ends)
-    sound = numbers and len(ends) in ((2, 3) if form == "range" else (3,))
+    sound = len(ends) in ((2, 3) if form == "range" else (3,)) and _are_numbers(ends)
     if not sound or not _SOUND[form](*ends):
         raise ValueError(f"{form} = {AXIS_FORMS[form]}")
     if form == "range":

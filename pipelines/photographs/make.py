@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 import sweep
 from sweep.analysis import simulation_gap
-from sweep.experiment.experiment import scene_plugins
 from sweep.experiment.photographs import read_board
 from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
 from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
@@ -81,7 +80,8 @@ def plane_images(pipeline: sweep.Pipeline) -> list[NDArray[np.float64]]:
     lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
     indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
     count = len(indices[0])
-    scenes = build_scenes(pipeline.experiment.scene_values(indices), count, scene_plugins(pipeline))
+    experiment = pipeline.experiment
+    scenes = build_scenes(experiment.scene_values(indices), count, experiment.scene_plugins)
     boxes = marker_boxes(scenes)
     low = QUIET * PLANE_PX / (1 + 2 * QUIET) - 0.5
     high = PLANE_PX - 1 - low

@@ -255,7 +255,7 @@ def _pipeline_of(results: xr.Dataset) -> Pipeline:
         raise DatasetError(
             "no pipeline in the dataset's attributes: expected results as sweep.open returns them"
         ) from None
-    if not pipeline.experiment.shows_boards:
+    if not pipeline.shows_boards:
         raise DatasetError("the scenes show no board: give kind = charuco or grid under [board]")
     return pipeline
 

@@ -79,7 +79,7 @@ def scenes_at(experiment: Experiment, indices: Sequence[NDArray[np.intp]]) -> Sc
     scenes = build_scenes(values, count, experiment.scene_plugins)
     visibility = visibility_flags(scenes)
     boards = values["board"].listed(count) if "board" in values else None
-    targets = target_scenes(scenes, visibility, boards, experiment.largest_board)
+    targets = target_scenes(scenes, visibility, boards, experiment.grid.largest_board)
     return SceneBatch(indices, values, scenes, visibility, targets, marker_boxes(scenes))
 
 

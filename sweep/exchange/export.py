@@ -30,7 +30,6 @@ from sweep.exchange.images import (
     write_errors,
 )
 from sweep.execution.forecast import free_disk
-from sweep.experiment.experiment import target_word
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import byte_count, plain
 from sweep.model.renderers import render
@@ -175,7 +174,7 @@ def export(
             write_whole(cameras / f"{name}.ros.yaml", camera.ros_yaml(name).encode())
         write_whole(target / "README.md", Template(GUIDE.read_text(encoding="utf-8")).render(
             title=pipeline.heading, images=tables.images, invisible=tables.invisible,
-            windowed=windowed, target=target_word(pipeline),
+            windowed=windowed, target=pipeline.target_word,
         ).encode())
     return Export(
         str(folder), tables.images, tables.invisible, written, len(digests) - written, damaged,

@@ -24,9 +24,8 @@ from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
-from sweep.experiment.photographs import along_photographs, shows_photographs
+from sweep.experiment.photographs import along_photographs
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import bytes_per_block
 from sweep.isolation.child_process import (
     Child,
     ChildDiedError,
@@ -117,7 +116,7 @@ def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
     """Return the indices of a random sample of scenes: of photographs all markers of one."""
     axes = pipeline.experiment.scene_axes
     generator = np.random.Generator(np.random.PCG64(count))
-    if not shows_photographs(pipeline):
+    if not pipeline.shows_photographs:
         return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
     each = [
         generator.integers(0, len(axis), 1) if along else np.arange(len(axis))
@@ -259,7 +258,7 @@ def blocks_of(
     """
     axes = pipeline.experiment.scene_axes
     lengths = tuple(len(axis) for axis in axes)
-    if shows_photographs(pipeline):  # each is searched once, for all its markers
+    if pipeline.shows_photographs:  # each is searched once, for all its markers
         along = along_photographs(axes)
         return Blocks(lengths, tuple(
             1 if each else length for each, length in zip(along, lengths, strict=True)))
@@ -269,7 +268,7 @@ def blocks_of(
         # What is written of a block costs as much if few of its scenes are needed.
         total_s = max(total_s * rule.ends[0] / rule.ends[-1], WAVE_BLOCK_S * BLOCKS_PER_WORKER)
     work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
-    most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // bytes_per_block(pipeline, 1))
+    most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1))
     target = max(min(int(work_s / scene_s), most), 1)
     blocks = Blocks(lengths, _cut(axes, target, rule))
     if block_s is None:
@@ -368,7 +367,7 @@ def demand_of(
     """
     poses = math.ceil(pipeline.size(Stage.scene) * left / max(blocks, 1))
     files = left * (len(pipeline.experiment.variables) + 1)
-    return Demand(poses * scene_s / workers, workers, bytes_per_block(pipeline, poses), files)
+    return Demand(poses * scene_s / workers, workers, pipeline.experiment.bytes_of(poses), files)
 
 
 def objections(
@@ -530,7 +529,7 @@ def forecast(
         blocks=len(blocks),
         files=demand.files,
         bytes=demand.bytes,
-        worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(blocks.extents)),
+        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
         pose_s=timing.scene_s,
         sampled=timing.sampled,
         over=timing.over,

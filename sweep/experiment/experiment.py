@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, cast
 
 from sweep.experiment.axes import Axis, Distribution, combinations
-from sweep.experiment.parameters import STATED, Parameter, Stage, parameters_with
+from sweep.experiment.parameters import (
+    PHOTOGRAPHS,
+    SIMULATED,
+    STATED,
+    Parameter,
+    Stage,
+    parameters_with,
+)
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.calibration import CalibrationError
-from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
+from sweep.model.effects import Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -111,83 +118,73 @@ class Grid:
             board = first | chosen
             yield tuple(board[name] for name in ARRANGING)
 
+    @property
+    def shows_boards(self) -> bool:
+        """Whether scenes show boards, or something beside a marker; all markers are boards then."""
+        return any(self.values_of("distractors")) or self.any_value(
+            "kind", lambda kind: kind != SINGLE)
 
-# --------------------------------------------------------------------------------------------------
-# The boards of a pipeline: whether its scenes show boards, and how large they are.
+    @property
+    def target_word(self) -> str:
+        """What the scenes show, in a word: marker, board, or target if both."""
+        if not self.shows_boards:
+            return "marker"
+        return "target" if self.any_value("kind", lambda kind: kind == SINGLE) else "board"
+
+    @cached_property
+    def largest_board(self) -> tuple[int, int]:
+        """The most markers and the most chessboard corners of a target."""
+        if not self.shows_boards:
+            return 1, 0
+        markers, corners = zip(
+            *(arranged(values).counts for values in self.arrangements(_SIZED_BY)), strict=True)
+        return max(markers), max(corners)
+
+    @property
+    def relative_sizes(self) -> tuple[float, float]:
+        """The least and the largest side of a marker over ``size_m``: listed ones have own."""
+        listed = [
+            each.size_m / values[ARRANGING.index("size_m")]
+            for values in self.arrangements(("kind", "size_m", "markers"))
+            if isinstance(board := arranged(values), Markers) for each in board.markers
+        ] if self.any_value("markers", bool) else []
+        return min(listed, default=1.0), max(listed, default=1.0)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether images are simulated at the poses of photographs."""
+        return self.fixed.get(SIMULATED) is True
+
+    @property
+    def shows_photographs(self) -> bool:
+        """Whether the images are photographs, not simulated at their poses."""
+        return PHOTOGRAPHS in self.given and not self.is_simulated
+
 
 _SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_pattern", "tagCols",
              "tagRows", "markers")
 """The parameters that a board's numbers of markers and corners depend on."""
 
 
-def shows_boards(pipeline: Grid) -> bool:
-    """Return whether the scenes of a pipeline show boards; single markers count as boards then.
-
-    Markers with something beside them do, too.
-    """
-    return any(pipeline.values_of("distractors")) or pipeline.any_value(
-        "kind", lambda kind: kind != SINGLE
-    )
-
-
-def target_word(pipeline: Grid) -> str:
-    """Return what the scenes of a pipeline show, in a word: marker, board, or target if both."""
-    if not shows_boards(pipeline):
-        return "marker"
-    return "target" if pipeline.any_value("kind", lambda kind: kind == SINGLE) else "board"
-
-
-def largest_board(pipeline: Grid) -> tuple[int, int]:
-    """Return the most markers and the most chessboard corners of a pipeline's boards."""
-    markers, corners = zip(
-        *(arranged(values).counts for values in pipeline.arrangements(_SIZED_BY)), strict=True
-    )
-    return max(markers), max(corners)
-
-
-def relative_sizes(pipeline: Grid) -> tuple[float, float]:
-    """Return the least and the largest side of a marker over ``size_m``: listed ones have own."""
-    listed = [
-        each.size_m / values[ARRANGING.index("size_m")]
-        for values in pipeline.arrangements(("kind", "size_m", "markers"))
-        if isinstance(board := arranged(values), Markers) for each in board.markers
-    ] if pipeline.any_value("markers", bool) else []
-    return min(listed, default=1.0), max(listed, default=1.0)
-
-
 # --------------------------------------------------------------------------------------------------
 # The effects and renderers of a pipeline: the built-in ones, and those of its plug-ins.
 
-def effects_of(plugins: Iterable[DeclaredPlugin]) -> tuple[Effect, ...]:
-    """Return the built-in effects and those of plug-ins, which are not imported for it."""
-    return (*EFFECTS, *(_effect(plugin) for plugin in plugins if plugin.kind == "effect"))
-
-
-def _effect(plugin: DeclaredPlugin) -> Effect:
+def effect_of(plugin: DeclaredPlugin) -> Effect:
+    """Return the effect of a plug-in, which is not imported for it: it lacks its function."""
     widens: Any = plugin.widens
     step: Any = plugin.step
     parameters = {setting.name: setting for setting in plugin.settings}
     return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
 
 
-def scene_plugins(pipeline: Grid) -> ScenePlugins:
-    """Return what a pipeline's plug-ins add to its scenes, imported.
-
-    Raises
-    ------
-    PluginError
-        If one is not the plug-in that was declared; in one line.
-    """
-    return _imported(pipeline.plugins, pipeline.folder)
-
-
 @lru_cache(maxsize=16)
-def _imported(plugins: tuple[DeclaredPlugin, ...], folder: str) -> ScenePlugins:
+def imported(plugins: tuple[DeclaredPlugin, ...], folder: str) -> ScenePlugins:
+    """Return what plug-ins add to scenes, imported; PluginError if one is not as declared."""
     effects, renderers, settings = [], {}, []
     for plugin in plugins:
         if plugin.kind == "effect":
             record = cast("EffectPlugin", plugin.record(folder))
-            effects.append(_effect(plugin).applying(checked_effect(plugin.name, record.apply)))
+            effects.append(effect_of(plugin).applying(checked_effect(plugin.name, record.apply)))
         elif plugin.kind == "renderer":
             renderer = cast("RendererPlugin", plugin.record(folder))
             renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from sweep.experiment.experiment import relative_sizes, target_word
 from sweep.experiment.grid import Experiment
 from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, STATED, WORLD
 from sweep.measure.detectors import (
@@ -282,7 +281,7 @@ class Facts:
             sides = given.broadcast(count) if not given.missing else (
                 fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
         sides = sides[sides > 0]  # before the camera
-        relative = relative_sizes(self.grid)
+        relative = self.grid.relative_sizes
         return CameraFacts(
             **{name: _ends(numbers) for name, numbers in {
                 "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
@@ -291,7 +290,7 @@ class Facts:
                 "off_centre_x": (cx - (width - 1) / 2) / width,
                 "off_centre_y": (cy - (height - 1) / 2) / height,
             }.items()},
-            square=bool(np.all(are_square(fx, fy))), boards=self.experiment.shows_boards,
+            square=bool(np.all(are_square(fx, fy))), boards=self.grid.shows_boards,
             side_px=None if not len(sides) else (
                 float(sides.min()) * relative[0], float(sides.max()) * relative[1]),
         )
@@ -432,7 +431,7 @@ class Facts:
                    "calibration_covariance states")
 
     def _visibility_notes(self) -> list[str]:
-        facts, target = self.poses, target_word(self.grid)
+        facts, target = self.poses, self.grid.target_word
         world = not self.grid.given.isdisjoint(WORLD)
         framed = not self.grid.given.isdisjoint(("frame_x", "frame_y"))
         lines = [f"{facts.share(chosen)} {what}" for chosen, what in (
@@ -466,7 +465,7 @@ class Facts:
         if in_camera and farther > FARTHER:
             distance = "side_px" if "side_px" in given else "distance_m"
             yield (f"{distance} counts along the optical axis: off it, the "
-                   f"{target_word(self.grid)}'s centre is up to {farther:.3g} times as far away")
+                   f"{self.grid.target_word}'s centre is up to {farther:.3g} times as far away")
         if ("azimuth_deg" in drawn or len(self.grid.values_of("azimuth_deg")) > 1) and not (
                 turned in drawn or self.grid.any_value(turned, bool)):
             yield f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0"
@@ -534,7 +533,7 @@ class Facts:
                     "{}, Sobol' points" if grid.sampling == "sobol" else "{}"),
             Part("background image", image, "background names a file" if image else "a level"),
             _listed("window", map(str, sorted(windows)), "the full frame",
-                    f"{{}} px around the {target_word(grid)}'s pixels{noise}"),
+                    f"{{}} px around the {grid.target_word}'s pixels{noise}"),
             _listed("plug-ins", map(_described, grid.plugins), "none is named"),
             Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
             Part("renderer", True, ", ".join(sorted(set(grid.values_of("renderer"))))),
@@ -560,7 +559,7 @@ class Facts:
             reasons.append("adaptiveThreshConstant is low for uneven light")
         if image:
             reasons.append("the background is an image: clutter near the "
-                           f"{target_word(self.grid)} may change the detection")
+                           f"{self.grid.target_word} may change the detection")
         return reasons + ['window = "full"'] * ("full" in self.grid.values_of("window"))
 
     def _effect(self, effect: Effect) -> Part:

@@ -28,20 +28,18 @@ from sweep.experiment.draws import (
 )
 from sweep.experiment.experiment import (
     Grid,
-    effects_of,
-    largest_board,
-    scene_plugins,
-    shows_boards,
+    effect_of,
+    imported,
 )
 from sweep.experiment.parameters import PARAMETERS, Stage
-from sweep.experiment.photographs import is_simulated, recorded_poses, shows_photographs
+from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
 from sweep.model.board_kinds import ARRANGING, arranged_board
 from sweep.model.camera import Column, canonical_distortion, map_columns
-from sweep.model.effects import Effect, ScenePlugins
+from sweep.model.effects import EFFECTS, Effect, ScenePlugins
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats
 
@@ -237,7 +235,7 @@ class Experiment:
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
         """The built-in effects and those of plug-ins, which are not imported for it."""
-        return effects_of(self.grid.plugins)
+        return (*EFFECTS, *(effect_of(each) for each in self.grid.plugins if each.kind == "effect"))
 
     @property
     def scene_plugins(self) -> ScenePlugins:
@@ -248,17 +246,7 @@ class Experiment:
         PluginError
             If one is not the plug-in that was declared; in one line.
         """
-        return scene_plugins(self.grid)
-
-    @cached_property
-    def shows_boards(self) -> bool:
-        """Whether scenes show boards; single markers count as boards then."""
-        return shows_boards(self.grid)
-
-    @cached_property
-    def largest_board(self) -> tuple[int, int]:
-        """The most markers and the most chessboard corners of a target."""
-        return largest_board(self.grid) if self.shows_boards else (1, 0)
+        return imported(self.grid.plugins, self.grid.folder)
 
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
@@ -269,6 +257,12 @@ class Experiment:
     def drawn(self) -> tuple[Variable, ...]:
         """Those of them that hold what is drawn for each scene."""
         return drawn_variables(self.grid)
+
+    def bytes_of(self, scenes: int) -> int:
+        """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
+        return scenes * sum(
+            variable.configurations(self.grid) * math.prod(variable.inner_shape)
+            * np.dtype(variable.dtype).itemsize for variable in self.variables)
 
     @cached_property
     def _constants(self) -> dict[str, Column]:
@@ -292,7 +286,7 @@ class Experiment:
                 values[name] = _column(along, index)
         trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
         values["distortion"] = values["distortion"].map(canonical_distortion)
-        if self.shows_boards:
+        if grid.shows_boards:
             values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
         drawn = grid.distributions
         if "background" not in drawn:
@@ -304,7 +298,7 @@ class Experiment:
             for effect in self.effects if effect.random
         )
         poses = {} if values["photographs"].missing else self._photographed(values, trials)
-        if shows_photographs(grid):
+        if grid.shows_photographs:
             return values | poses
         calibration = grid.calibration
         if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
@@ -342,7 +336,7 @@ class Experiment:
         names = values["photographs"].listed(len(trials))
         ids = values["marker_id"].broadcast(len(trials), np.int64)
         poses = recorded_poses(
-            names, self.grid.folder, trials, ids, simulated=is_simulated(self.grid)
+            names, self.grid.folder, trials, ids, simulated=self.grid.is_simulated
         )
         return {name: Column.of(column) for name, column in poses.items()}
 

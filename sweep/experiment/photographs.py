@@ -20,8 +20,7 @@ from sweep.declaration import Declaration, Declared, check_table, declared_field
 from sweep.errors import PluginError, SweepError
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.document import file_text, read_document
-from sweep.experiment.experiment import Grid
-from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
+from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
@@ -238,16 +237,6 @@ def _board(document: str) -> Board:
 def along_photographs(axes: Iterable[Axis]) -> list[bool]:
     """Return of each axis whether its values are other photographs."""
     return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
-
-
-def shows_photographs(pipeline: Grid) -> bool:
-    """Return whether the images of a pipeline are photographs, not simulated at their poses."""
-    return PHOTOGRAPHS in pipeline.given and not is_simulated(pipeline)
-
-
-def is_simulated(pipeline: Grid) -> bool:
-    """Return whether a pipeline's images are simulated at the poses of photographs."""
-    return pipeline.fixed.get(SIMULATED) is True
 
 
 def recorded_poses(

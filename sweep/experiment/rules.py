@@ -15,7 +15,6 @@ from sweep.errors import PluginError
 from sweep.experiment.axes import MAX_DEVIATIONS, TRIAL
 from sweep.experiment.document import HEADER, SEARCH, Reading
 from sweep.experiment.draws import REPLICATES, SAMPLINGS
-from sweep.experiment.experiment import shows_boards
 from sweep.experiment.parameters import (
     FIELDS_OF_VIEW,
     FOCAL_LENGTHS,
@@ -503,7 +502,7 @@ def boards_can_be_printed(reading: Reading) -> None:
             users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
             reading.refuse(name, f"kind = {users}, which uses it; kind = "
                            f"{' or '.join(dict.fromkeys(kinds))} does not: delete it")
-    if not shows_boards(reading) or needed or not all(map(reading.values_of, ARRANGING)):
+    if not reading.shows_boards or needed or not all(map(reading.values_of, ARRANGING)):
         return
     if "marker_id" in reading.given and any(reading.values_of("ids")):
         reading.refuse("ids", "ids, or marker_id of the first; not both")
@@ -547,7 +546,7 @@ def _bitmaps_fit(reading: Reading) -> None:
 def boards_are_searched_and_solved(reading: Reading) -> None:
     """Demand detectors, solvers and renderers that can do boards."""
     plugged = [each.name for each in reading.plugins if each.of_boards]
-    if not shows_boards(reading):
+    if not reading.shows_boards:
         reading.refuse_values("solver", "a solver of single markers, or a board: give kind under "
                               "[board]", lambda name: name in plugged)
         for name in reading.given & {"points", "refine", "refineDetectedMarkers", "minMarkers"}:

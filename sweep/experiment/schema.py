@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.draws import CALIBRATED
-from sweep.experiment.experiment import largest_board, shows_boards
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
 from sweep.measure.flags import (
     BoundStatus,
@@ -560,7 +559,7 @@ def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     drawn = drawn_variables(pipeline)
     photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
     common = SCHEMA
-    if shows_boards(pipeline):
+    if pipeline.shows_boards:
         common = tuple(each for each in common if each.name not in NOT_OF_BOARDS)
         common += _board_variables(pipeline)
     return common + drawn + photographed
@@ -568,19 +567,9 @@ def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
 
 def _board_variables(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables of a pipeline's boards, as long as its largest board."""
-    markers, corners = largest_board(pipeline)
+    markers, corners = pipeline.largest_board
     lengths = (("marker", markers), ("chessboard_corner", corners))
     return tuple(
         dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
         if corners or "chessboard_corner" not in variable.inner
-    )
-
-
-def bytes_per_block(pipeline: Grid, scenes: int) -> int:
-    """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
-    return scenes * sum(
-        variable.configurations(pipeline)
-        * math.prod(variable.inner_shape)
-        * np.dtype(variable.dtype).itemsize
-        for variable in variables_of(pipeline)
     )

@@ -15,7 +15,6 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
-from sweep.experiment.experiment import scene_plugins
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import (
     Child,
@@ -381,7 +380,7 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
         ):
             build(estimator)
     else:
-        scene_plugins(pipeline)
+        _ = pipeline.experiment.scene_plugins
 
 
 def _first(values: Iterable[object]) -> list[Any]:

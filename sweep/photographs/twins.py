@@ -13,7 +13,7 @@ from sweep.errors import ArgumentError, PluginError
 from sweep.experiment.axes import TRIAL, parse_distribution
 from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
-from sweep.experiment.photographs import PhotographRecord, read_record, shows_photographs
+from sweep.experiment.photographs import PhotographRecord, read_record
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
@@ -47,7 +47,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     ArgumentError, PipelineError
         If the pipeline is not one of photographs, or the scene is not valid.
     """
-    if not shows_photographs(pipeline):
+    if not pipeline.shows_photographs:
         raise ArgumentError(
             "photographs", plain(pipeline.name),
             "expected a store of photographs, as `sweep photos` makes it",

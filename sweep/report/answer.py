@@ -20,7 +20,6 @@ from sweep.analysis.requirements import (
     verdicts,
 )
 from sweep.errors import DatasetError, StoreError
-from sweep.experiment.experiment import target_word
 from sweep.report.comparison import CARDS, COUNTED, Comparison, comparison
 from sweep.report.decisions import WORDS, condition_table, decision_table, valued
 from sweep.report.error_model_file import error_model_tables
@@ -257,7 +256,7 @@ def _headline(
 ) -> str:
     """Return the answer in one line."""
     if not int(compared.known.summary["looked_for"].sum()):
-        return (f"The {target_word(data.pipeline)} was looked for in no pose: it was visible and "
+        return (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
                 "modelled in none.")
     if decided is not None:
         return decided.line
@@ -275,7 +274,7 @@ def _notes(data: ReportData, known: Configurations) -> str:
     warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
     return warnings + sentences(
         "A board counts as detected if at least one of its markers is."
-        if data.pipeline.experiment.shows_boards else "",
+        if data.pipeline.shows_boards else "",
         interval_note(data), *known.settings.grouping.notes,
         data.pooled(*known.settings.axes))
 

@@ -27,7 +27,6 @@ from sweep.analysis.decisions import Reached
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
-from sweep.experiment.experiment import target_word
 from sweep.experiment.parameters import Stage
 from sweep.experiment.same_meaning import used_settings
 from sweep.measure.flags import BoundStatus, outcomes, present_values
@@ -228,7 +227,7 @@ def _detection(data: ReportData) -> Figure | None:
         return None
     axis = data.size_axis
     along = AREA if axis is None or data.length(axis) >= MIN_BINNED_SIZES else axis
-    word = target_word(data.pipeline)
+    word = data.pipeline.target_word
     detected = f"the {word} is detected" + (", by at least one marker" * (word != "marker"))
     return along_axis(data, detection_rate, along, (Stage.detection,)).figure(
         "detection", f"Detection rate by {short_name(along)}",
@@ -269,7 +268,7 @@ def _bias(data: ReportData) -> Figure | None:
         "bias", f"Bias by {short_name(along)}",
         "Mean error of the solved poses that are not flipped, estimated minus true: the range in "
         "percent of the true depth; x (right), y (down) and z (forward) of the "
-        f"{target_word(data.pipeline)}'s position in the camera's frame; yaw. The table also has "
+        f"{data.pipeline.target_word}'s position in the camera's frame; yaw. The table also has "
         "the standard deviations, and pitch and roll.", "Bias and standard deviation",
         SIGNED_COLUMNS, SIGNED_CURVES, counted="solved")
 
@@ -364,7 +363,7 @@ def _frame(data: ReportData) -> Figure | None:
         for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS)))), (Stage.detection,)
     ).figure(
         "frame", "Detection by place in the frame",
-        f"Detection rate by the place of the {target_word(data.pipeline)}'s centre in the frame, "
+        f"Detection rate by the place of the {data.pipeline.target_word}'s centre in the frame, "
         "in percent of its width and height from the top left corner.", "Detection rate by place",
         RATES, [DETECTED], by=data.label(DOWN))
 

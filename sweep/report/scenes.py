@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.experiment.cell_selection import cell, coordinates_text, selection_text
-from sweep.experiment.experiment import target_word
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.integrity.recomputation import StoredValues, compare
@@ -471,7 +470,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         scene, result=result, picture=encoded.tobytes(),
         problem=f"Differs from the store: {difference}." if difference else "",
         size=(picture.shape[1], picture.shape[0]),
-        alt=f"Rendered {target_word(data.pipeline)} with its true outline and the detections: "
+        alt=f"Rendered {data.pipeline.target_word} with its true outline and the detections: "
             f"{result}",
         chessboard=bool(np.isfinite(inspected.chessboard).any()),
     )

@@ -21,7 +21,6 @@ from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import is_simulated
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import (
     LABELS,
@@ -232,7 +231,7 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
         (name, digest) for name, digest in pipeline.files.items()
         if name.lower().endswith(IMAGE_SUFFIXES)
     )
-    if is_simulated(pipeline):  # two cameras' photographs have the same names
+    if pipeline.is_simulated:  # two cameras' photographs have the same names
         files = files[: len({name.rpartition("/")[2] for name, _ in files})]
         files *= -(-len(trials) // max(len(files), 1))
     if len(files) < len(trials):

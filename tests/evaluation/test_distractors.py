@@ -54,7 +54,7 @@ def searched(chosen, count, window):
     values = chosen.experiment.scene_values(block_indices(Block((0,) * len(shape), shape)))
     scenes = build_scenes(values, count)
     visible = visibility_flags(scenes) == DetectionStatus.not_run
-    boards = values["board"].listed(count), chosen.experiment.largest_board
+    boards = values["board"].listed(count), chosen.largest_board
     full = window == "full"
     return scenes, searching.searched(
         scenes, DetectorSetting(), full=full, wanted=visible, boards=boards).found
@@ -111,7 +111,7 @@ def test_a_target_is_visible_and_as_large_as_without_distractors(board):
             for more in (({} if board is GRID else {"distractors": [SQUARE]}),
                          {"distractors": BESIDE})
         )
-        assert beside.experiment.largest_board == plain.experiment.largest_board
+        assert beside.largest_board == plain.largest_board
         for name in ("marker_area_px", "detection", "marker_detection", "board_marker_id"):
             np.testing.assert_array_equal(one(beside, name), one(plain, name))
     # At the last pose the frame shows the distractor with the board's ID alone.
@@ -144,5 +144,5 @@ def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(besid
     flags = visibility_flags(scenes)
     assert flags[0] == expected
     boards = target_scenes(
-        scenes, flags, values["board"].listed(1), chosen.experiment.largest_board)
+        scenes, flags, values["board"].listed(1), chosen.largest_board)
     assert (boards.flags == expected).all()

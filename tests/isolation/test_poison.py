@@ -14,7 +14,6 @@ from support.stores import by_hand
 from sweep.experiment.cell_selection import cell as cell_at
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import variables_of
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
@@ -69,7 +68,7 @@ def expected(reference, pipeline, poisons):
 
     The flags are those of the stage that is hit; the stages after it have nothing to work on.
     """
-    values = {v.name: reference[v.name].to_numpy().copy() for v in variables_of(pipeline)}
+    values = {v.name: reference[v.name].to_numpy().copy() for v in pipeline.experiment.variables}
     changed = {name: np.zeros(array.shape, dtype=bool) for name, array in values.items()}
     for poison in poisons:
         named = dict(poison.setting + poison.solver)
@@ -87,7 +86,7 @@ def expected(reference, pipeline, poisons):
         }
         if first is Stage.estimation:
             flags["estimate"] = EstimateStatus.crashed if poison.deadly else EstimateStatus.failed
-        for v in variables_of(pipeline):
+        for v in pipeline.experiment.variables:
             if v.stage >= first:
                 where = tuple(at.get(name, slice(None)) for name in v.dimensions(pipeline))
                 values[v.name][where] = np.nan if v.flags is None else flags[v.name]

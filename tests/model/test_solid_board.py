@@ -150,7 +150,7 @@ def test_an_image_is_that_of_rays(name, tilt_deg):
     )
     assert fine < 0.8
     assert fine < 0.3 * coarse or fine == coarse == 0
-    assert chosen.experiment.largest_board[0] == (4 if ground else len(declared["markers"]))
+    assert chosen.largest_board[0] == (4 if ground else len(declared["markers"]))
 
 
 MOTION = {"velocity_x_m_s": 0.5, "velocity_y_m_s": -0.3, "velocity_z_m_s": 0.4,

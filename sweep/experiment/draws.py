@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from hashlib import blake2b
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,10 +40,10 @@ from sweep.typing import Floats, Integers
 # --------------------------------------------------------------------------------------------------
 # Sobol' points, scrambled: draws of several quantities that fill their space evenly.
 #
-# Points are those of Sobol' (USSR Computational Mathematics and Mathematical Physics 7(4), 1967)
-# with the direction numbers of Joe and Kuo ("Constructing Sobol sequences with better two-
-# dimensional projections", SIAM Journal on Scientific Computing 30(5), 2008; their file new-joe-
-# kuo-6.21201), in the order of Antonov and Saleev's Gray code. They are randomised by Owen's
+# SciPy's points are those of Sobol' (USSR Computational Mathematics and Mathematical Physics 7(4),
+# 1967) with the direction numbers of Joe and Kuo ("Constructing Sobol sequences with better two-
+# dimensional projections", SIAM Journal on Scientific Computing 30(5), 2008), in the order of
+# Antonov and Saleev's Gray code. They are randomised by Owen's
 # nested uniform scrambling ("Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995): each
 # binary digit is flipped by a random bit that depends on the digits before it. So each point is
 # uniform, and replicates with scrambles of their own are independent.
@@ -55,49 +54,29 @@ REPLICATES = 16
 BITS = 32
 """Binary digits of a point; those beyond are random."""
 
-_NUMBERS = tuple(
-    tuple(map(int, line.split()))
-    for line in Path(__file__).with_name("sobol_directions.txt").read_text().splitlines()
-)
-"""Of each dimension after the first: the bits of its primitive polynomial, and m_1, m_2, ..."""
-
-DIMENSIONS = len(_NUMBERS) + 1
-"""The most quantities that can be drawn together."""
+MAX_GAP = 1000
+"""Points between two wanted ones that are generated and not skipped."""
 
 _STEP_SOBOL = np.uint64(0x9E3779B97F4A7C15)
 _ONE = np.uint64(1)
 
 
-@cache
-def directions(dimension: int) -> tuple[int, ...]:
-    """Return the direction numbers (:data:`BITS`,) of a dimension from 0, as fractions of 2^32.
-
-    Joe and Kuo 2008, section 2, equations 2 and 3.
-    """
-    if dimension == 0:
-        numbers = [1] * BITS
-    else:
-        polynomial, *numbers = _NUMBERS[dimension - 1]
-        degree = polynomial.bit_length() - 1
-        for k in range(degree, BITS):
-            number = numbers[k - degree] ^ (numbers[k - degree] << degree)
-            for j in range(1, degree):
-                if polynomial >> (degree - j) & 1:
-                    number ^= numbers[k - j] << j
-            numbers.append(number)
-    return tuple(number << (BITS - 1 - k) for k, number in enumerate(numbers))
-
-
 def points(dimension: int, index: Integers) -> NDArray[np.uint64]:
     """Return the points (N,) of a dimension at indices (N,) of the sequence, times 2^32."""
-    index = np.asarray(index, dtype=np.uint64)
-    gray = index ^ (index >> _ONE)
-    found = np.zeros(index.shape, dtype=np.uint64)
-    highest = int(gray.max(initial=0)).bit_length()
-    for k, direction in enumerate(directions(dimension)[:highest]):
-        bit = (gray >> np.uint64(k)) & _ONE
-        found ^= bit * np.uint64(direction)
-    return found
+    from scipy.stats import qmc  # noqa: PLC0415  (slow to import, for few pipelines)
+
+    wanted, back = np.unique(np.asarray(index, dtype=np.int64), return_inverse=True)
+    engine = qmc.Sobol(dimension + 1, scramble=False, bits=BITS)
+    parts = []
+    # Trials of one cell may be far apart: what lies between them is skipped, not generated.
+    for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > MAX_GAP) + 1):
+        engine.reset()
+        if run[0]:
+            engine.fast_forward(int(run[0]))
+        # SciPy warns where the first points that are asked for are not 2^k.
+        count = 1 << int(run[-1] - run[0]).bit_length()
+        parts.append(engine.random(count)[run - run[0], dimension])
+    return np.asarray((np.concatenate(parts) * 2.0**BITS).astype(np.uint64)[back])
 
 
 def scrambled(digits: NDArray[np.uint64], keys: NDArray[np.uint64]) -> Floats:

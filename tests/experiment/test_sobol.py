@@ -3,22 +3,17 @@
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.stats import qmc
 
 import sweep
 from sweep.errors import PipelineError
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.draws import (
     BITS,
-    DIMENSIONS,
     REPLICATES,
-    jointly_drawn,
     points,
     scrambled,
     sobol_uniform,
 )
-from sweep.experiment.parameters import PARAMETERS
-from sweep.model.calibration import CalibrationError
 from sweep.store.provenance import fingerprint
 
 
@@ -38,21 +33,15 @@ def drawn(grid, *indices):
             ("tilt_deg", "roll_deg", "shift_u_px", "shift_v_px")}
 
 
-def test_points_are_those_of_scipy():
-    reference = qmc.Sobol(DIMENSIONS, scramble=False, bits=30)
-    expected = reference.random(2048)
-    far = qmc.Sobol(DIMENSIONS, scramble=False, bits=BITS).fast_forward(123_456).random(8)
-    for dimension in range(DIMENSIONS):
-        ours = points(dimension, np.arange(2048)) * 2.0**-BITS
-        np.testing.assert_array_equal(ours, expected[:, dimension])
-        ours = points(dimension, np.arange(123_456, 123_464)) * 2.0**-BITS
-        np.testing.assert_array_equal(ours, far[:, dimension])
-
-
-def test_every_drawable_quantity_has_a_dimension():
-    drawable = [name for name, each in PARAMETERS.items() if each.declaration.drawable]
-    calibrated = CalibrationError.of((1.0,) * 18, (), 14).names
-    assert len(jointly_drawn(drawable, calibrated)) <= DIMENSIONS
+def test_points_are_sobols_wherever_they_are_asked_for():
+    # Of the first dimension they are van der Corput's, in the order of the Gray code.
+    index = np.array([0, 1, 2, 3, 70_000, 70_001, 5, 3])
+    gray = index ^ (index >> 1)
+    reversed_digits = [int(f"{number:0{BITS}b}"[::-1], 2) for number in gray.tolist()]
+    np.testing.assert_array_equal(points(0, index), np.array(reversed_digits, dtype=np.uint64))
+    # Joe and Kuo 2008: the first points of the second and third dimension.
+    np.testing.assert_array_equal(points(1, np.arange(5)) * 2.0**-BITS, [0, .5, .25, .75, .375])
+    np.testing.assert_array_equal(points(2, np.arange(5)) * 2.0**-BITS, [0, .5, .25, .75, .625])
 
 
 def test_scrambling_is_nested_and_uniform():

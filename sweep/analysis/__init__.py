@@ -18,10 +18,17 @@ from sweep.analysis.decisions import (
 )
 from sweep.analysis.error_models import error_models, model_covariance, model_errors
 from sweep.analysis.poses import per_marker
-from sweep.analysis.rates import detection_rate, failure_composition, flip_rate, marker_ranking
 from sweep.analysis.requirements import check_requirements
 from sweep.analysis.simulation_gaps import simulation_gap
-from sweep.analysis.summaries import covariance_trust, efficiency, error_statistics
+from sweep.analysis.summaries import (
+    covariance_trust,
+    detection_rate,
+    efficiency,
+    error_statistics,
+    failure_composition,
+    flip_rate,
+    marker_ranking,
+)
 
 __all__ = [
     "ambiguity", "calibration_summary", "camera_calibrations", "check_requirements", "compare",

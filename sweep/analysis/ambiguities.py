@@ -6,10 +6,8 @@ The ratio of a pose is its reprojection error over that of the other planar solu
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -24,7 +22,6 @@ from sweep.analysis.dataset import (
     stacked,
 )
 from sweep.analysis.estimator import (
-    INTERVAL,
     TAIL_SHARE,
     Bins,
     Count,
@@ -35,11 +32,11 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
-from sweep.analysis.rates import FLIPPED, SOLVED
+from sweep.analysis.summaries import FLIPPED, SOLVED
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.typing import Floats, Integers, Masks
+from sweep.typing import Floats, Masks
 
 THRESHOLDS = (
     0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, np.inf)
@@ -182,17 +179,20 @@ def ambiguity(
     if not (_is_number(min_kept) and 0.0 <= min_kept <= 1.0):
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
     kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
-    statistics: list[Statistic[AmbiguousPoses]] = [
+    inputs = {name: array.compute() for name, array in pose_arrays(results, RATIO_INPUTS).items()}
+    counts: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution",
-              lambda poses: poses.single),
-        *(rate for threshold in tried for rate in _rates(threshold)),
-    ]
-    table = aggregate(
-        results, pose_arrays(results, RATIO_INPUTS), kept, statistics, AmbiguousPoses, bins)
+              lambda poses: poses.single)]
+    table = aggregate(results, inputs, kept, counts, AmbiguousPoses, bins)
+    at_thresholds = [aggregate(results, inputs, kept, _rates(threshold), AmbiguousPoses, bins)
+                     for threshold in tried]
+    table = table.assign(stacked(at_thresholds, "threshold")).assign_coords(
+        threshold=("threshold", tried, cf_attributes(
+            "largest ratio of both reprojection errors that is kept", "1")))
     tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
-    return _with_choice(_along_thresholds(table, tried), flip_rate, min_kept, tail)
+    return _with_choice(table, flip_rate, min_kept, tail)
 
 
 def _is_number(value: object) -> bool:
@@ -211,115 +211,66 @@ def _checked_thresholds(thresholds: Iterable[float]) -> list[float]:
     return sorted({*numbers.tolist(), np.inf})
 
 
-Masked = Callable[[AmbiguousPoses], Masks]
-
-RATES = {
-    "kept_rate": "kept of the solved poses",
-    "kept_flip_rate": "flips of the kept poses",
-    "flips_kept_rate": "kept of the flips",
-    "right_rejected_rate": "rejected of the poses that are not flipped",
-    "rejected_right_rate": "not flipped of the rejected poses",
-}
-"""Rates at a threshold, and what they are."""
-
-
 def _rates(threshold: float) -> list[Rate[AmbiguousPoses]]:
-    """Return the rates at a threshold; the threshold stands behind their names."""
+    """Return the rates at a threshold."""
     def kept(poses: AmbiguousPoses) -> Masks:
         return poses.kept(threshold)
 
     def rejected(poses: AmbiguousPoses) -> Masks:
         return np.asarray(poses.solved & ~poses.kept(threshold))
 
-    of: dict[str, tuple[Masked, Masked]] = {
-        "kept_rate": (kept, lambda poses: poses.solved),
-        "kept_flip_rate": (lambda poses: poses.flipped, kept),
-        "flips_kept_rate": (kept, lambda poses: poses.flipped),
-        "right_rejected_rate": (rejected, lambda poses: poses.unflipped),
-        "rejected_right_rate": (lambda poses: poses.unflipped, rejected),
-    }
     return [
-        Rate(_at(name, threshold), RATES[name], successes, used, exact=True,
-             counts=((_at(f"{name} n", threshold), ""), (_at(f"{name} hits", threshold), "")),
-             draws_name=_at(f"{name} draws", threshold))
-        for name, (successes, used) in of.items()
+        Rate("kept_rate", "kept of the solved poses", kept, lambda poses: poses.solved,
+             exact=True),
+        Rate("kept_flip_rate", "flips of the kept poses", lambda poses: poses.flipped, kept,
+             exact=True, counts=(("kept", "poses that the threshold keeps"),
+                                 ("kept_flipped", "flips that the threshold keeps"))),
+        Rate("flips_kept_rate", "kept of the flips", kept, lambda poses: poses.flipped,
+             exact=True),
+        Rate("right_rejected_rate", "rejected of the poses that are not flipped", rejected,
+             lambda poses: poses.unflipped, exact=True),
+        Rate("rejected_right_rate", "not flipped of the rejected poses",
+             lambda poses: poses.unflipped, rejected, exact=True),
     ]
 
 
-def _at(name: str, threshold: float, end: str = "") -> str:
-    """Return the name of a variable at one threshold."""
-    return f"{name} {threshold!r}{end}"
-
-
-def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
-    """Return a table of variables at single thresholds as one of variables along them."""
-    def along(name: str, end: str = "") -> xr.DataArray:
-        return stacked([table[_at(name, threshold, end)] for threshold in tried], "threshold")
-
-    variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}
-    for name, source, meaning in (
-        ("kept", "kept_flip_rate n", "poses that the threshold keeps"),
-        ("kept_flipped", "kept_flip_rate hits", "flips that the threshold keeps"),
-        ("draws", "kept_flip_rate draws", "random draws that the kept poses are worth"),
-    ):
-        variables[name] = along(source).assign_attrs(cf_attributes(meaning, "1"))
-    for name, meaning in RATES.items():
-        for end, words in INTERVAL.items():
-            variables[f"{name}{end}"] = along(name, end).assign_attrs(
-                cf_attributes(words + meaning, "1"))
-    coordinates = {"threshold": ("threshold", list(tried), cf_attributes(
-        "largest ratio of both reprojection errors that is kept", "1"))}
-    return xr.Dataset(variables, table.coords).assign_coords(coordinates)
-
-
 CHOSEN = {
-    "chosen_threshold": "largest threshold that is shown to keep the wanted flip rate",
-    "chosen_kept_rate": "kept of the solved poses, at the chosen threshold",
-    "chosen_flip_rate": "flips of the kept poses, at the chosen threshold",
-    "chosen_flip_rate_bound": "upper bound of the flip rate at the chosen threshold",
-    "chosen_right_rejected_rate": "rejected of the poses not flipped, at the chosen threshold",
+    "threshold": ("threshold", "largest threshold that is shown to keep the wanted flip rate"),
+    "kept_rate": ("kept_rate", "kept of the solved poses, at the chosen threshold"),
+    "flip_rate": ("kept_flip_rate", "flips of the kept poses, at the chosen threshold"),
+    "flip_rate_bound": ("bound", "upper bound of the flip rate at the chosen threshold"),
+    "right_rejected_rate": (
+        "right_rejected_rate", "rejected of the poses not flipped, at the chosen threshold"),
 }
+"""What is told at the chosen threshold: its name there, and what it is."""
 
 
 def _with_choice(
     table: xr.Dataset, flip_rate: float, min_kept: float, tail: float
 ) -> xr.Dataset:
     """Return the table with the chosen threshold of each group."""
-    inputs = [table[name] for name in (
-        "threshold", "kept", "kept_flipped", "draws", "kept_rate", "kept_flip_rate",
-        "kept_flip_rate_low", "right_rejected_rate")]
-    choice, *values = xr.apply_ufunc(
-        functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept, tail=tail), *inputs,
-        input_core_dims=[["threshold"]] * len(inputs),
-        output_core_dims=[[]] * (1 + len(CHOSEN)))
-    chosen = {name: value.assign_attrs(cf_attributes(meaning, "1"))
-              for (name, meaning), value in zip(CHOSEN.items(), values, strict=True)}
-    chosen["choice"] = choice.assign_attrs(
+    _, most = scaled_to_draws(*(table[name].values for name in ("kept_flipped", "kept", "draws")))
+    level = 1.0 - 2.0 * tail / table.sizes["threshold"]
+    bound = table["kept"].copy(data=clopper_pearson(most, table["draws"], level)[1])
+    useful = (table["kept_rate"] >= min_kept) | np.isinf(table["threshold"])
+    low = table["kept_flip_rate_low"]
+    meets = useful & low.notnull() & (bound <= flip_rate)
+    of_all = {"threshold": -1}
+    choice = xr.full_like(table["solved"], ThresholdChoice.too_few_draws)
+    for where, flag_ in (
+        (((low > flip_rate) | ~useful).all("threshold"), ThresholdChoice.none),
+        (meets.any("threshold"), ThresholdChoice.found),
+        (meets.isel(of_all), ThresholdChoice.not_needed),
+        (low.isel(of_all).isnull(), ThresholdChoice.nothing_drawn),
+        (table["kept"].isel(of_all) == 0, ThresholdChoice.not_run),
+    ):
+        choice = choice.where(~where, flag_)
+    # The largest threshold that meets.
+    at = (meets * np.arange(table.sizes["threshold"])).argmax("threshold")
+    columns = table.assign(bound=bound).isel(threshold=at).reset_coords("threshold").where(
+        meets.any("threshold"))
+    chosen = {f"chosen_{name}": columns[source].assign_attrs(cf_attributes(meaning, "1"))
+              for name, (source, meaning) in CHOSEN.items()}
+    chosen["choice"] = choice.astype(np.uint8).assign_attrs(
         cf_attributes("whether a threshold keeps the wanted flip rate", flags=ThresholdChoice))
     return table.assign(chosen).assign_attrs(flip_rate=flip_rate, min_kept=min_kept)
-
-
-def _choose(
-    thresholds: Floats, n: Integers, hits: Integers, draws: Integers, share: Floats, rate: Floats,
-    low: Floats, right_rejected: Floats, flip_rate: float, min_kept: float, tail: float,
-) -> tuple[Any, ...]:
-    """Return the flag and the values of `CHOSEN`; arrays are (..., thresholds)."""
-    _, most = scaled_to_draws(hits, n, draws)
-    bound = clopper_pearson(most, draws, 1.0 - 2.0 * tail / len(thresholds))[1]
-    useful = (share >= min_kept) | np.isinf(thresholds)
-    meets = useful & ~np.isnan(low) & (bound <= flip_rate)
-    last = len(thresholds) - 1
-    at = np.where(meets.any(axis=-1), last - np.argmax(meets[..., ::-1], axis=-1), last)
-    none = ((low > flip_rate) | ~useful).all(axis=-1)
-    choice = np.select(
-        [n[..., -1] == 0, np.isnan(low[..., -1]), meets[..., -1], meets.any(axis=-1), none],
-        [ThresholdChoice.not_run, ThresholdChoice.nothing_drawn, ThresholdChoice.not_needed,
-         ThresholdChoice.found, ThresholdChoice.none], ThresholdChoice.too_few_draws)
-    exists = meets.any(axis=-1)
-
-    def chosen(values: Floats) -> Floats:
-        picked = np.take_along_axis(np.broadcast_to(values, n.shape), at[..., None], axis=-1)
-        return np.where(exists, picked[..., 0], np.nan)
-
-    return (choice.astype(np.uint8), chosen(thresholds), chosen(share), chosen(rate),
-            chosen(bound), chosen(right_rejected))

@@ -31,6 +31,8 @@ from sweep.plugins.declared import recorded_plugins
 DRAWS = "trial"
 """The dimension of random draws."""
 
+Labelled = TypeVar("Labelled", xr.Dataset, xr.DataArray)
+
 
 def axes_of(results: xr.Dataset, *stages: Stage) -> list[str]:
     """Return the axes of the schema's variables (of some stages, or of all), in their order."""
@@ -207,10 +209,11 @@ def require_dimension(results: xr.Dataset, *names: str) -> str:
                        f"there are {', '.join(axes) or 'none'}")
 
 
-def stacked(arrays: Sequence[xr.DataArray], dim: str) -> xr.DataArray:
-    """Return arrays of the same coordinates as one, whose last dimension is a new one."""
+def stacked(parts: Sequence[Labelled], dim: str) -> Labelled:
+    """Return arrays, or tables, of the same coordinates as one, whose last dimension is new."""
+    options: Any = {"data_vars": "all"} if isinstance(parts[0], xr.Dataset) else {}
     return xr.concat(
-        arrays, dim=dim, coords="minimal", compat="override", join="exact",
+        parts, dim=dim, coords="minimal", compat="override", join="exact", **options,
     ).transpose(..., dim)
 
 
@@ -486,9 +489,6 @@ UNKNOWN = "unknown"
 
 UNNAMED = 255
 """Where a table of labels has :data:`UNKNOWN`: flags are stored as uint8, and none has so many."""
-
-Labelled = TypeVar("Labelled", xr.Dataset, xr.DataArray)
-
 
 def decode_flags(results: Labelled) -> Labelled:
     """Return results with every flag in words: ``"detected"`` in place of 1.

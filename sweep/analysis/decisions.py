@@ -41,7 +41,6 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor, wilson
 from sweep.analysis.poses import Poses
-from sweep.analysis.rates import LOOKED_FOR, detection_rate
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
     MIN_DRAWS,
@@ -62,6 +61,7 @@ from sweep.analysis.requirements import (
     requirables,
     worst_cell,
 )
+from sweep.analysis.summaries import LOOKED_FOR, detection_rate
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.axes import TRIAL
 from sweep.experiment.document import SEARCH

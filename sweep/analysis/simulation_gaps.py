@@ -47,7 +47,7 @@ from sweep.analysis.intervals import (
     unit_counts,
 )
 from sweep.analysis.poses import ERROR_INPUTS, INSIDE, QUANTITIES, Poses, pose_arrays
-from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE
+from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import DatasetError
 from sweep.experiment.parameters import PARAMETERS, SIMULATED, Stage
 from sweep.messages import label, shown
@@ -317,8 +317,8 @@ class Compared:
     percent: int = 50
 
 
-RATES = tuple(Compared(name=each.rate.name, meaning=each.rate.meaning, rate=each.rate)
-              for each in (DETECTION_RATE, FLIP_RATE))
+RATES = tuple(Compared(name=rate.name, meaning=rate.meaning, rate=rate)
+              for rate in (DETECTION_RATE, FLIP_RATE))
 
 QUANTILES = (
     Compared(name="range_bias_percent", meaning="median depth error of the true depth, solved",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sweep.analysis.rates import OUTCOMES
+from sweep.analysis.summaries import OUTCOMES
 from sweep.measure.flags import EstimateStatus
 from tests.support.recipes import added, printed_by
 

@@ -28,6 +28,7 @@ from sweep.model.camera import Column
 from sweep.model.polygon import signed_areas
 from sweep.model.scene import Scenes
 from sweep.store.files import write_whole
+from sweep.store.layout import planned_arrays
 from sweep.store.locations import reason_of
 from sweep.typing import Integers, Masks
 
@@ -298,16 +299,17 @@ class TruthTables:
         """Return the truth over the experiment's scene axes."""
         axes = self.pipeline.experiment.scene_axes
         dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
-        corner_dims = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
-        inner = {name: VARIABLES[name].inner for name in (*GEOMETRY, "marker_area_px")}
-        attributes = {name: VARIABLES[name].attributes() for name in inner} | {
+        drawn_names = {each.name for each in drawn}
+        described = {name: VARIABLES[name] for name in (*GEOMETRY, "marker_area_px")} | {
+            each.name: each for each in drawn}
+        inner = {name: each.inner for name, each in described.items() if name not in drawn_names}
+        inner["true_corners_px"] = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
+        attributes = {name: each.attributes() for name, each in described.items()} | {
             "true_corners_px": {
                 "long_name": "true corners in the frame; pixel (0, 0) is the centre of the top "
                 "left pixel", "units": "px"},
             "image": {"long_name": "name of the image; empty where the target is not visible"},
-            **{each.name: each.attributes() for each in drawn},
         }
-        inner |= {"true_corners_px": corner_dims}
         variables: dict[str, Any] = {
             name: (
                 dims + inner.get(name, ()), values.reshape(shape + values.shape[1:]),
@@ -316,18 +318,11 @@ class TruthTables:
             for name, values in columns.items()
         }
         coordinates: dict[str, Any] = {
-            name: list(LABELS[name]) for name in ("corner", "xy", "xyz")
-        } | {each.name: variables.pop(each.name) for each in drawn}
-        for axis in axes:
-            unit = {"units": axis.unit} if axis.unit else {}
-            coordinates[axis.name] = (
-                axis.name, _plain(axis.coordinates()), {"long_name": axis.meaning, **unit}
-            )
-            coordinates |= {
-                name: (axis.name, _plain(np.array([label(v) if isinstance(v, tuple) else v
-                                                   for v in values])))
-                for name, values in axis.zipped
-            }
+            each.path: (each.dimensions, _plain(each.values), each.attributes)
+            for each in planned_arrays(self.pipeline, shape)
+            if each.values is not None  # noqa: PD011  (of an array that is planned)
+            and {*each.dimensions} <= {*dims, "corner", "xy", "xyz"}
+        } | {name: variables.pop(name) for name in drawn_names}
         return xr.Dataset(
             variables, coordinates,
             {"title": self.pipeline.heading, "pipeline": self.pipeline.text},
@@ -336,8 +331,6 @@ class TruthTables:
 
 def _plain(values: Any) -> Any:
     """Return coordinates in types that netCDF has."""
-    if values.dtype.kind in "TU":
-        return values.astype(object)
     return values.astype(np.int8) if values.dtype.kind == "b" else values
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
 from sweep.model.pose import rotation_of_vector
 from sweep.processor import processor
-from sweep.store.blocks import RunStore, committed, missing_chunks, receipts, region
+from sweep.store.blocks import RunStore, committed, missing_chunks, receipts
 from sweep.store.provenance import differences
 
 # --------------------------------------------------------------------------------------------------
@@ -24,24 +23,19 @@ from sweep.store.provenance import differences
 StoredValues = dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class StoredCell:
-    """A cell of a store.
-
-    Attributes
-    ----------
-    values
-        Variable -> its value, of the dimensions that are no axes.
-    same_processor
-        Whether it was computed on a processor with the features of this one.
-    """
-
-    values: StoredValues
-    same_processor: bool
+def stored_values(store: RunStore, index: Mapping[str, int | slice]) -> StoredValues:
+    """Return every variable at an index along axes; axes that it does not name are whole."""
+    return {
+        variable.name: np.asarray(store.array(variable.name)[tuple(
+            index.get(name, slice(None)) for name in variable.dimensions(store.pipeline))])
+        for variable in store.variables
+    }
 
 
-def stored_cell(store: RunStore, index: Mapping[str, int]) -> StoredCell | None:
+def stored_cell(store: RunStore, index: Mapping[str, int]) -> tuple[StoredValues, bool] | None:
     """Return the cell at an index along each axis; None if its block is not committed.
+
+    The second value tells whether a processor with the features of this one computed it.
 
     Raises
     ------
@@ -56,25 +50,14 @@ def stored_cell(store: RunStore, index: Mapping[str, int]) -> StoredCell | None:
     for key in missing_chunks(store, [number]).values():
         raise StoreError(
             f"{store.url}: damaged: {key} is missing; `sweep verify --repair` repairs it")
-    values = {}
-    for variable in store.variables:
-        part = tuple(
-            index.get(name, slice(None)) for name in variable.dimensions(store.pipeline)
-        )
-        values[variable.name] = np.asarray(store.array(variable.name)[part])
-    return StoredCell(values, tuple(receipt.processors) == (processor(),))
+    return stored_values(store, index), tuple(receipt.processors) == (processor(),)
 
 
 def stored_scene(store: RunStore, number: int, scene: int) -> StoredValues:
     """Return a scene of a block with all its configurations; its scene axes have length 1."""
-    index = store.blocks[number].cell(scene)
-    block = Block(index, tuple(k + 1 for k in index))
-    return {
-        variable.name: np.asarray(
-            store.array(variable.name)[region(variable, store.pipeline, block)]
-        )
-        for variable in store.variables
-    }
+    axes, cell = store.pipeline.experiment.scene_axes, store.blocks[number].cell(scene)
+    return stored_values(store, {
+        axis.name: slice(k, k + 1) for axis, k in zip(axes, cell, strict=True)})
 
 
 def current_pipeline(store: RunStore) -> tuple[Pipeline, list[str]]:

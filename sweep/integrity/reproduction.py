@@ -119,20 +119,18 @@ def reproduce(
         v.name: cells.columns[v.name][configuration[v.stage]][0].astype(v.dtype)
         for v in store.variables
     }
-    stored = stored_cell(store, index)
-    unneeded = stored is not None and bool(
-        stored.values["detection"] == DetectionStatus.not_needed)
+    stored, same_processor = stored_cell(store, index) or (None, False)
+    unneeded = stored is not None and bool(stored["detection"] == DetectionStatus.not_needed)
     stored = None if unneeded else stored
-    exact = stored is not None and stored.same_processor and not changes
+    exact = stored is not None and same_processor and not changes
     difference = "" if stored is None else compare(
-        recomputed, stored.values, store.variables, same_processor=exact
+        recomputed, stored, store.variables, same_processor=exact
     )
     full_at = selection_text(pipeline.cell_at(index))
     cell_pipeline = cell(pipeline, full_at)
     inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
     return Reproduction(
-        full_at, store.variables, recomputed, None if stored is None else stored.values,
-        difference, exact,
+        full_at, store.variables, recomputed, stored, difference, exact,
         {"scene": cells.seconds["scene"][0], "detection": cells.seconds["detection"][setting],
          "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
         cells.failures, changes, pipeline, cell_pipeline, inspected, image, unneeded,

@@ -8,7 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 from sweep.measure.flags import DetectionStatus
-from sweep.store.layout import packed, unpacked
+from sweep.store.layout import RECEIPTS, packed, unpacked
+
+
+def receipt_key(number: int) -> str:
+    """Return the key of a block's receipt."""
+    return f"{RECEIPTS}/c/{number}"
+
 
 STAGES = ("scene", "detection", "estimation")
 

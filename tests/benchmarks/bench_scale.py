@@ -43,11 +43,10 @@ from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed, missing_chunks, receipts
-from sweep.store.chunks import receipt_key
 from sweep.store.files import write_files
 from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.receipt import Receipt
+from sweep.store.receipt import Receipt, receipt_key
 
 PROCESSES = 2
 SCENES = 1000

@@ -10,11 +10,10 @@ from support.store_files import editable
 from sweep.errors import StoreError
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import receipts
-from sweep.store.chunks import receipt_key
 from sweep.store.files import write_files
 from sweep.store.layout import RECEIPTS
 from sweep.store.lifecycle import create_store
-from sweep.store.receipt import FailedCell, Receipt
+from sweep.store.receipt import FailedCell, Receipt, receipt_key
 
 RECEIPT = Receipt(
     run_id="a" * 32, processors=("avx2", "sse"), scenes=3,

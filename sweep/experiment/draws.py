@@ -43,10 +43,10 @@ from sweep.typing import Floats, Integers
 # SciPy's points are those of Sobol' (USSR Computational Mathematics and Mathematical Physics 7(4),
 # 1967) with the direction numbers of Joe and Kuo ("Constructing Sobol sequences with better two-
 # dimensional projections", SIAM Journal on Scientific Computing 30(5), 2008), in the order of
-# Antonov and Saleev's Gray code. They are randomised by Owen's
-# nested uniform scrambling ("Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995): each
-# binary digit is flipped by a random bit that depends on the digits before it. So each point is
-# uniform, and replicates with scrambles of their own are independent.
+# Antonov and Saleev's Gray code. They are randomised by Owen's nested uniform scrambling ("Randomly
+# permuted (t,m,s)-nets and (t,s)-sequences", 1995): each binary digit is flipped by a random bit
+# that depends on the digits before it. So each point is uniform, and replicates with scrambles of
+# their own are independent.
 
 REPLICATES = 16
 """Independent randomisations; the trial modulo this is the number of a trial's replicate."""
@@ -67,9 +67,11 @@ def points(dimension: int, index: Integers) -> NDArray[np.uint64]:
 
     wanted, back = np.unique(np.asarray(index, dtype=np.int64), return_inverse=True)
     engine = qmc.Sobol(dimension + 1, scramble=False, bits=BITS)
-    parts = []
+    parts = [np.empty(0)]
     # Trials of one cell may be far apart: what lies between them is skipped, not generated.
     for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > MAX_GAP) + 1):
+        if not len(run):
+            continue
         engine.reset()
         if run[0]:
             engine.fast_forward(int(run[0]))

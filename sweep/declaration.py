@@ -181,22 +181,37 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def parameter(default: Any, meaning: str, **declared: Any) -> Any:
+UNITS = {
+    "_m_s": "m/s", "_deg_s": "degree/s", "_per_m": "1/m", "_px": "px", "_mm": "mm", "_um": "um",
+    "_deg": "degree", "_s": "s", "_m": "m", "_e": "e-", "_modules": "module",
+}
+"""Ending of a field's name -> its unit, unless it declares another one; the first that fits."""
+
+
+def parameter(
+    default: Any, meaning: str, low: float = -math.inf, high: float = math.inf, **declared: Any
+) -> Any:
     """Return a dataclass field that carries its :class:`Declaration` (keywords as its fields)."""
-    declaration = Declaration(meaning, **declared)
+    declaration = Declaration(meaning, low=low, high=high, **declared)
     return dataclasses.field(default=default, metadata={"declaration": declaration})
+
+
+def drawn(default: Any, meaning: str, low: float, high: float = math.inf, **declared: Any) -> Any:
+    """As :func:`parameter`, of a number that may be drawn from a distribution per trial."""
+    return parameter(default, meaning, low, high, drawable=True, **declared)
 
 
 def declared_fields(declaring: type) -> dict[str, Declared]:
     """Return the fields that a dataclass declares, by name."""
-    hints = typing.get_type_hints(declaring)
-    return {
-        field.name: Declared(
-            field.name, plain_types(hints[field.name]), field.default,
-            field.metadata["declaration"],
-        )
-        for field in dataclasses.fields(declaring)
-    }
+    hints, declared = typing.get_type_hints(declaring), {}
+    for field in dataclasses.fields(declaring):
+        declaration = field.metadata["declaration"]
+        if not declaration.unit:
+            unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
+            declaration = dataclasses.replace(declaration, unit=unit)
+        types = plain_types(hints[field.name])
+        declared[field.name] = Declared(field.name, types, field.default, declaration)
+    return declared
 
 
 class TablesError(ValueError):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model.camera import Cameras
-from sweep.model.coverage import MarkerEdges
+from sweep.model.coverage import MarkerEdges, joined
 from sweep.model.marker import (
     BLACK,
     OCCLUDER,
@@ -24,6 +24,7 @@ from sweep.model.marker import (
     marker_corners,
     module_count,
     overhang,
+    rectangle_edges,
 )
 from sweep.model.polygon import half_plane
 from sweep.model.pose import rotation_of_vector
@@ -186,16 +187,14 @@ def edges_on_sheet(prints: Sequence[Print]) -> MarkerEdges:
     Their plane is (rotation[:, 0], -rotation[:, 1], translation).
     """
     on_sheet = [each.plane(np.eye(3), np.array([0.0, 0.0, 1.0])) for each in prints]
-    ends = [
-        (each.edges.ends.reshape(-1, 2) @ plane[:2, :2].T + plane[:2, 2]).reshape(-1, 4)
+    upwards = joined([
+        MarkerEdges(
+            (each.edges.ends.reshape(-1, 2) @ plane[:2, :2].T + plane[:2, 2]).reshape(-1, 4),
+            each.edges.sides,
+        )
         for each, plane in zip(prints, on_sheet, strict=True)
-    ]
-    return MarkerEdges(
-        np.concatenate([*ends, np.empty((0, 4))]) * [1.0, -1.0, 1.0, -1.0],
-        np.concatenate([
-            *(each.edges.sides for each in prints), np.empty((0, 2), dtype=np.int64)
-        ]),
-    )
+    ])
+    return MarkerEdges(upwards.ends * [1.0, -1.0, 1.0, -1.0], upwards.sides)
 
 
 def marker_print(
@@ -246,27 +245,15 @@ def corners_of(size_m: float, x_m: float, y_m: float, roll_deg: float = 0.0) -> 
 
 def cells_print(codes: Integers, side_m: float) -> Print:
     """Return square cells (h, w) of areas ``codes`` on white, their middle at the origin."""
-    ends, sides = cell_edges(np.pad(codes, 1, constant_values=WHITE))
+    cells = cell_edges(np.pad(codes, 1, constant_values=WHITE))
     height, width = codes.shape
-    shifted = np.array(ends, dtype=np.float64) - np.tile([width / 2, height / 2], 2)
-    return Print(MarkerEdges(shifted, np.array(sides, dtype=np.int64)), side_m, 0.0)
+    shifted = cells.ends - np.tile([width / 2, height / 2], 2)
+    return Print(MarkerEdges(shifted, cells.sides), side_m, 0.0)
 
 
 def rectangles_print(boxes_m: Floats, outside: int, inside: int) -> Print:
-    """Return rectangles (n, 4) of left, top, right, bottom in metres, right and down.
-
-    ``outside`` and ``inside`` are the codes of the areas.
-    """
-    left, top, right, bottom = boxes_m.T
-    ends = np.concatenate([
-        np.stack([left, top, left, bottom], axis=1), np.stack([right, top, right, bottom], axis=1),
-        np.stack([left, top, right, top], axis=1), np.stack([left, bottom, right, bottom], axis=1),
-    ])
-    codes = [(outside, inside), (inside, outside), (inside, outside), (outside, inside)]
-    return Print(
-        MarkerEdges(ends, np.repeat(np.array(codes, dtype=np.int64), len(boxes_m), axis=0)),
-        1.0, 0.0,
-    )
+    """Return rectangles (n, 4) in metres, as :func:`sweep.model.marker.rectangle_edges`."""
+    return Print(rectangle_edges(boxes_m, outside, inside), 1.0, 0.0)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -414,12 +401,7 @@ def target_edges(target: Board) -> MarkerEdges:
 def edges_of(target: Board) -> MarkerEdges:
     """Return the edges of all that is printed, beside a board too, in units."""
     own = target_edges(target)
-    if not target.distractors:
-        return own
-    beside = beside_edges(target)
-    return MarkerEdges(
-        np.concatenate([own.ends, beside.ends]), np.concatenate([own.sides, beside.sides])
-    )
+    return joined([own, beside_edges(target)]) if target.distractors else own
 
 
 def beside_edges(target: Board) -> MarkerEdges:
@@ -434,11 +416,7 @@ def edge_table(targets: tuple[Board, ...]) -> tuple[MarkerEdges, NDArray[np.int6
     each = [edges_of(target) for target in targets]
     stops = np.cumsum([len(outline.ends) for outline in each])
     starts = np.concatenate([[0], stops[:-1]])
-    table = MarkerEdges(
-        np.concatenate([outline.ends for outline in each]),
-        np.concatenate([outline.sides for outline in each]),
-    )
-    return table, np.stack([starts, stops], axis=1).astype(np.int64)
+    return joined(each), np.stack([starts, stops], axis=1).astype(np.int64)
 
 
 @lru_cache(maxsize=8192)
@@ -690,11 +668,7 @@ def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[Visible
                     MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
                 )
                 movers.append(mover)
-        edges = MarkerEdges(
-            np.concatenate([part.ends for part in parts]),
-            np.concatenate([part.sides for part in parts]),
-        )
-        seen.append(VisiblePrint(face.number, edges, face.plane, np.concatenate(movers)))
+        seen.append(VisiblePrint(face.number, joined(parts), face.plane, np.concatenate(movers)))
     return seen
 
 

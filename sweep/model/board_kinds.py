@@ -25,7 +25,7 @@ from sweep.model.board import (
     sheets_m,
     solid_print,
 )
-from sweep.model.coverage import MarkerEdges
+from sweep.model.coverage import MarkerEdges, joined
 from sweep.model.marker import (
     BLACK,
     OUTSIDE,
@@ -35,6 +35,7 @@ from sweep.model.marker import (
     missing_package,
     module_count,
     overhang,
+    rectangle_edges,
 )
 from sweep.typing import Floats, Integers
 
@@ -205,8 +206,7 @@ class Markers(_Kind):
         "one for each", list_text=_TABLES, reads=_read_markers
     )
     quiet_zone_modules: float | None = parameter(
-        None, "width of the white that surrounds each marker on its own sheet (default: 1)",
-        unit="module", low=0, high=100,
+        None, "width of the white that surrounds each marker on its own sheet (default: 1)", 0, 100
     )
     margin_m: float | None = margin(
         "width of the one white sheet beyond all markers; without it each has its own"
@@ -327,11 +327,10 @@ def with_distractors(
 def _black_square(modules: float, quiet_modules: float) -> MarkerEdges:
     """Return the edges of a black square as large as a marker's, on its white sheet."""
     low, high = -quiet_modules, modules + quiet_modules
-    sheet = rectangles_print(np.array([[low, low, high, high]]), OUTSIDE, WHITE).edges
-    square = rectangles_print(np.array([[0.0, 0.0, modules, modules]]), WHITE, BLACK).edges
-    return MarkerEdges(
-        np.concatenate([sheet.ends, square.ends]), np.concatenate([sheet.sides, square.sides])
-    )
+    return joined([
+        rectangle_edges(np.array([[low, low, high, high]]), OUTSIDE, WHITE),
+        rectangle_edges(np.array([[0.0, 0.0, modules, modules]]), WHITE, BLACK),
+    ])
 
 
 def listing_faults(
@@ -392,12 +391,12 @@ class _OnSheet(_Kind):
     dictionary: str = dictionary_of_all()
     first_id: int | None = parameter(
         None, "ID of the first marker (of an aprilgrid at the bottom left), from which they count "
-        "(default: 0)", low=0, high=10**6,
+        "(default: 0)", 0, 10**6,
     )
     ids: tuple[int, ...] | None = parameter(
         None, "IDs of all markers in reading order, of an aprilgrid from the bottom left to the "
-        "right, then upwards; without it they count from the first on",
-        list_text=_LIST_OF_IDS, reads=_read_ids,
+        "right, then upwards; without it they count from the first on", list_text=_LIST_OF_IDS,
+        reads=_read_ids,
     )
     margin_m: float | None = margin(
         "width of the white sheet beyond all that is black (default: one module of a marker)"
@@ -668,9 +667,9 @@ OPTIONAL = _own_keys(needed=False)
 class _Arrangement:
     kind: str = parameter(
         SINGLE, "none: one marker; grid: rows and columns of markers (GridBoard); aprilgrid: "
-        "Kalibr's, marker_id at the bottom left; "
-        "charuco: a chessboard with markers in its white squares; diamond: a ChArUco diamond of "
-        "3 x 3 squares; markers: those that [[board.markers]] lists",
+        "Kalibr's, marker_id at the bottom left; charuco: a chessboard with markers in its white "
+        "squares; diamond: a ChArUco diamond of 3 x 3 squares; markers: those that "
+        "[[board.markers]] lists",
         choices=(SINGLE, "grid", "aprilgrid", "charuco", "diamond", "markers"),
     )
     markers: tuple[tuple[float, ...], ...] | None = parameter(

@@ -35,49 +35,41 @@ class Camera:
     Pixels are square unless both sides of the sensor, or ``fx_px`` and ``fy_px``, are given.
     """
 
-    width_px: int = parameter(640, "width of the frame", unit="px", low=1, high=100_000)
-    height_px: int = parameter(480, "height of the frame", unit="px", low=1, high=100_000)
+    width_px: int = parameter(640, "width of the frame", 1, 100_000)
+    height_px: int = parameter(480, "height of the frame", 1, 100_000)
     sensor_width_mm: float | None = parameter(
         None, "width of the sensor's active area (default: 4.8, or with sensor_height_mm what "
-        "makes the pixels square)", unit="mm", low=1e-6, high=1e6,
+        "makes the pixels square)", 1e-6, 1e6,
     )
     sensor_height_mm: float | None = parameter(
-        None, "height of the sensor's active area (default: what makes the pixels square)",
-        unit="mm", low=1e-6, high=1e6,
+        None, "height of the sensor's active area (default: what makes the pixels square)", 1e-6,
+        1e6,
     )
-    focal_length_mm: float = parameter(
-        4.0, "focal length of the lens", unit="mm", low=1e-6, high=1e6
-    )
+    focal_length_mm: float = parameter(4.0, "focal length of the lens", 1e-6, 1e6)
     pixel_size_um: float | None = parameter(
-        None, "side of a square pixel; with focal_length_mm, replaces the sensor's sides",
-        unit="um", low=0.05, high=1e4,
+        None, "side of a square pixel; with focal_length_mm, replaces the sensor's sides", 0.05,
+        1e4,
     )
     hfov_deg: float | None = parameter(
-        None, "horizontal field of view between the frame's edges, without lens distortion: "
-        "2 atan(width_px / (2 fx)); replaces focal lengths and the sensor's sides",
-        unit="degree", low=1e-5, high=179.9,
+        None, "horizontal field of view between the frame's edges, without lens distortion: 2 "
+        "atan(width_px / (2 fx)); replaces focal lengths and the sensor's sides", 1e-5, 179.9,
     )
     vfov_deg: float | None = parameter(
-        None, "vertical field of view: 2 atan(height_px / (2 fy)); as hfov_deg",
-        unit="degree", low=1e-5, high=179.9,
+        None, "vertical field of view: 2 atan(height_px / (2 fy)); as hfov_deg", 1e-5, 179.9
     )
     dfov_deg: float | None = parameter(
-        None, "diagonal field of view between the frame's opposite corners, in square pixels: "
-        "2 atan(hypot(width_px, height_px) / (2 fx)); as hfov_deg",
-        unit="degree", low=1e-5, high=179.9,
+        None, "diagonal field of view between the frame's opposite corners, in square pixels: 2 "
+        "atan(hypot(width_px, height_px) / (2 fx)); as hfov_deg", 1e-5, 179.9,
     )
     fx_px: float | None = parameter(
-        None, "focal length along x; replaces the parameters in mm", unit="px", low=1e-3,
-        high=1e9,
+        None, "focal length along x; replaces the parameters in mm", 1e-3, 1e9
     )
-    fy_px: float | None = parameter(
-        None, "focal length along y (default: fx_px)", unit="px", low=1e-3, high=1e9
-    )
+    fy_px: float | None = parameter(None, "focal length along y (default: fx_px)", 1e-3, 1e9)
     cx_px: float | None = parameter(
-        None, "principal point, x (default: (width_px - 1) / 2)", unit="px", low=-1e9, high=1e9
+        None, "principal point, x (default: (width_px - 1) / 2)", -1e9, 1e9
     )
     cy_px: float | None = parameter(
-        None, "principal point, y (default: (height_px - 1) / 2)", unit="px", low=-1e9, high=1e9
+        None, "principal point, y (default: (height_px - 1) / 2)", -1e9, 1e9
     )
     distortion: tuple[float, ...] = parameter(
         (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers",

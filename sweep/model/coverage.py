@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,6 +105,14 @@ class MarkerEdges(NamedTuple):
 
     ends: Floats
     sides: NDArray[np.int64]
+
+
+def joined(parts: Sequence[MarkerEdges]) -> MarkerEdges:
+    """Return the edges of several prints in one table."""
+    return MarkerEdges(
+        np.concatenate([np.empty((0, 4)), *(part.ends for part in parts)]),
+        np.concatenate([np.empty((0, 2), dtype=np.int64), *(part.sides for part in parts)]),
+    )
 
 
 class Segment(NamedTuple):

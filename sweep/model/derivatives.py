@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import compiled
+from sweep.compilation import compiled, compiled_inline
 from sweep.model.coverage import (
     MIN_PANEL_PX,
     NODES,
@@ -306,6 +306,20 @@ def differentiate(
     return count
 
 
+@compiled_inline
+def _add_column(
+    matrix: Floats, vector: Floats, column: Floats, first: int, pixels: float, total: float
+) -> None:
+    """Add a number of pixels, the sum of whose levels is ``total``, with columns from ``first`` on.
+
+    To the lower triangle of ``matrix``; the columns before ``first`` are 0.
+    """
+    for k in range(first, len(column)):
+        vector[k] += total * column[k]
+        for m in range(first, k + 1):
+            matrix[k, m] += pixels * column[k] * column[m]
+
+
 @compiled
 def normal_equations(
     image: Floats, work: Work, free: int, matrix: Floats, vector: Floats
@@ -335,10 +349,7 @@ def normal_equations(
                 continue
             # A run of pixels with the same areas ends.
             column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
-            for k in range(free, size):
-                vector[k] += total * column[k]
-                for m in range(free, k + 1):
-                    matrix[k, m] += pixels * column[k] * column[m]
+            _add_column(matrix, vector, column, free, pixels, total)
             black += more_black
             white += more_white
             shares[0, i, j] = shares[1, i, j] = 0.0
@@ -354,15 +365,9 @@ def normal_equations(
             column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
             for k in range(free):
                 column[k] = slopes[slot, k]
-            for k in range(size):
-                vector[k] += level * column[k]
-                for m in range(k + 1):
-                    matrix[k, m] += column[k] * column[m]
+            _add_column(matrix, vector, column, 0, 1.0, level)
         column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
-        for k in range(free, size):
-            vector[k] += total * column[k]
-            for m in range(free, k + 1):
-                matrix[k, m] += pixels * column[k] * column[m]
+        _add_column(matrix, vector, column, free, pixels, total)
         shares[0, i, width:] = 0.0
         shares[1, i, width:] = 0.0
     for k in range(size):

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.declaration import parameter
+from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
 from sweep.model.sensor import BLOCK_PX, METHODS, PATTERNS, REACH_PX, standard_normals
 from sweep.plugins.loading import call, real_numbers
@@ -194,331 +194,219 @@ def _defocus_px(values: Mapping[str, float], focal_px: float, inverse_depth: Flo
 
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect(
-        "printed size", "edges",
-        {
-            "marker_scale": parameter(
-                1.0, "size of the printed marker relative to size_m, which truth and belief keep",
-                low=0, high=10, open_low=True, drawable=True,
-            ),
+    Effect("printed size", "edges", {
+        "marker_scale": drawn(
+            1.0, "size of the printed marker relative to size_m, which truth and belief keep",
+            0, 10, open_low=True,
+        ),
+    }),
+    Effect("bend", "edges", {
+        "curvature_per_m": drawn(
+            0.0, "curvature of the marker's sheet; positive if it bulges towards the viewer; "
+            "the true pose is that of the tangent plane at the centre", -1e6, 1e6,
+        ),
+        "bend": parameter(
+            "cylinder", "shape of the bent sheet: cylinder: paper on a can, not stretched; "
+            "saddle: curved as much the other way across", choices=("cylinder", "saddle"),
+        ),
+        "bend_deg": drawn(
+            0.0, "direction in which the sheet curves, in the marker's plane: 0 right, 90 up",
+            -360, 360,
+        ),
+    }, needs=dict.fromkeys(("bend", "bend_deg"), ("curvature_per_m",))),
+    Effect("occlusion", "edges", {
+        "occlusion": drawn(
+            0.0, "share of the black square's extent that a sheet with a straight edge hides; "
+            "it lies on the marker and also hides the quiet zone on its side", 0, 1,
+        ),
+        "occlusion_deg": drawn(
+            0.0, "side that the sheet comes from, in the marker's plane: 0 its right, 90 its "
+            "top", -360, 360,
+        ),
+        "occluder": drawn(128.0, "level of the sheet", 0, 255, unit="grey level"),
+    }),
+    Effect("uneven light", "light", {
+        "illumination_gradient": drawn(
+            0.0, "change of the light across the frame's width, relative to its centre", -2, 2
+        ),
+        "illumination_deg": drawn(
+            0.0, "direction in which the light grows: 0 right, 90 down", -360, 360
+        ),
+    }, widens="uneven light"),
+    Effect("motion blur", "edges", {
+        "exposure_s": drawn(
+            0.0, "exposure time: the image is the mean over it; the true pose is that in its "
+            "middle", 0, 1e6,
+        ),
+    }, needs={"exposure_s": VELOCITIES}),
+    Effect("rolling shutter", "edges", {
+        "row_time_s": drawn(
+            0.0, "rolling shutter: time from one row's exposure to the next's; the true pose "
+            "is that at the middle row's", 0, 1e6,
+        ),
+        # The velocities are those of both effects of motion.
+        **{
+            name: parameter(
+                0.0, f"velocity of the marker's centre, {along}", unit="m/s", low=-1e9,
+                high=1e9, drawable=True,
+            )
+            for name, along in zip(
+                VELOCITIES[:3], ("right", "down", "away from the camera"), strict=True
+            )
         },
-    ),
-    Effect(
-        "bend", "edges",
-        {
-            "curvature_per_m": parameter(
-                0.0, "curvature of the marker's sheet; positive if it bulges towards the viewer; "
-                "the true pose is that of the tangent plane at the centre",
-                unit="1/m", low=-1e6, high=1e6, drawable=True,
-            ),
-            "bend": parameter(
-                "cylinder", "shape of the bent sheet: cylinder: paper on a can, not stretched; "
-                "saddle: curved as much the other way across", choices=("cylinder", "saddle"),
-            ),
-            "bend_deg": parameter(
-                0.0, "direction in which the sheet curves, in the marker's plane: 0 right, 90 up",
-                unit="degree", low=-360, high=360, drawable=True,
-            ),
+        **{
+            name: parameter(
+                0.0, "angular velocity about the axis through the marker's centre that points "
+                + along, unit="degree/s", low=-1e9, high=1e9, drawable=True,
+            )
+            for name, along in zip(VELOCITIES[3:], ("right", "down", "forward"), strict=True)
         },
-        needs=dict.fromkeys(("bend", "bend_deg"), ("curvature_per_m",)),
-    ),
-    Effect(
-        "occlusion", "edges",
-        {
-            "occlusion": parameter(
-                0.0, "share of the black square's extent that a sheet with a straight edge hides; "
-                "it lies on the marker and also hides the quiet zone on its side", low=0, high=1,
-                drawable=True,
-            ),
-            "occlusion_deg": parameter(
-                0.0, "side that the sheet comes from, in the marker's plane: 0 its right, 90 its "
-                "top", unit="degree", low=-360, high=360, drawable=True,
-            ),
-            "occluder": parameter(
-                128.0, "level of the sheet", unit="grey level", low=0, high=255, drawable=True
-            ),
-        },
-    ),
-    Effect(
-        "uneven light", "light",
-        {
-            "illumination_gradient": parameter(
-                0.0, "change of the light across the frame's width, relative to its centre",
-                low=-2, high=2, drawable=True,
-            ),
-            "illumination_deg": parameter(
-                0.0, "direction in which the light grows: 0 right, 90 down", unit="degree",
-                low=-360, high=360, drawable=True,
-            ),
-        },
-        widens="uneven light",
-    ),
-    Effect(
-        "motion blur", "edges",
-        {
-            "exposure_s": parameter(
-                0.0, "exposure time: the image is the mean over it; the true pose is that in its "
-                "middle", unit="s", low=0, high=1e6, drawable=True,
-            ),
-        },
-        needs={"exposure_s": VELOCITIES},
-    ),
-    Effect(
-        "rolling shutter", "edges",
-        {
-            "row_time_s": parameter(
-                0.0, "rolling shutter: time from one row's exposure to the next's; the true pose "
-                "is that at the middle row's", unit="s", low=0, high=1e6, drawable=True,
-            ),
-            # The velocities are those of both effects of motion.
-            **{
-                name: parameter(
-                    0.0, f"velocity of the marker's centre, {along}", unit="m/s", low=-1e9,
-                    high=1e9, drawable=True,
-                )
-                for name, along in zip(
-                    VELOCITIES[:3], ("right", "down", "away from the camera"), strict=True
-                )
-            },
-            **{
-                name: parameter(
-                    0.0, "angular velocity about the axis through the marker's centre that points "
-                    + along, unit="degree/s", low=-1e9, high=1e9, drawable=True,
-                )
-                for name, along in zip(VELOCITIES[3:], ("right", "down", "forward"), strict=True)
-            },
-        },
+    },
         needs={
             "row_time_s": VELOCITIES,
             **dict.fromkeys(VELOCITIES, ("exposure_s", "row_time_s")),
         },
     ),
-    Effect(
-        "optical blur", "edges",
-        {
-            "blur_px": parameter(
-                0.0, "standard deviation of the lens' Gaussian point spread", unit="px", low=0,
-                high=1000, drawable=True,
-            ),
-        },
-        in_bound=True, spread_px=lambda values, _, depth: np.full(depth.shape, values["blur_px"]),
-    ),
-    Effect(
-        "defocus", "edges",
-        {
-            "aperture_mm": parameter(
-                None, "diameter of the lens' opening: defocus adds a quarter of the circle of "
-                "confusion's diameter to the point spread, in quadrature, at each depth",
-                unit="mm", low=0, high=1e6, open_low=True, drawable=True,
-            ),
-            "focus_distance_m": parameter(
-                None, "depth at which the image is sharp", unit="m", low=0, open_low=True,
-                drawable=True,
-            ),
-        },
+    Effect("optical blur", "edges", {
+        "blur_px": drawn(0.0, "standard deviation of the lens' Gaussian point spread", 0, 1000),
+    }, in_bound=True, spread_px=lambda values, _, depth: np.full(depth.shape, values["blur_px"])),
+    Effect("defocus", "edges", {
+        "aperture_mm": drawn(
+            None, "diameter of the lens' opening: defocus adds a quarter of the circle of "
+            "confusion's diameter to the point spread, in quadrature, at each depth", 0, 1e6,
+            open_low=True,
+        ),
+        "focus_distance_m": drawn(None, "depth at which the image is sharp", 0, open_low=True),
+    },
         needs={
             "aperture_mm": ("focus_distance_m",), "focus_distance_m": ("aperture_mm",),
         },
         spread_px=_defocus_px,
     ),
-    Effect(
-        "image shift", "edges",
-        {
-            "geometry_px": parameter(
-                0.0, "standard deviation, right and down, of shifts of the image that vary slowly "
-                "over the frame, as of a lens that its model does not describe; drawn anew for "
-                "each frame",
-                unit="px", low=0, high=1000, drawable=True,
-            ),
-            "geometry_length_px": parameter(
-                100.0, "distance at which the correlation of these shifts has fallen to 0.61",
-                unit="px", low=1, high=1e6, drawable=True,
-            ),
-        },
-        needs={"geometry_length_px": ("geometry_px",)}, random=True,
-    ),
-    Effect(
-        "ragged edges", "edges",
-        {
-            "edge_px": parameter(
-                0.0, "standard deviation, right and down, of shifts of the image that vary from "
-                "one module to the next, as a screen's raster, compression and a camera's colour "
-                "filter lead to; drawn anew for each frame, beside geometry_px",
-                unit="px", low=0, high=1000, drawable=True,
-            ),
-            "edge_length_px": parameter(
-                4.0, "distance at which the correlation of these shifts has fallen to 0.61",
-                unit="px", low=1, high=1e6, drawable=True,
-            ),
-        },
-        needs={"edge_length_px": ("edge_px",)}, random=True,
-    ),
-    Effect(
-        "sharpening", "edges",
-        {
-            "sharpening": parameter(
-                0.0, "amount of unsharp masking in the camera: the exact image plus so many times "
-                "its difference from the image blurred by sharpening_px; the noise stays as it is",
-                low=-1, high=100, drawable=True,
-            ),
-            "sharpening_px": parameter(
-                1.0, "radius of sharpening: standard deviation of the Gaussian whose blurred image "
-                "is subtracted", unit="px", low=0, high=1000, open_low=True, drawable=True,
-            ),
-        },
+    Effect("image shift", "edges", {
+        "geometry_px": drawn(
+            0.0, "standard deviation, right and down, of shifts of the image that vary slowly "
+            "over the frame, as of a lens that its model does not describe; drawn anew for "
+            "each frame", 0, 1000,
+        ),
+        "geometry_length_px": drawn(
+            100.0, "distance at which the correlation of these shifts has fallen to 0.61", 1,
+            1e6,
+        ),
+    }, needs={"geometry_length_px": ("geometry_px",)}, random=True),
+    Effect("ragged edges", "edges", {
+        "edge_px": drawn(
+            0.0, "standard deviation, right and down, of shifts of the image that vary from "
+            "one module to the next, as a screen's raster, compression and a camera's colour "
+            "filter lead to; drawn anew for each frame, beside geometry_px", 0, 1000,
+        ),
+        "edge_length_px": drawn(
+            4.0, "distance at which the correlation of these shifts has fallen to 0.61", 1, 1e6
+        ),
+    }, needs={"edge_length_px": ("edge_px",)}, random=True),
+    Effect("sharpening", "edges", {
+        "sharpening": drawn(
+            0.0, "amount of unsharp masking in the camera: the exact image plus so many times "
+            "its difference from the image blurred by sharpening_px; the noise stays as it is",
+            -1, 100,
+        ),
+        "sharpening_px": drawn(
+            1.0, "radius of sharpening: standard deviation of the Gaussian whose blurred image "
+            "is subtracted", 0, 1000, open_low=True,
+        ),
+    },
         needs={"sharpening_px": ("sharpening",)},
         # That of the image that is subtracted.
         spread_px=lambda values, _, depth: np.full(depth.shape, values["sharpening_px"]),
     ),
-    Effect(
-        "bloom", "light",
-        {
-            "bloom": parameter(
-                0.0, "widening of bright areas: a level that is a share s of the way from black to "
-                "white is lifted by bloom · s · (1 - s) of it", low=-1, high=1, drawable=True,
-            ),
-        },
-    ),
-    Effect(
-        "vignetting", "light",
-        {
-            "vignetting": parameter(
-                0.0, "power of the cosine of a pixel's angle to the optical axis by which its "
-                "light falls off; 4 is the natural law", low=0, high=100, drawable=True,
-            ),
-        },
-        widens="uneven light",
-    ),
-    Effect(
-        "shot noise", "signal",
-        {
-            "full_well_e": parameter(
-                None, "electrons that a pixel holds, at level 255 and gain 1; the shot noise is "
-                "theirs", unit="e-", low=1, high=1e9, drawable=True,
-            ),
-            "read_noise_e": parameter(
-                0.0, "standard deviation of the read noise", unit="e-", low=0, high=1e9,
-                drawable=True,
-            ),
-        },
-        needs={"read_noise_e": ("full_well_e",)}, random=True, widens="noise",
-    ),
-    Effect(
-        "gain", "signal",
-        {
-            "gain": parameter(
-                1.0, "factor on the signal and its noise, before it is quantised", low=0,
-                high=1e6, open_low=True, drawable=True,
-            ),
-        },
-        in_bound=True,
-    ),
-    Effect(
-        "grey noise", "signal",
-        {
-            "noise_grey": parameter(
-                0.0, "standard deviation of plain Gaussian noise on the grey levels",
-                unit="grey level", low=0, high=1e6, drawable=True,
-            ),
-        },
-        random=True, in_bound=True, widens="noise",
-    ),
-    Effect(
-        "correlated noise", "signal",
-        {
-            "noise_correlation": parameter(
-                0.0, "correlation of the grey noise (noise_grey, noise_table) of neighbouring "
-                "pixels; two pixels apart 0.025, 0.084, 0.24, 0.66 for 0.3, 0.5, 0.7, 0.9; the "
-                "standard deviation stays",
-                low=0, high=0.99, drawable=True,
-            ),
-        },
-        needs={"noise_correlation": ("noise_grey", "noise_table")}, worsens=("noise",),
-    ),
-    Effect(
-        "demosaicing", "signal",
-        {
-            "bayer": parameter(
-                "none", "colour filters of the frame's first two by two pixels; none: a grey "
-                "camera", choices=("none", *PATTERNS),
-            ),
-            "demosaic": parameter(
-                "bilinear", "how colours are interpolated (OpenCV), before they are turned to grey",
-                choices=tuple(METHODS),
-            ),
-            "bayer_red": parameter(
-                1.0, "gain of the red pixels relative to the green ones", low=0, high=100,
-                drawable=True,
-            ),
-            "bayer_blue": parameter(
-                1.0, "gain of the blue pixels relative to the green ones", low=0, high=100,
-                drawable=True,
-            ),
-        },
-        needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
-        reach_px=REACH_PX,
-    ),
-    Effect(
-        "gamma", "signal",
-        {
-            "tone_gamma": parameter(
-                1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
-                "below 1 dark areas are lifted", low=0.1, high=10, drawable=True,
-            ),
-        },
-        worsens=("uneven light",),
-    ),
-    Effect(
-        "toe", "signal",
-        {
-            "tone_toe": parameter(
-                0.0, "compression of the lower half of the scale towards black: the response has "
-                "the slope 1 - tone_toe at black", low=-1, high=1, drawable=True,
-            ),
-        },
-        worsens=("uneven light",),
-    ),
-    Effect(
-        "knee", "signal",
-        {
-            "tone_knee": parameter(
-                0.0, "compression of the upper half of the scale towards white: the response has "
-                "the slope 1 - tone_knee at white", low=-1, high=1, drawable=True,
-            ),
-        },
-        worsens=("uneven light",),
-    ),
-    Effect(
-        "noise by level", "signal",
-        {
-            "noise_table": parameter(
-                (), "standard deviation of Gaussian noise over the level in the image: level, "
-                "deviation, level, deviation, ..., ascending, interpolated, constant beyond",
-                unit="grey level", lengths=(0, *range(2, 513, 2)),
-                list_text="a list of an even number of finite numbers, at most 512",
-            ),
-        },
-        random=True, widens="noise",
-    ),
-    Effect(
-        "bit depth", "readout",
-        {
-            "bit_depth": parameter(
-                8, "bits to which the levels 0 to 255 are quantised, clipped; OpenCV gets them "
-                "rounded to 8", unit="bit", low=8, high=16,
-            ),
-        },
-    ),
-    Effect(
-        "JPEG", "readout",
-        {
-            "jpeg_quality": parameter(
-                0, "quality of JPEG compression (OpenCV's encoder), 1 to 100; 0: not compressed",
-                low=0, high=100,
-            ),
-        },
-        worsens=("noise", "uneven light"), block_px=BLOCK_PX,
-    ),
+    Effect("bloom", "light", {
+        "bloom": drawn(
+            0.0, "widening of bright areas: a level that is a share s of the way from black to "
+            "white is lifted by bloom · s · (1 - s) of it", -1, 1,
+        ),
+    }),
+    Effect("vignetting", "light", {
+        "vignetting": drawn(
+            0.0, "power of the cosine of a pixel's angle to the optical axis by which its "
+            "light falls off; 4 is the natural law", 0, 100,
+        ),
+    }, widens="uneven light"),
+    Effect("shot noise", "signal", {
+        "full_well_e": drawn(
+            None, "electrons that a pixel holds, at level 255 and gain 1; the shot noise is "
+            "theirs", 1, 1e9,
+        ),
+        "read_noise_e": drawn(0.0, "standard deviation of the read noise", 0, 1e9),
+    }, needs={"read_noise_e": ("full_well_e",)}, random=True, widens="noise"),
+    Effect("gain", "signal", {
+        "gain": drawn(
+            1.0, "factor on the signal and its noise, before it is quantised", 0, 1e6,
+            open_low=True,
+        ),
+    }, in_bound=True),
+    Effect("grey noise", "signal", {
+        "noise_grey": drawn(
+            0.0, "standard deviation of plain Gaussian noise on the grey levels", 0, 1e6,
+            unit="grey level",
+        ),
+    }, random=True, in_bound=True, widens="noise"),
+    Effect("correlated noise", "signal", {
+        "noise_correlation": drawn(
+            0.0, "correlation of the grey noise (noise_grey, noise_table) of neighbouring "
+            "pixels; two pixels apart 0.025, 0.084, 0.24, 0.66 for 0.3, 0.5, 0.7, 0.9; the "
+            "standard deviation stays", 0, 0.99,
+        ),
+    }, needs={"noise_correlation": ("noise_grey", "noise_table")}, worsens=("noise",)),
+    Effect("demosaicing", "signal", {
+        "bayer": parameter(
+            "none", "colour filters of the frame's first two by two pixels; none: a grey "
+            "camera", choices=("none", *PATTERNS),
+        ),
+        "demosaic": parameter(
+            "bilinear", "how colours are interpolated (OpenCV), before they are turned to grey",
+            choices=tuple(METHODS),
+        ),
+        "bayer_red": drawn(1.0, "gain of the red pixels relative to the green ones", 0, 100),
+        "bayer_blue": drawn(1.0, "gain of the blue pixels relative to the green ones", 0, 100),
+    }, needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)), reach_px=REACH_PX),
+    Effect("gamma", "signal", {
+        "tone_gamma": drawn(
+            1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
+            "below 1 dark areas are lifted", 0.1, 10,
+        ),
+    }, worsens=("uneven light",)),
+    Effect("toe", "signal", {
+        "tone_toe": drawn(
+            0.0, "compression of the lower half of the scale towards black: the response has "
+            "the slope 1 - tone_toe at black", -1, 1,
+        ),
+    }, worsens=("uneven light",)),
+    Effect("knee", "signal", {
+        "tone_knee": drawn(
+            0.0, "compression of the upper half of the scale towards white: the response has "
+            "the slope 1 - tone_knee at white", -1, 1,
+        ),
+    }, worsens=("uneven light",)),
+    Effect("noise by level", "signal", {
+        "noise_table": parameter(
+            (), "standard deviation of Gaussian noise over the level in the image: level, "
+            "deviation, level, deviation, ..., ascending, interpolated, constant beyond",
+            unit="grey level", lengths=(0, *range(2, 513, 2)),
+            list_text="a list of an even number of finite numbers, at most 512",
+        ),
+    }, random=True, widens="noise"),
+    Effect("bit depth", "readout", {
+        "bit_depth": parameter(
+            8, "bits to which the levels 0 to 255 are quantised, clipped; OpenCV gets them "
+            "rounded to 8", 8, 16, unit="bit",
+        ),
+    }),
+    Effect("JPEG", "readout", {
+        "jpeg_quality": parameter(
+            0, "quality of JPEG compression (OpenCV's encoder), 1 to 100; 0: not compressed", 0,
+            100,
+        ),
+    }, worsens=("noise", "uneven light"), block_px=BLOCK_PX),
 )
 """Every effect, in physical order."""
 

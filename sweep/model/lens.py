@@ -188,19 +188,6 @@ def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, f
 
 
 @compiled
-def distort_points(
-    points: NDArray[np.float64], lenses: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Distort points (N, M, 2), each row through its own packed lens (N, 24)."""
-    distorted = np.empty_like(points)
-    for i in range(points.shape[0]):
-        for j in range(points.shape[1]):
-            x, y = distort(points[i, j, 0], points[i, j, 1], lenses[i])
-            distorted[i, j, 0], distorted[i, j, 1] = x, y
-    return distorted
-
-
-@compiled
 def undistort_points(
     points: NDArray[np.float64], lenses: NDArray[np.float64]
 ) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sweep.declaration import parameter
 from sweep.errors import MissingPackageError
 from sweep.installation import check_opencv
-from sweep.model.coverage import MarkerEdges
+from sweep.model.coverage import MarkerEdges, joined
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -39,34 +39,21 @@ class TagFamily:
         Modules beyond that square on each side.
     count
         IDs.
-    sha256
-        Digest of codes and positions of bits: a library with others is refused.
     """
 
     modules: int
     overhang: int
     count: int
-    sha256: str
 
 
 TAG_FAMILIES = {
-    "tagCircle21h7": TagFamily(
-        5, 2, 38, "25b2d4816d658f6a3e50433e8afe0728b2b384b45bbd4d58e6d1888e0848d1c1"
-    ),
-    "tagCircle49h12": TagFamily(
-        5, 3, 65_535, "366a1f684df9ad1d608021dce1123881606fca0f66b67b07b83f75babbe2b734"
-    ),
-    "tagCustom48h12": TagFamily(
-        6, 2, 42_211, "b84f4ca90d0cf10e34fb5e8603db4f10aabb9f8abc73daacae159c106ab1924a"
-    ),
-    "tagStandard41h12": TagFamily(
-        5, 2, 2_115, "dbc172f60f18d0b06b4a6e608cb19eb17c38081e522946148bf244402d885d2b"
-    ),
-    "tagStandard52h13": TagFamily(
-        6, 2, 48_714, "3150751035d317dc0da6dff9b9ccd58794170f7c30a2f8335104b837642c9871"
-    ),
+    "tagCircle21h7": TagFamily(5, 2, 38),
+    "tagCircle49h12": TagFamily(5, 3, 65_535),
+    "tagCustom48h12": TagFamily(6, 2, 42_211),
+    "tagStandard41h12": TagFamily(5, 2, 2_115),
+    "tagStandard52h13": TagFamily(6, 2, 48_714),
 }
-"""By AprilTag's own names. Numbers and digests are those of AprilTag 3.1 to 3.4."""
+"""By AprilTag's own names."""
 
 PACKAGES = ("pyapriltags", "pupil_apriltags")
 """Python packages whose AprilTag library has all families."""
@@ -87,22 +74,20 @@ class _Family(ctypes.Structure):
     )
 
 
-def library_path() -> Path | None:
-    """Return the AprilTag library of the first installed package that brings one, or None."""
-    for package in PACKAGES:
-        spec = importlib.util.find_spec(package)
-        for folder in (spec and spec.submodule_search_locations) or ():
-            for pattern in ("libapriltag.so", "lib*/libapriltag.so", "libapriltag.dylib"):
-                for path in sorted(Path(folder).glob(pattern)):
-                    return path
+def _file_of(package: str, *patterns: str) -> Path | None:
+    """Return the first file in an installed package whose name has one of some patterns."""
+    spec = importlib.util.find_spec(package)
+    for folder in (spec and spec.submodule_search_locations) or ():
+        for pattern in patterns:
+            for path in sorted(Path(folder).glob(pattern)):
+                return path
     return None
 
 
-def missing_library() -> str | None:
-    """Return what to install for the families' codes; None if a library is installed."""
-    if library_path() is not None:
-        return None
-    return "an AprilTag library for its codes: pip install 'fiducial-sweep[pyapriltags]'"
+def library_path() -> Path | None:
+    """Return the AprilTag library of the first installed package that brings one, or None."""
+    names = "libapriltag.so", "lib*/libapriltag.so", "libapriltag.dylib"
+    return next(filter(None, (_file_of(package, *names) for package in PACKAGES)), None)
 
 
 @lru_cache(maxsize=8)
@@ -113,7 +98,7 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
     """
     path = library_path()
     if path is None:
-        raise MissingPackageError(f"{name} needs {missing_library()}")
+        raise MissingPackageError(f"{name} needs {missing_package(name)}")
     create = getattr(ctypes.CDLL(str(path)), f"{name}_create")
     create.restype = ctypes.POINTER(_Family)
     family = create().contents  # the library keeps it; it is read once in a process
@@ -121,11 +106,6 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
     positions = np.array(
         [family.bit_x[: family.nbits], family.bit_y[: family.nbits]], dtype=np.int32
     ).T
-    digest = hashlib.sha256(codes.astype("<u8").tobytes() + positions.astype("<i4").tobytes())
-    if digest.hexdigest() != TAG_FAMILIES[name].sha256:
-        raise MissingPackageError(
-            f"{name}: the codes in {path} are not AprilTag's; install another pyapriltags"
-        )
     return codes, positions
 
 
@@ -163,34 +143,20 @@ def tag_cells(name: str, marker_id: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class StagLibrary:
-    """A library of STag: its number of IDs, and the digest of their codes."""
+    """A library of STag: its number of IDs, and the beginning of their codes' SHA-256."""
 
     count: int
-    sha256: str
+    digest: str
 
 
 STAG_LIBRARIES = {
-    "STAG_HD11": StagLibrary(
-        22_309, "8b094d9a0e7f95956bba2081f2d5238fd86b4abc46b061ad8f2e912051105dd1"
-    ),
-    "STAG_HD13": StagLibrary(
-        2_884, "d452276ebcb1fbaddf3228c47f2c8dee2bdd1747b1ceffb592aa61b0afc3f97e"
-    ),
-    "STAG_HD15": StagLibrary(
-        766, "68a33359c25246f85127ea4fe3ea4b6f4927bda0923fce65377a3dd424c3ff6d"
-    ),
-    "STAG_HD17": StagLibrary(
-        157, "6b7c8cf6538611507dbd2d42186edf45e6dfb452e7fe393efb475e7c012c7922"
-    ),
-    "STAG_HD19": StagLibrary(
-        38, "21b903cb3a75576c1cab1e515ceaf6234bb91c84b6d1c87582d3545af9b4a083"
-    ),
-    "STAG_HD21": StagLibrary(
-        12, "7ac380b8f8dfac5b4f9f398f1590f8901e48ad807b5880849815ef59cb846c3d"
-    ),
-    "STAG_HD23": StagLibrary(
-        6, "b4881e97f27dddbf0f9b66d95a220593abd3763eaf5468808e32aadf1ac99e62"
-    ),
+    "STAG_HD11": StagLibrary(22_309, "8b094d9a0e7f9595"),
+    "STAG_HD13": StagLibrary(2_884, "d452276ebcb1fbad"),
+    "STAG_HD15": StagLibrary(766, "68a33359c25246f8"),
+    "STAG_HD17": StagLibrary(157, "6b7c8cf653861150"),
+    "STAG_HD19": StagLibrary(38, "21b903cb3a75576c"),
+    "STAG_HD21": StagLibrary(12, "7ac380b8f8dfac5b"),
+    "STAG_HD23": StagLibrary(6, "b4881e97f27dddbf"),
 }
 """By the Hamming distance between their codes."""
 
@@ -225,18 +191,7 @@ than 1/20,000 of the marker's side."""
 
 def library_file() -> Path | None:
     """Return the compiled module of the installed package stag, or None."""
-    spec = importlib.util.find_spec("stag")
-    for folder in (spec and spec.submodule_search_locations) or ():
-        for path in sorted(Path(folder).glob("_core*")):
-            return path
-    return None
-
-
-def missing_stag() -> str | None:
-    """Return what to install for the libraries' codes; None if it is installed."""
-    if library_file() is not None:
-        return None
-    return "the package stag for its codes: pip install 'fiducial-sweep[stag-python]'"
+    return _file_of("stag", "_core*")
 
 
 def turned(codes: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
@@ -254,7 +209,7 @@ def _stag_codes(name: str) -> NDArray[np.uint64]:
     """
     path, library = library_file(), STAG_LIBRARIES[name]
     if path is None:
-        raise MissingPackageError(f"{name} needs {missing_stag()}")
+        raise MissingPackageError(f"{name} needs {missing_package(name)}")
     raw = path.read_bytes()
     words = np.frombuffer(raw[: len(raw) // 8 * 8], dtype="<u8").astype(np.uint64)
     n = library.count
@@ -264,22 +219,25 @@ def _stag_codes(name: str) -> NDArray[np.uint64]:
     for first, stop in ends.reshape(-1, 2).tolist():
         for start in range(first, stop - 3 * n + 1):
             codes = words[start : start + n]
-            if hashlib.sha256(codes.astype("<u8").tobytes()).hexdigest() == library.sha256:
+            digest = hashlib.sha256(codes.astype("<u8").tobytes()).hexdigest()
+            if digest.startswith(library.digest):
                 return codes
     raise MissingPackageError(f"{name}: its codes are not in {path}; install stag-python 1.1")
 
 
-def _circle(centre: Floats, radius: float, sides: int) -> Floats:
-    """Return the sides (sides, 4) of a regular polygon with a circle's area, as x, y, x, y.
-
-    The inside lies first of the two sides of each edge.
-    """
+def _circle(
+    centre: Floats, radius: float, sides: int, areas: tuple[int, int]
+) -> MarkerEdges:
+    """Return a regular polygon with a circle's area; ``areas`` are those inside and outside."""
     turn = 2 * math.pi / sides
     angle = turn * np.arange(sides + 1)
     reach = radius * math.sqrt(turn / math.sin(turn))
     points = centre + reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points[-1] = points[0]
-    return np.concatenate([points[:-1], points[1:]], axis=1)
+    return MarkerEdges(
+        np.concatenate([points[:-1], points[1:]], axis=1),
+        np.tile(np.array(areas, dtype=np.int64), (sides, 1)),
+    )
 
 
 @lru_cache(maxsize=1)
@@ -290,23 +248,6 @@ def dot_centres() -> Floats:
     angle = (positions[:, 1] + np.arange(4)[:, None] * math.pi / 2).ravel()
     half = STAG_MODULES / 2
     return np.stack([half + radius * np.cos(angle), half - radius * np.sin(angle)], axis=1)
-
-
-def stag_circles(name: str, marker_id: int) -> tuple[Floats, list[Floats]]:
-    """Return the sides of a marker's white circle (256, 4), and of each black dot (64, 4).
-
-    Raises
-    ------
-    MissingPackageError
-        The package stag-python is not installed.
-    """
-    code = int(_stag_codes(name)[marker_id])
-    middle = np.full(2, STAG_MODULES / 2)
-    dots = [
-        _circle(centre, DOT_RADIUS, DOT_SIDES)
-        for bit, centre in enumerate(dot_centres()) if code >> bit & 1
-    ]
-    return _circle(middle, CIRCLE_RADIUS, CIRCLE_SIDES), dots
 
 
 # --------------------------------------------------------------------------------------------------
@@ -334,18 +275,16 @@ class Marker:
 
     dictionary: str = parameter(
         "DICT_5X5_50", "the marker's dictionary, by OpenCV's name; tag*: AprilTag's families that "
-        "OpenCV lacks; STAG_*: STag's libraries",
-        choices=dictionary_names(), prefix="DICT_", abbreviated=True,
+        "OpenCV lacks; STAG_*: STag's libraries", choices=dictionary_names(), prefix="DICT_",
+        abbreviated=True,
         numbers=tuple((name, getattr(cv2.aruco, name)) for name in opencv_dictionary_names()),
     )
-    marker_id: int = parameter(0, "the marker's ID in its dictionary", low=0, high=10**6)
+    marker_id: int = parameter(0, "the marker's ID in its dictionary", 0, 10**6)
     size_m: float = parameter(
-        0.01, "side of the black square (of tag* the white one, whose corners are detected)",
-        unit="m", low=1e-9, high=1e9,
+        0.01, "side of the black square (of tag* the white one, whose corners are detected)", 1e-9,
+        1e9,
     )
-    quiet_zone_modules: float = parameter(
-        1.0, "width of the white surround, in modules", unit="module", low=0, high=100
-    )
+    quiet_zone_modules: float = parameter(1.0, "width of the white surround, in modules", 0, 100)
 
 
 @lru_cache(maxsize=64)
@@ -356,18 +295,17 @@ def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
 
 def missing_package(dictionary: str) -> str | None:
     """Return what to install for a dictionary's codes; None if nothing is missing."""
-    if dictionary in TAG_FAMILIES:
-        return missing_library()
-    return missing_stag() if dictionary in STAG_LIBRARIES else None
+    if dictionary in TAG_FAMILIES and library_path() is None:
+        return "an AprilTag library for its codes: pip install 'fiducial-sweep[pyapriltags]'"
+    if dictionary in STAG_LIBRARIES and library_file() is None:
+        return "the package stag for its codes: pip install 'fiducial-sweep[stag-python]'"
+    return None
 
 
 def marker_count(dictionary: str) -> int:
     """Return how many IDs a dictionary has."""
-    if dictionary in TAG_FAMILIES:
-        return TAG_FAMILIES[dictionary].count
-    if dictionary in STAG_LIBRARIES:
-        return STAG_LIBRARIES[dictionary].count
-    return len(opencv_dictionary(dictionary).bytesList)
+    family = TAG_FAMILIES.get(dictionary) or STAG_LIBRARIES.get(dictionary)
+    return family.count if family else len(opencv_dictionary(dictionary).bytesList)
 
 
 def module_count(dictionary: str) -> int:
@@ -424,10 +362,8 @@ def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
     return runs
 
 
-def cell_edges(
-    codes: NDArray[np.int64],
-) -> tuple[list[tuple[float, float, float, float]], list[tuple[int, int]]]:
-    """Return the maximal edges between square cells, and the areas beside each.
+def cell_edges(codes: NDArray[np.int64]) -> MarkerEdges:
+    """Return the maximal edges between square cells.
 
     ``codes`` (h + 2, w + 2) are the areas' codes, with those around the cells; the ends are
     (column, row, to column, to row) in cells from the top left corner.
@@ -447,7 +383,25 @@ def cell_edges(
                 # A quarter turn takes "down with the right side at greater x" to "right, above".
                 ends.append((start, line, stop, line))
                 sides.append((below, above))
-    return ends, sides
+    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+
+
+def rectangle_edges(boxes: Floats, outside: int, inside: int) -> MarkerEdges:
+    """Return the edges of rectangles (n, 4): left, top, right, bottom; right and down.
+
+    ``outside`` and ``inside`` are the codes of the areas.
+    """
+    left, top, right, bottom = boxes.T
+    ends = np.concatenate([
+        np.stack([left, top, left, bottom], axis=1), np.stack([right, top, right, bottom], axis=1),
+        np.stack([left, top, right, top], axis=1), np.stack([left, bottom, right, bottom], axis=1),
+    ])
+    codes = [(outside, inside), (inside, outside), (inside, outside), (outside, inside)]
+    return MarkerEdges(ends, np.repeat(np.array(codes, dtype=np.int64), len(boxes), axis=0))
+
+
+def _square(low: float, high: float, outside: int, inside: int) -> MarkerEdges:
+    return rectangle_edges(np.array([[low, low, high, high]], dtype=np.float64), outside, inside)
 
 
 @lru_cache(maxsize=8192)
@@ -466,38 +420,29 @@ def edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
         constant_values=surround,
     )
     n = len(codes) - 2
-    ends, sides = cell_edges(codes)
+    parts = [cell_edges(codes)]
     if surround == WHITE:
-        border, codes_beside = _square(beyond - margin, n - beyond + margin, OUTSIDE, WHITE)
-        ends += border
-        sides += codes_beside
-    return MarkerEdges(
-        np.array(ends, dtype=np.float64) - beyond, np.array(sides, dtype=np.int64)
-    )
-
-
-def _square(
-    low: float, high: float, outside: int, inside: int
-) -> tuple[list[tuple[float, float, float, float]], list[tuple[int, int]]]:
-    """Return the edges of a square from ``low`` to ``high``, and the areas beside each."""
-    return (
-        [(low, low, low, high), (high, low, high, high), (low, low, high, low),
-         (low, high, high, high)],
-        [(outside, inside), (inside, outside), (inside, outside), (outside, inside)],
-    )
+        parts.append(_square(beyond - margin, n - beyond + margin, OUTSIDE, WHITE))
+    whole = joined(parts)
+    return MarkerEdges(whole.ends - beyond, whole.sides)
 
 
 def _stag_edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
-    """Return the edges of a STag marker; its circles are polygons."""
-    circle, dots = stag_circles(dictionary, marker_id)
-    ends, sides = _square(0, STAG_MODULES, OUTSIDE if margin == 0 else WHITE, BLACK)
+    """Return the edges of a STag marker; its circles are polygons.
+
+    Raises
+    ------
+    MissingPackageError
+        The package stag-python is not installed.
+    """
+    code = int(_stag_codes(dictionary)[marker_id])
+    parts = [_square(0, STAG_MODULES, OUTSIDE if margin == 0 else WHITE, BLACK)]
     if margin > 0:
-        border, beside = _square(-margin, STAG_MODULES + margin, OUTSIDE, WHITE)
-        ends, sides = ends + border, sides + beside
-    return MarkerEdges(
-        np.concatenate([np.array(ends, dtype=np.float64), circle, *dots]),
-        np.array(
-            [*sides, *[(WHITE, BLACK)] * len(circle),
-             *[(BLACK, WHITE)] * sum(len(dot) for dot in dots)], dtype=np.int64,
-        ),
-    )
+        parts.append(_square(-margin, STAG_MODULES + margin, OUTSIDE, WHITE))
+    middle = np.full(2, STAG_MODULES / 2)
+    parts.append(_circle(middle, CIRCLE_RADIUS, CIRCLE_SIDES, (WHITE, BLACK)))
+    parts += [
+        _circle(centre, DOT_RADIUS, DOT_SIDES, (BLACK, WHITE))
+        for bit, centre in enumerate(dot_centres()) if code >> bit & 1
+    ]
+    return joined(parts)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sweep.compilation import compiled
-from sweep.declaration import parameter
+from sweep.declaration import drawn, parameter
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -21,71 +21,56 @@ from sweep.typing import Floats
 class Pose:
     """The pose's parameters; all angles zero is upright and parallel to the image plane."""
 
-    distance_m: float | None = parameter(
-        None, "depth of the marker's centre along the optical axis", unit="m", low=0,
-        high=1e12, open_low=True, drawable=True,
+    distance_m: float | None = drawn(
+        None, "depth of the marker's centre along the optical axis", 0, 1e12, open_low=True
     )
-    side_px: float | None = parameter(
-        None,
-        "side of the black square in the image if it were parallel to it; replaces distance_m",
-        unit="px", low=0, open_low=True, drawable=True,
+    side_px: float | None = drawn(
+        None, "side of the black square in the image if it were parallel to it; replaces "
+        "distance_m", 0, open_low=True,
     )
-    tilt_deg: float = parameter(
-        0.0, "angle between the marker's plane and the image plane", unit="degree", low=-360,
-        high=360, drawable=True,
+    tilt_deg: float = drawn(0.0, "angle between the marker's plane and the image plane", -360, 360)
+    view_angle_deg: float | None = drawn(
+        None, "angle between the marker's normal and the line of sight to its centre; replaces "
+        "tilt_deg", -180, 180,
     )
-    view_angle_deg: float | None = parameter(
-        None,
-        "angle between the marker's normal and the line of sight to its centre; replaces tilt_deg",
-        unit="degree", low=-180, high=180, drawable=True,
-    )
-    azimuth_deg: float = parameter(
+    azimuth_deg: float = drawn(
         0.0, "direction of the tilt axis: in the image plane, with view_angle_deg across the line "
-        "of sight", unit="degree", low=-360, high=360, drawable=True,
+        "of sight", -360, 360,
     )
-    yaw_deg: float | None = parameter(
-        None,
-        "turn about the camera's y axis; with pitch_deg it replaces tilt_deg and azimuth_deg "
-        "(default: 0 beside pitch_deg)", unit="degree", low=-360, high=360, drawable=True,
+    yaw_deg: float | None = drawn(
+        None, "turn about the camera's y axis; with pitch_deg it replaces tilt_deg and azimuth_deg "
+        "(default: 0 beside pitch_deg)", -360, 360,
     )
-    pitch_deg: float | None = parameter(
-        None, "turn about the x axis that yaw_deg has turned (default: 0 beside yaw_deg)",
-        unit="degree", low=-360, high=360, drawable=True,
+    pitch_deg: float | None = drawn(
+        None, "turn about the x axis that yaw_deg has turned (default: 0 beside yaw_deg)", -360,
+        360,
     )
-    roll_deg: float = parameter(
-        0.0, "rotation of the marker in its own plane, before all others", unit="degree", low=-360,
-        high=360, drawable=True,
+    roll_deg: float = drawn(
+        0.0, "rotation of the marker in its own plane, before all others", -360, 360
     )
-    bearing_x_deg: float = parameter(
-        0.0, "direction of the centre, right of the optical axis", unit="degree", low=-89.999,
-        high=89.999, drawable=True,
+    bearing_x_deg: float = drawn(
+        0.0, "direction of the centre, right of the optical axis", -89.999, 89.999
     )
-    bearing_y_deg: float = parameter(
-        0.0, "direction of the centre, below the optical axis", unit="degree", low=-89.999,
-        high=89.999, drawable=True,
+    bearing_y_deg: float = drawn(
+        0.0, "direction of the centre, below the optical axis", -89.999, 89.999
     )
-    x_m: float | None = parameter(
-        None, "place of the centre, right of the optical axis; replaces bearing_x_deg", unit="m",
-        low=-1e12, high=1e12, drawable=True,
+    x_m: float | None = drawn(
+        None, "place of the centre, right of the optical axis; replaces bearing_x_deg", -1e12, 1e12
     )
-    y_m: float | None = parameter(
-        None, "place of the centre, below the optical axis; replaces bearing_y_deg", unit="m",
-        low=-1e12, high=1e12, drawable=True,
+    y_m: float | None = drawn(
+        None, "place of the centre, below the optical axis; replaces bearing_y_deg", -1e12, 1e12
     )
-    frame_x: float | None = parameter(
-        None,
-        "place between the leftmost (0) and the rightmost (1) at which the marker and its quiet "
-        "zone are wholly in the frame; replaces bearing_x_deg", low=0, high=1, drawable=True,
+    frame_x: float | None = drawn(
+        None, "place between the leftmost (0) and the rightmost (1) at which the marker and its "
+        "quiet zone are wholly in the frame; replaces bearing_x_deg", 0, 1,
     )
-    frame_y: float | None = parameter(
-        None,
-        "place between the uppermost (0) and the lowest (1) at which the marker and its quiet "
-        "zone are wholly in the frame; replaces bearing_y_deg", low=0, high=1, drawable=True,
+    frame_y: float | None = drawn(
+        None, "place between the uppermost (0) and the lowest (1) at which the marker and its "
+        "quiet zone are wholly in the frame; replaces bearing_y_deg", 0, 1,
     )
     jitter_px: float = parameter(
-        0.0,
-        "a: the centre moves parallel to the image plane by uniform [-a, a] pixels in u and in v",
-        unit="px", low=0,
+        0.0, "a: the centre moves parallel to the image plane by uniform [-a, a] pixels in u and "
+        "in v", 0,
     )
 
 

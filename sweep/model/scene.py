@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.declaration import parameter
+from sweep.declaration import drawn, parameter
 from sweep.model import lens as lens_model
 from sweep.model.board import (
     Board,
@@ -63,39 +63,29 @@ class Scene:
     """The marker's surroundings, and the renderer."""
 
     renderer: str = parameter(
-        "exact",
-        "exact: area coverage; warp: the paper's, 10 px a module, INTER_LINEAR; supersample-N: "
-        "N x N regular samples a pixel; supersample-N-jittered: at random within their cells; or a "
-        "plug-in: the name of an installed one, or file:name beside the pipeline",
+        "exact", "exact: area coverage; warp: the paper's, 10 px a module, INTER_LINEAR; "
+        "supersample-N: N x N regular samples a pixel; supersample-N-jittered: at random within "
+        "their cells; or a plug-in: the name of an installed one, or file:name beside the pipeline",
         plugin="renderer", reads=renderer_name,
     )
     window: str = parameter(
-        "auto",
-        "auto: render and search the pixels that the marker can influence; full: the whole frame",
-        choices=("auto", "full"),
+        "auto", "auto: render and search the pixels that the marker can influence; full: the whole "
+        "frame", choices=("auto", "full"),
     )
-    black: float = parameter(
-        0.0, "level of black", unit="grey level", low=0, high=255, drawable=True
-    )
-    white: float = parameter(
-        255.0, "level of white", unit="grey level", low=0, high=255, drawable=True
-    )
-    background: float | str = parameter(
-        0.0,
-        "level beside the marker, or an image file of exactly the frame's size (path relative to "
-        "the pipeline file)",
-        unit="grey level", low=0, high=255, drawable=True,
+    black: float = drawn(0.0, "level of black", 0, 255, unit="grey level")
+    white: float = drawn(255.0, "level of white", 0, 255, unit="grey level")
+    background: float | str = drawn(
+        0.0, "level beside the marker, or an image file of exactly the frame's size (path relative "
+        "to the pipeline file)", 0, 255, unit="grey level",
     )
     photographs: str | None = parameter(
-        None,
-        "photographs with the poses of their markers, in place of simulated images: a file that "
-        "`sweep photos` writes (path relative to the pipeline file); trial is then the "
+        None, "photographs with the poses of their markers, in place of simulated images: a file "
+        "that `sweep photos` writes (path relative to the pipeline file); trial is then the "
         "photograph's number",
     )
     simulated: bool = parameter(
-        False,
-        "true: of the photographs the poses alone are taken, and each marker is simulated by "
-        "itself; trial k has the poses of photograph k modulo their number",
+        False, "true: of the photographs the poses alone are taken, and each marker is simulated "
+        "by itself; trial k has the poses of photograph k modulo their number",
     )
 
 

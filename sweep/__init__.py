@@ -416,11 +416,10 @@ def twins(
     (3, 10, 3)
     """
     named = "twins" if isinstance(scene, Mapping) else scene
-    parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene)
+    measured = library.lifecycle.read_pipeline(photographs)
+    parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene, measured)
     return _run(
-        library.twins.twin_pipeline(
-            library.lifecycle.read_pipeline(photographs), parameters, repeats
-        ),
+        library.twins.twin_pipeline(measured, parameters, repeats),
         store=store or library.twins.twin_store(photographs, named),
         workers=workers,
         overwrite=overwrite,

@@ -23,7 +23,13 @@ from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary_names
 from sweep.model.polygon import side_lengths
 from sweep.model.pose import rotation_of_vector
-from sweep.photographs.folder import FoundCorners, KnownCamera, Photograph, detect_markers
+from sweep.photographs.folder import (
+    FoundCorners,
+    KnownCamera,
+    Photograph,
+    detect_markers,
+    named,
+)
 from sweep.photographs.pose_fit import Lens
 from sweep.photographs.truth import fitted_board
 from sweep.typing import Floats, Integers, Masks
@@ -47,8 +53,11 @@ MAX_SIZE_ERROR = 0.08
 """Relative difference of the markers' measured side to the board's that is refused; blur makes
 detected markers up to 5 % smaller."""
 
+MIN_OWN, MIN_JUDGED = 0.6, 4
+"""Share of the markers of a single photograph that must lie there, and how many tell."""
+
 MAX_TRIED = 3
-"""Photographs in which other dictionaries are searched for."""
+"""Photographs in which other dictionaries, and halves side by side, are searched for."""
 
 Seen = Sequence[tuple[Integers, Floats]]
 """IDs (k,) and corners (k, 4, 2) px of each photograph."""
@@ -64,6 +73,7 @@ def check_board(
     ArgumentError
         One line: what is wrong, and which board fits.
     """
+    _check_halves(board, find, photographs)
     if not any(len(ids) for ids, _ in seen):
         raise ArgumentError("board", plain(path), _no_marker(board, find, photographs))
     known = {each for ids, _ in seen for each in ids.tolist()} & set(board.marker_ids)
@@ -75,6 +85,18 @@ def check_board(
             "first_id or ids",
         )
     share = fitting_share(board, seen)
+    own = [
+        fitting_share(board, [each]) if len(each[0]) >= MIN_JUDGED else 1.0
+        for each in seen[: len(photographs)]
+    ]
+    odd = [each.path.name for each, one in zip(photographs, own, strict=True) if one < MIN_OWN]
+    if odd and len(odd) < len(own) / 2:
+        raise ArgumentError(
+            "folders", plain(photographs[0].path.parent, 300),
+            f"{named(odd)}: less than {100 * MIN_OWN:.0f} % of the markers lie where the board "
+            f"has them, unlike in {len(own) - len(odd)} other photographs; move those of another "
+            "board elsewhere",
+        )
     ratio = measured_side(board, seen)
     centres = board.corners_m.mean(axis=1, keepdims=True)
     scaled = dataclasses.replace(board, corners_m=centres + ratio * (board.corners_m - centres))
@@ -194,6 +216,29 @@ def _others(path: Path) -> Iterator[tuple[str, Board]]:
         yield words, other
 
 
+def _check_halves(
+    board: Board, find: FindFunction, photographs: Sequence[Photograph]
+) -> None:
+    """Refuse images of two cameras side by side: most of their markers are in both halves."""
+    both = whole = 0
+    for each in photographs[:MAX_TRIED]:
+        height, width = each.image.shape
+        if width < 2 * height:
+            continue
+        halves = [
+            set(detect_markers(find, half, board.dictionary)[0].tolist())
+            for half in (each.image[:, : width // 2], each.image[:, width // 2 :])
+        ]
+        both += len(halves[0] & halves[1])
+        whole += len(halves[0] | halves[1])
+    if whole >= MIN_JUDGED and both > whole / 2:
+        raise ArgumentError(
+            "folders", plain(photographs[0].path.parent, 300),
+            "most markers are in both halves of the images: of two cameras side by side give the "
+            "calibration (--stereo FILE)",
+        )
+
+
 def _no_marker(
     board: Board, find: FindFunction, photographs: Sequence[Photograph]
 ) -> str:
@@ -290,6 +335,10 @@ MIN_PHOTOGRAPHS = 4
 MIN_CORNERS = 12
 """Corners of a board in a photograph that is used."""
 
+MAX_RMS_PX = 2.0
+"""RMS of the corners beside the calibrated camera that is refused, in images of 800 px or less; in
+larger ones it grows with the width."""
+
 
 def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCamera:
     """Calibrate a camera with five coefficients (:func:`sweep.measure.intrinsics.calibrate`).
@@ -322,6 +371,14 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCame
             "camera", "calibrate",
             "OpenCV cannot calibrate from these photographs; take others, from different sides, or "
             "give the file of a calibration",
+        )
+    limit = MAX_RMS_PX * max(1.0, size[0] / 800)
+    if made.rms_px > limit:
+        raise ArgumentError(
+            "camera", "calibrate",
+            f"corners are {made.rms_px:.2g} px RMS beside the calibrated camera; expected at most "
+            f"{limit:.2g} px: check the board's kind, that the print is flat, and that all "
+            "photographs are of one camera at one focus",
         )
     fx, fy, cx, cy, *distortion = made.values.tolist()
     lens = Lens.of(fx, fy, cx, cy, tuple(distortion))

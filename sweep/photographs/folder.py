@@ -100,11 +100,11 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
         notes.update(_conversions(content))
         photographs.append(Photograph(path, digest, part.of(image)))
     name = plain(home.name, 300)
-    lines = [f"{name}: left out {_named(other)}: no images"] if other else []
+    lines = [f"{name}: left out {named(other)}: no images"] if other else []
     if unreadable:
-        lines.append(f"{name}: left out {_named(unreadable)}")
+        lines.append(f"{name}: left out {named(unreadable)}")
     if repeated:
-        lines.append(f"{name}: left out {_named(repeated)}: the same photographs again")
+        lines.append(f"{name}: left out {named(repeated)}: the same photographs again")
     lines += [f"{name}: {count} of {len(photographs)} photographs {note}"
               for note, count in sorted(notes.items())]
     if not photographs:
@@ -138,12 +138,12 @@ def _check_sizes(home: Path, photographs: Sequence[Photograph]) -> None:
     ]
     raise ArgumentError(
         "folders", plain(home, 300),
-        f"expected photographs of one size: most are {width} x {height}, not {_named(odd)}; move "
+        f"expected photographs of one size: most are {width} x {height}, not {named(odd)}; move "
         "those of another camera or size elsewhere",
     )
 
 
-def _named(names: Sequence[str]) -> str:
+def named(names: Sequence[str]) -> str:
     """Return a few of some names, and how many they are."""
     rest = len(names) - MAX_NAMED
     listed = ", ".join(plain(name) for name in names[:MAX_NAMED])

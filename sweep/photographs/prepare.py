@@ -29,6 +29,7 @@ from sweep.photographs.folder import (
     detect_markers,
     find_corners,
     name_of,
+    named,
     read_folder,
     reference_detector,
     setting_name,
@@ -303,10 +304,7 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
         ) if not some
     ]
     if empty:
-        more = f" and {len(empty) - 3} more" if len(empty) > 3 else ""
-        lines.append(
-            f"no pose of a marker is known in {', '.join(map(plain, empty[:3]))}{more}: not counted"
-        )
+        lines.append(f"no pose of a marker is known in {named(empty)}: not counted")
     if np.any([each.known.any(axis=1) for each in truth], axis=0).sum() == 1:
         lines.append(
             "one photograph: errors and rates without intervals, which are those of other "

@@ -15,7 +15,7 @@ from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import PhotographRecord, read_record
 from sweep.experiment.pipeline import Pipeline
-from sweep.messages import plain
+from sweep.messages import notice, plain
 from sweep.model.image_file import read_regular
 
 NAME = "{}-twins"
@@ -107,8 +107,10 @@ def twin_store(photographs: str | os.PathLike[str], scene: str | os.PathLike[str
     return f"{os.fspath(photographs).rstrip('/').removesuffix('.zarr')}-{Path(scene).stem}.zarr"
 
 
-def read_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_scene(path: str | os.PathLike[str], like: Pipeline | None = None) -> dict[str, Any]:
     """Return the section [scene] of a TOML file, such as `sweep fit` writes.
+
+    Warns if its camera has other pixels than that of ``like``, whose twins are to have the scene.
 
     Raises
     ------
@@ -120,7 +122,16 @@ def read_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ArgumentError("scene", plain(path, 300), f"cannot be read: {reason}") from None
-    scene = document.get("scene")
+    scene, camera = document.get("scene"), document.get("camera")
     if not isinstance(scene, dict):
         raise ArgumentError("scene", plain(path, 300), "expected a section [scene]")
+    sizes = [
+        tuple(known.get(name) for name in ("width_px", "height_px"))
+        for known in (camera if isinstance(camera, dict) else {}, like.fixed if like else {})
+    ]
+    if None not in sizes[0] + sizes[1] and sizes[0] != sizes[1]:
+        notice(
+            f"{plain(path, 300)}: fitted to images of {sizes[0][0]} x {sizes[0][1]}, not of "
+            f"{sizes[1][0]} x {sizes[1][1]}: its blur, noise and shifts in px are of those"
+        )
     return scene

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from support.board_photographs import POSES, SIZE, VIEW, board, camera
+from sweep.errors import ArgumentError
 from sweep.photographs.board_check import calibrate
 from sweep.photographs.folder import FoundCorners
 from sweep.photographs.pose_fit import Lens, fit_pose
@@ -29,6 +30,13 @@ def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
     assert np.sqrt(np.diag(made.covariance)) == pytest.approx(made.sd, rel=1e-3)
     correlation = made.covariance[0, 1] / np.sqrt(made.covariance[0, 0] * made.covariance[1, 1])
     assert correlation > 0.5  # both focal lengths rest on the same depths
+
+
+def test_a_camera_that_does_not_fit_its_photographs_is_refused():
+    rng = np.random.default_rng(1)
+    turned = [seen(number, rng, 4.0) for number in range(len(POSES))]
+    with pytest.raises(ArgumentError, match="px RMS beside the calibrated camera; expected at mo"):
+        calibrate(SIZE, turned)
 
 
 @pytest.mark.parametrize("number", [0, 2])

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from support.board_photographs import POSES, camera, toml, write_set
+from support.board_photographs import BOARD, POSES, camera, image, toml, write_set
 from sweep.errors import ArgumentError, SweepError
+from sweep.experiment.photographs import board_of
 from sweep.photographs.prepare import prepare
 
 
@@ -20,8 +21,8 @@ def folder(tmp_path_factory):
         "mixed": (grey, grey, grey[:200]), "without": (np.full_like(grey, 128),), "empty": (),
     }.items():
         (made / name).mkdir()
-        for number, image in enumerate(images):
-            cv2.imwrite(str(made / name / f"{number}.png"), image)
+        for number, shown in enumerate(images):
+            cv2.imwrite(str(made / name / f"{number}.png"), shown)
     return made
 
 
@@ -92,3 +93,24 @@ def test_what_is_left_out_and_converted_is_said(folder, tmp_path):
     assert "\\udcff.png (its name is not UTF-8" in said
     assert "2 of 3 photographs have 16 bits" in said
     assert "1 of 3 photographs are in colour" in said
+
+
+def test_a_photograph_of_another_board_is_named(folder, tmp_path):
+    shots = write_set(tmp_path, POSES[:3])
+    other = board_of({**BOARD, "first_id": 5}, "board")
+    cv2.imwrite(str(shots / "other.png"), image(POSES[1], 7, printed=other))
+    with pytest.raises(ArgumentError, match=r"other.png: less than 60 % of the markers") as caught:
+        prepare([shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path)
+    assert "\n" not in str(caught.value)
+    (shots / "other.png").unlink()
+    prepare([shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path)
+
+
+def test_images_of_two_cameras_side_by_side_get_a_hint(folder, tmp_path):
+    for number, pose in enumerate(POSES[:2]):
+        halves = [image(pose, number), image(pose, number + 5)]
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.hstack(halves))
+    path = tmp_path / "both.json"
+    path.write_text(camera((720, 270), (420.0, 420.0, 360.0, 132.0)))
+    with pytest.raises(ArgumentError, match=r"in both halves .* .--stereo FILE"):
+        prepare([tmp_path], path, board=folder / "board.toml", home=tmp_path)

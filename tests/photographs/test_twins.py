@@ -113,6 +113,16 @@ def test_blocks_of_any_size_give_the_same_store_without_the_photographs(prepared
     assert small.photograph.values.tolist() == ["shot0.png", "shot1.png", "shot2.png"]
 
 
+def test_a_scene_of_another_resolution_is_said(prepared, tmp_path, capsys):
+    path = tmp_path / "scene.toml"
+    for width, said in ((360, False), (720, True)):
+        path.write_text(
+            f"[camera]\nwidth_px = {width}\nheight_px = 270\n[scene]\nblur_px = 0.6\n")
+        assert read_scene(path, prepared) == {"blur_px": 0.6}
+        warned = "fitted to images of 720 x 270, not of 360 x 270" in capsys.readouterr().err
+        assert warned == said
+
+
 def test_only_photographs_have_twins(prepared, tmp_path):
     with pytest.raises(SweepError, match="expected a store of photographs"):
         twin_pipeline(Pipeline.from_dict({"pose": {"distance_m": 1}}), {})

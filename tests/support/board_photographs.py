@@ -54,11 +54,11 @@ def camera(size=SIZE, view=VIEW):
     })
 
 
-def image(pose, seed, view=VIEW):
-    """Return a photograph (height, width)."""
+def image(pose, seed, view=VIEW, printed=None):
+    """Return a photograph (height, width), of another board if that is printed."""
     view = dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), view, strict=True))
     scenes = board_scene(
-        board(), {"width_px": SIZE[0], "height_px": SIZE[1], **view},
+        printed or board(), {"width_px": SIZE[0], "height_px": SIZE[1], **view},
         BoardPose(pose[0], np.array(pose[1])), blur_px=0.6,
     )
     levels = levels_of(scenes, background=120.0, black=35.0, white=210.0)

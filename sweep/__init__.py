@@ -17,7 +17,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from sweep import library
 from sweep.execution import BLOCK_TASK
@@ -41,6 +41,8 @@ from sweep.errors import (
 from sweep.version import __version__
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
     import xarray as xr
     from distributed import Client
 
@@ -59,6 +61,22 @@ __all__ = [
     "error_model", "fit", "limit", "measure_tradeoff", "open", "photos", "reference", "require",
     "run", "size", "twins", "write_report",
 ]
+
+class LocalOptions(TypedDict, total=False):
+    """Options of what runs on this machine, as :func:`run` has them."""
+
+    workers: int | None
+    overwrite: bool
+
+
+class RunOptions(LocalOptions, total=False):
+    """Options of a run that are not its pipeline and store, as :func:`run` has them."""
+
+    client: Client | Cluster | None
+    scheduler: str | None
+    reuse: Sequence[str | os.PathLike[str]]
+    yes: bool
+
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
                     "decode_flags": "sweep.analysis.dataset"}
@@ -170,13 +188,8 @@ def limit(
     at_all: Sequence[str] | None = None,
     max_trials: int | None = None,
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    client: Client | Cluster | None = None,
-    scheduler: str | None = None,
-    reuse: Sequence[str | os.PathLike[str]] = (),
-    overwrite: bool = False,
-    yes: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
+    **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Find how far along an axis requirements are met, and return the limits.
 
@@ -224,12 +237,10 @@ def limit(
     """
     # The child imports its packages while this process does.
     with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-
         source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
         limits, summary = library.limit_search.search_limits(
             source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
-            store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-            overwrite=overwrite, yes=yes, progress=report, child=child)
+            store=store, progress=report, child=child, **options)
     for line in summary.warnings if summary is not None else ():
         notice(line)
     return limits
@@ -313,9 +324,8 @@ def photos(
     stereo: str | os.PathLike[str] | None = None,
     settings: Sequence[str] = (),
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    overwrite: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
+    **options: Unpack[LocalOptions],
 ) -> xr.Dataset:
     """Measure detectors and estimators on photographs of known markers.
 
@@ -361,14 +371,14 @@ def photos(
     home, name = library.folder.record_home(store)
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
-        name=name, overwrite=overwrite,
+        name=name, overwrite=options.get("overwrite", False),
     )
     for line in prepared.lines:
         notice(line)
     return _run(
-        prepared.pipeline, store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
-        workers=workers, overwrite=overwrite, progress=progress,
-    )
+        prepared.pipeline,
+        store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
+        progress=progress, **options)
 
 
 def twins(
@@ -377,9 +387,8 @@ def twins(
     *,
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    overwrite: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
+    **options: Unpack[LocalOptions],
 ) -> xr.Dataset:
     """Simulate the markers of photographs at their poses.
 
@@ -420,11 +429,7 @@ def twins(
     parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene, measured)
     return _run(
         library.twins.twin_pipeline(measured, parameters, repeats),
-        store=store or library.twins.twin_store(photographs, named),
-        workers=workers,
-        overwrite=overwrite,
-        progress=progress,
-    )
+        store=store or library.twins.twin_store(photographs, named), progress=progress, **options)
 
 
 def fit(
@@ -484,12 +489,9 @@ def size(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    reuse: Sequence[str | os.PathLike[str]] = (),
-    overwrite: bool = False,
-    yes: bool = False,
     limit_s: float = 20.0,
     progress: bool | Callable[[Progress], None] | None = None,
+    **options: Unpack[RunOptions],
 ) -> Choice:
     """Search the smallest, or the cheapest, choice that meets requirements at all conditions.
 
@@ -497,7 +499,7 @@ def size(
     ----------
     pipeline
         As for :func:`run`, with the sections [require] and [search].
-    store, workers, reuse, overwrite, yes, progress
+    store, workers, client, scheduler, reuse, overwrite, yes, progress
         As for :func:`run`.
     limit_s
         Seconds of the measurement of costs, where there are alternatives or a budget.
@@ -529,7 +531,7 @@ def size(
           library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
             _pipeline(pipeline), store, limit_s=limit_s, progress=report, stage=stage, child=child,
-            workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
+            **options)
     for line in found.notes:
         notice(line)
     return found
@@ -743,9 +745,8 @@ def compare(
     output: str | os.PathLike[str] | None = None,
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    overwrite: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
+    **options: Unpack[LocalOptions],
 ) -> Findings:
     """Compare photographs with a simulation, or two stores of one pipeline.
 
@@ -791,8 +792,7 @@ def compare(
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
         place = os.fspath(store or library.twins.twin_store(one, other))
-        twins(one, other, repeats=repeats, store=place, workers=workers, overwrite=overwrite,
-              progress=progress)
+        twins(one, other, repeats=repeats, store=place, progress=progress, **options)
         other = place
     elif store:
         raise ArgumentError("store", store, "expected photographs and a TOML file to simulate")

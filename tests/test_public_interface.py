@@ -68,8 +68,11 @@ def test_every_public_function_says_what_it_takes_returns_and_raises(name):
         assert f"\n{heading}\n{'-' * len(heading)}\n" in described
     parameters = described.partition("Parameters\n---")[2].partition("Returns\n---")[0]
     named = re.findall(r"^(\w+(?:, \w+)*)$", parameters, re.MULTILINE)
-    assert sorted(", ".join(named).split(", ")) == sorted(
-        inspect.signature(FUNCTIONS[name]).parameters)
+    taken = inspect.signature(FUNCTIONS[name]).parameters
+    several = re.fullmatch(r"Unpack\[(\w+)\]", str(taken["options"].annotation)) if (
+        "options" in taken) else None
+    options = getattr(sweep, several[1]).__annotations__ if several else {}
+    assert sorted(", ".join(named).split(", ")) == sorted({*taken, *options} - {"options"})
 
 
 @pytest.mark.usefixtures("no_child")

@@ -520,8 +520,7 @@ def length_interval(estimate: MeanEstimate, components: int, level: float = LEVE
 # All intervals are at 95 %, over the random draws, conditional on the grid; NaN if no cell has
 # two draws that count.
 
-@dataclass(frozen=True)
-class Output:
+class Output(NamedTuple):
     """A variable that a statistic gives."""
 
     name: str
@@ -553,9 +552,13 @@ def interval_variables(name: str, interval: Sequence[NDArray[Any]]) -> Variables
 class Statistic(ABC, Generic[ViewT]):
     """What is computed of poses; generic over the view of them."""
 
-    @abstractmethod
+    name: str
+    meaning: str
+    units: str
+
     def outputs(self) -> Sequence[Output]:
-        """Return the variables that it gives."""
+        """Return the variables that it gives: by default a value and its interval."""
+        return with_interval(self.name, self.meaning, self.units)
 
     @abstractmethod
     def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
@@ -760,10 +763,6 @@ class Mean(Statistic[ViewT]):
     tail_share: ClassVar[float] = TAIL_SHARE
     """Where sampling was stopped."""
 
-    def outputs(self) -> Sequence[Output]:
-        """Return the mean and its interval."""
-        return with_interval(self.name, self.meaning, self.units)
-
     def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
         """Return the mean and its interval."""
         level = design.level(self.level, self.tail_share)
@@ -922,10 +921,6 @@ class FlipMixture(Statistic[Poses]):
     level: float = LEVEL
     guarded: bool = False
     """Whether the ends of u and v also hold errors that no draw showed, as `PositiveMean` says."""
-
-    def outputs(self) -> Sequence[Output]:
-        """Return the root mean square and its interval."""
-        return with_interval(self.name, self.meaning, self.units)
 
     def used(self, poses: Poses) -> Masks:
         """Return the poses that count."""

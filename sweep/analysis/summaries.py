@@ -30,20 +30,17 @@ from sweep.analysis.estimator import (
     Count,
     Design,
     FlipMixture,
+    Interval,
     Mean,
     MeanLength,
-    Output,
     PositiveMean,
     Quantiles,
     Rate,
     RootMeanSquare,
     StandardDeviation,
     Statistic,
-    Variables,
     aggregate,
     guarded,
-    interval_variables,
-    with_interval,
 )
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import (
@@ -872,53 +869,37 @@ def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 @dataclass(frozen=True)
-class BoundRatio(Statistic[Poses]):
-    """The RMS bound over the RMS error of a kind of error, of the poses that have both.
+class BoundRatio(RootMeanSquare[Poses]):
+    """The RMS bound over the RMS error, of the poses that have both; ``values`` are of the error.
 
     Attributes
     ----------
-    name
-        Of the ratio.
-    quantity
-        The kind of error.
-    bound_squared
+    bound
         The squared bounds (...) of poses.
-    level, guarded
-        As of `RootMeanSquare`.
     """
 
-    name: str
-    quantity: Quantity
-    bound_squared: Callable[[Poses], Floats]
-    level: float = LEVEL
-    guarded: bool = False
+    bound: Callable[[Poses], Floats] = field(kw_only=True)
 
-    def outputs(self) -> Sequence[Output]:
-        """Return the ratio and its interval."""
-        words = f"RMS bound over RMS {self.quantity.words}, solved and not flipped"
-        return with_interval(self.name, words, "1")
-
-    def variables(self, columns: Columns[Poses], design: Design) -> Variables:
+    def interval(self, columns: Columns[Poses], design: Design, level: float) -> Interval:
         """Return the ratio; its interval is that of the error."""
-        bound, error = (
-            RootMeanSquare(
-                "", "", self.quantity.units, squares, self.used, self.level, self.guarded,
-            ).variables(columns, design)
-            for squares in (lambda poses: self.bound_squared(poses)[..., None],
-                            self.quantity.squares))
+        value, low, high = super().interval(columns, design, level)
+        squares: Mean[Poses] = Mean(
+            "", "", "", lambda poses: self.bound(poses)[..., None], self.used)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ends = [bound[""] / error[end] for end in ("", "_high", "_low")]
-        return interval_variables(self.name, ends)
+            bound = np.sqrt(squares.sums(columns).mean[:, 0])
+            return bound / value, bound / high, bound / low
 
-    def used(self, poses: Poses) -> Masks:
-        """Return the poses that have a bound and are solved and not flipped."""
-        return poses.unflipped & np.isfinite(self.bound_squared(poses))
+
+def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> BoundRatio:
+    return BoundRatio(
+        f"{quantity.name}_efficiency",
+        f"RMS bound over RMS {quantity.words}, solved and not flipped", "1", quantity.squares,
+        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound=bound)
 
 
 RATIOS = (
-    BoundRatio("rotation_efficiency", QUANTITIES[0],
-               lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
-    BoundRatio("range_efficiency", QUANTITIES[1],
-               lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
+    _of_bound(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
+    _of_bound(QUANTITIES[1],
+              lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
 )
 """Of the rotation and of the depth."""

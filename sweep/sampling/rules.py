@@ -164,18 +164,13 @@ class Waves:
 
     def index(self, number: int) -> tuple[int, ...]:
         """Return a block's index along each scene axis."""
-        index = []
-        for count in reversed(self.blocks.counts):
-            number, position = divmod(number, count)
-            index.append(position)
-        return tuple(reversed(index))
+        return tuple(map(int, np.unravel_index(number, self.blocks.counts)))
 
     def group(self, number: int) -> int:
         """Return the number of the group that a block belongs to."""
-        index, counts, group = self.index(number), self.blocks.counts, 0
-        for k in self.free:
-            group = group * counts[k] + index[k]
-        return group
+        index, counts = self.index(number), self.blocks.counts
+        return int(np.ravel_multi_index([index[k] for k in self.free] or [0],
+                                        [counts[k] for k in self.free] or [1]))
 
     def wave(self, number: int) -> int:
         """Return the number of the wave that a block belongs to, from 0."""
@@ -188,18 +183,16 @@ class Waves:
         ``last`` is ``first`` if it is left out; earlier trials come first.
         """
         counts, extent = self.blocks.counts, self.blocks.extents[self.trial]
-        at: dict[int, int] = {}
-        for k in reversed(self.free):
-            group, at[k] = divmod(group, counts[k])
+        at = np.unravel_index(group, [counts[k] for k in self.free] or [1])
         start = self.ends[first - 1] // extent if first else 0
         stop = -(-self.ends[first if last is None else last] // extent)
+        ranges = {k: range(counts[k]) for k in self.coupled} | {
+            k: range(int(position), int(position) + 1)
+            for k, position in zip(self.free, at, strict=False)}
         for trial in range(start, stop):
-            for along in product(*(range(counts[k]) for k in self.coupled)):
-                index = {**at, self.trial: trial, **dict(zip(self.coupled, along, strict=True))}
-                number = 0
-                for k, count in enumerate(counts):
-                    number = number * count + index[k]
-                yield number
+            whole = ranges | {self.trial: range(trial, trial + 1)}
+            for index in product(*(whole[k] for k in range(len(counts)))):
+                yield int(np.ravel_multi_index(index, counts))
 
     def span(self, block: Block) -> Block:
         """Return the box of a block's group, of all its trials."""

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, VARIES
 from sweep.analysis.error_models import (
+    CONDITIONS,
+    PREDICTORS,
     QUANTITIES,
     UNITS,
+    VARIES,
     WORDS,
     Use,
     cell_edges,

@@ -20,8 +20,7 @@ from support.pose_errors import (
 )
 from support.stores import by_hand
 from sweep.analysis import error_models, model_covariance, model_errors
-from sweep.analysis.error_model_fit import focal_size_of
-from sweep.analysis.error_models import Use
+from sweep.analysis.error_models import Use, focal_size_of
 from sweep.analysis.poses import in_sight_frame, sight_rotation, viewing_angle_of
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.pipeline import Pipeline

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections import Counter
@@ -15,7 +16,7 @@ from sweep.evaluation.block import bound_notes
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.axes import Axis
 from sweep.experiment.parameters import Stage
-from sweep.measure.flags import DetectionStatus, EstimateStatus, looked_for
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
 from sweep.processor import differing_processors
 from sweep.store.blocks import (
     RunStore,
@@ -29,7 +30,7 @@ from sweep.store.lifecycle import finish, open_store, reopen
 from sweep.store.lock import changing, is_written
 from sweep.store.outcome import (
     MAX_ROWS,
-    FailureGroup,
+    Outcome,
     failure_table,
     first_cell,
     outcome_of,
@@ -39,6 +40,57 @@ from sweep.store.receipt import FailedCell, Receipt
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+# --------------------------------------------------------------------------------------------------
+# What the receipts of a store add up to.
+
+@dataclass(slots=True)
+class Totals:
+    """Receipts, added up.
+
+    Attributes
+    ----------
+    blocks
+        Number and receipt of each; without its failures, of which all are not kept in memory.
+    scenes, needed
+        Scenes of the blocks, and those of them that were needed.
+    detection, estimate
+        Counts of cells; the flag is the index.
+    processors
+        Blocks by the features of the processors that computed them.
+    cells
+        Failed and crashed cells, at most 1,000 of each kind.
+    """
+
+    blocks: list[tuple[int, Receipt]] = field(default_factory=list)
+    scenes: int = 0
+    needed: int = 0
+    detection: list[int] = field(default_factory=lambda: [0] * len(DetectionStatus))
+    estimate: list[int] = field(default_factory=lambda: [0] * len(EstimateStatus))
+    processors: Counter[str] = field(default_factory=Counter)
+    cells: dict[str, list[FailedCell]] = field(
+        default_factory=lambda: {"failed": [], "crashed": []})
+
+    @staticmethod
+    def of(store: RunStore, numbers: Iterable[int]) -> Totals:
+        """Add up the receipts of some committed blocks; StoreError if one is damaged."""
+        totals = Totals()
+        for number, receipt in receipts(store, numbers):
+            totals.blocks.append((number, dataclasses.replace(
+                receipt, failures=(), checksums={}, detection=[], estimate=[])))
+            totals.scenes += receipt.scenes
+            totals.needed += receipt.scenes_needed
+            totals.processors.update(receipt.processors)
+            for counts, added in (
+                (totals.detection, receipt.detection), (totals.estimate, receipt.estimate),
+            ):
+                for flag, count in enumerate(added):
+                    counts[flag] += count
+            for cell in receipt.failures:
+                if len(totals.cells[cell.kind]) < MAX_ROWS:
+                    totals.cells[cell.kind].append(cell)
+        return totals
 
 
 # --------------------------------------------------------------------------------------------------
@@ -56,33 +108,22 @@ def close(store: RunStore) -> None:
         If a receipt is damaged, a chunk is missing, or the store cannot be written.
     """
     check_not_replaced(store)
-    done = check_whole(store, finished=True)
-    blocks: list[tuple[int, Mapping[str, Sequence[float]]]] = []
-    cells: list[FailedCell] = []
-    kept: Counter[str] = Counter()
-    counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
-    needed = 0
-    processors: Counter[str] = Counter()
-    for number, receipt in receipts(store, done):
-        needed += receipt.scenes_needed
-        processors.update(receipt.processors)
-        if receipt.seconds["scene"]:
-            blocks.append((number, receipt.seconds))
-        for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):
-            for flag, count in enumerate(flags):
-                counts[name][flag] += count
-        for cell in receipt.failures:
-            kept[cell.kind] += 1
-            if kept[cell.kind] <= MAX_ROWS:
-                cells.append(cell)
-    failures = failure_table(cells, lost(counts["detection"], counts["estimate"]))
-    recorded: dict[str, Any] = {**counts, "processors": dict(processors)}
+    totals = Totals.of(store, check_whole(store, finished=True))
+    counts: dict[str, Any] = {
+        "detection": totals.detection, "estimate": totals.estimate,
+        "processors": dict(totals.processors),
+    }
     if store.pipeline.stopping is not None:
-        recorded["sampled"] = {
-            "needed": needed, "conditions": condition_count(store.pipeline),
+        counts["sampled"] = {
+            "needed": totals.needed, "conditions": condition_count(store.pipeline),
             "unsettled": unsettled_count(store),
         }
-    finish(store, {"cost": _cost(store, blocks), "failures": failures}, recorded)
+    failures = failure_table(
+        [*totals.cells["failed"], *totals.cells["crashed"]],
+        lost(totals.detection, totals.estimate))
+    costs = [(number, receipt.seconds) for number, receipt in totals.blocks
+             if receipt.seconds["scene"]]
+    finish(store, {"cost": _cost(store, costs), "failures": failures}, counts)
 
 
 def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
@@ -209,8 +250,8 @@ def _lost(receipt: Receipt) -> int:
 # --------------------------------------------------------------------------------------------------
 # What a run did, in one record.
 
-@dataclass(frozen=True, slots=True)
-class Summary:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary(Outcome):
     """What a run did; ``sweep run --json`` prints it.
 
     Attributes
@@ -234,16 +275,6 @@ class Summary:
         Duration of this run.
     crashed, failed
         Cells that are flagged so.
-    nothing_computed
-        Whether a stage was tried and failed on every cell; ``sweep run`` ends with status 1 then.
-    failed_share
-        Share of the cells that failed or crashed, of those that a stage was tried on.
-    failures
-        The same cells by reason, each with one that ``sweep repro --at`` takes.
-    warnings
-        The lines of ``sweep run`` on failures, and on a run in which nothing was detected.
-    advice
-        The command that recomputes a cell for each reason; empty without warnings.
     needed, conditions, unsettled
         Of a run in waves, the poses that were needed, the conditions, and those of them that would
         need more than ``max_trials``; None of a run of fixed trials.
@@ -264,11 +295,6 @@ class Summary:
     seconds: float
     crashed: int = 0
     failed: int = 0
-    nothing_computed: bool = False
-    failed_share: float = 0.0
-    failures: list[FailureGroup] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    advice: str = ""
     retried: int = 0
     recovered: int = 0
     needed: int | None = None
@@ -314,20 +340,22 @@ def summary_of(
         computed_scenes=computed.get("scenes", 0),
         computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
-        **missing,
-        nothing_computed=outcome.nothing_computed,
-        failed_share=round(outcome.failed_share, 6),
-        failures=outcome.failures,
-        warnings=[
-            *outcome.warnings, *bound_notes(store.pipeline), *_unsettled_lines(store, sampled),
-        ],
-        advice=outcome.advice,
+        crashed=missing["crashed"],
+        failed=missing["failed"],
+        **_told(outcome, *bound_notes(store.pipeline), *_unsettled_lines(store, sampled)),
         retried=retry.cells,
         recovered=retry.recovered(store),
         needed=sampled.get("needed"),
         conditions=sampled.get("conditions"),
         unsettled=sampled.get("unsettled"),
     )
+
+
+def _told(outcome: Outcome, *more: str) -> dict[str, Any]:
+    """Return the fields of an outcome, with more warnings."""
+    told = {each.name: getattr(outcome, each.name) for each in dataclasses.fields(outcome)}
+    return told | {"failed_share": round(outcome.failed_share, 6),
+                   "warnings": [*outcome.warnings, *more]}
 
 
 def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
@@ -353,8 +381,8 @@ RATE_BLOCKS = 10
 """At least so many times the longest block is measured: with many workers, blocks come in waves."""
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(Outcome):
     """A store's status, from the receipts of its committed blocks.
 
     Attributes
@@ -382,8 +410,6 @@ class Status:
     processors
         Blocks by the features of the processors that computed them: where there are several, the
         last digits of results differ from those of a uniform run.
-    nothing_computed, failed_share, failures, warnings, advice
-        As `sweep.execution.status.Summary` has them, of the committed blocks.
     """
 
     store: str
@@ -401,11 +427,6 @@ class Status:
     seconds_left: float | None
     crashed: list[FailedCell]
     failed: list[FailedCell]
-    nothing_computed: bool
-    failed_share: float
-    failures: list[FailureGroup]
-    warnings: list[str]
-    advice: str
     needed: int | None = None
     settled: int | None = None
     conditions: int | None = None
@@ -421,66 +442,44 @@ def status(url: str) -> Status:
         If there is no store, or it cannot be read.
     """
     store = open_store(url)
-    detection: Counter[str] = Counter()
-    estimate: Counter[str] = Counter()
-    written: list[WrittenBlock] = []
-    cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
-    processors: Counter[str] = Counter()
-    done = poses = needed = 0
-    for _, receipt in receipts(store, check_whole(store)):
-        done += 1
-        poses += receipt.scenes
-        needed += receipt.scenes_needed
-        processors.update(receipt.processors)
-        for flags, counts, counter in (
-            (DetectionStatus, receipt.detection, detection),
-            (EstimateStatus, receipt.estimate, estimate),
-        ):
-            for flag, count in zip(flags, counts, strict=False):
-                counter[flag.name] += count
-        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
-        for cell in receipt.failures:
-            if len(cells[cell.kind]) < MAX_ROWS:
-                cells[cell.kind].append(cell)
-    total = store.pipeline.size(Stage.scene)
+    totals = Totals.of(store, check_whole(store))
+    poses = store.pipeline.size(Stage.scene)
+    in_waves = store.pipeline.stopping is not None
     writing = not store.finished and is_written(store.storage)
-    rate = poses_per_second(written)
+    rate = poses_per_second([
+        WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed)
+        for _, receipt in totals.blocks])
     outcome = outcome_of(
-        url, [detection[flag.name] for flag in DetectionStatus],
-        [estimate[flag.name] for flag in EstimateStatus],
-        [*cells["failed"], *cells["crashed"]], first_cell(store),
-    )
+        url, totals.detection, totals.estimate,
+        [*totals.cells["failed"], *totals.cells["crashed"]], first_cell(store))
     return Status(
         store=url,
         title=store.pipeline.heading,
         finished=store.finished,
         being_written=writing,
         blocks=len(store.blocks),
-        blocks_done=done,
-        poses=total,
-        poses_done=poses,
-        looked_for=looked_for([detection[flag.name] for flag in DetectionStatus]),
-        detection={name: count for name, count in detection.items() if count},
-        estimate={name: count for name, count in estimate.items() if count},
+        blocks_done=len(totals.blocks),
+        poses=poses,
+        poses_done=totals.scenes,
+        looked_for=looked_for(totals.detection),
+        detection=_by_flag(DetectionStatus, totals.detection),
+        estimate=_by_flag(EstimateStatus, totals.estimate),
         poses_per_s=rate,
-        seconds_left=(
-            (total - poses) / rate if rate and writing and store.pipeline.stopping is None else None
-        ),
-        crashed=cells["crashed"],
-        failed=cells["failed"],
-        nothing_computed=outcome.nothing_computed,
-        failed_share=round(outcome.failed_share, 6),
-        failures=outcome.failures,
-        warnings=[
-            *outcome.warnings, *differing_processors(processors, "blocks"),
-            *bound_notes(store.pipeline),
-        ],
-        advice=outcome.advice,
-        needed=None if store.pipeline.stopping is None else needed,
+        seconds_left=(poses - totals.scenes) / rate if rate and writing and not in_waves else None,
+        crashed=totals.cells["crashed"],
+        failed=totals.cells["failed"],
+        **_told(outcome, *differing_processors(totals.processors, "blocks"),
+                *bound_notes(store.pipeline)),
+        needed=totals.needed if in_waves else None,
         settled=_settled(store),
-        conditions=None if store.pipeline.stopping is None else condition_count(store.pipeline),
-        processors=dict(processors),
+        conditions=condition_count(store.pipeline) if in_waves else None,
+        processors=dict(totals.processors),
     )
+
+
+def _by_flag(flags: type[Flag], counts: Sequence[int]) -> dict[str, int]:
+    """Return counts of cells by the flags that occur."""
+    return {flag.name: counts[flag] for flag in flags if counts[flag]}
 
 
 def _settled(store: RunStore) -> int | None:

@@ -11,7 +11,6 @@ import sweep
 from support.here import calls_here
 from support.lengths import first_of
 from sweep.cli import main
-from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.pipeline import Pipeline
@@ -133,29 +132,6 @@ def test_a_frame_size_on_an_axis_keeps_pixels_square():
     facts = grid.facts.camera
     assert facts.square
     assert facts.fx_px == facts.fy_px == (4 / 4.8 * 640, 4 / 4.8 * 1280)
-
-
-@pytest.mark.parametrize(("camera", "lines"), [
-    ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
-    ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
-     ["vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"]),
-    ({"hfov_deg": 60, "fy_px": 500}, ["hfov_deg = 60: expected fy_px or hfov_deg, not both"]),
-    ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
-     ["pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"]),
-    ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
-    ({"pixel_size_um": 0.003, "focal_length_mm": 4},
-     ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
-    *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])
-      for bad in (180, 360, 0, -60)),
-    ({"fov_deg": 60}, ["camera.fov_deg: unknown key; did you mean"]),
-])
-def test_a_camera_given_in_two_ways_is_refused_in_a_line_for_each(camera, lines):
-    with pytest.raises(PipelineError) as refused:
-        pipeline(camera)
-    told = str(refused.value).split("\n")
-    assert len(told) == len(lines)
-    for line, expected in zip(told, lines, strict=True):
-        assert expected in line
 
 
 # 2. --set and --at.

@@ -151,6 +151,24 @@ def test_settings_replace_values_of_a_dictionary():
     assert Pipeline.from_text(pipeline.to_toml()) == pipeline
 
 
+def test_settings_replace_values_axes_and_distributions(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text("# kept\n[pose]\ndistance_m = 1\n[axes]\ntilt_deg = [0, 1]")
+    pipeline = Pipeline.from_toml(
+        path,
+        ["tilt_deg=5", "distance_m=[1, 2]", "roll_deg={uniform = [0, 90]}", "solver=sqpnp",
+         "trial=3", "distortion=[[], [0.1, 0, 0, 0]]", "seed=7"],
+    )
+    assert pipeline.fixed["tilt_deg"] == 5.0
+    assert [axis.name for axis in pipeline.axes] == ["distance_m", "trial", "distortion"]
+    assert pipeline.fixed["solver"] == "sqpnp"
+    assert str(pipeline.distributions["roll_deg"]) == "uniform(0,90)"
+    assert pipeline.seed == 7
+    assert pipeline.text.startswith("# kept")
+    again = Pipeline.from_text(pipeline.text)
+    assert (again.fixed, again.axes) == (pipeline.fixed, pipeline.axes)
+
+
 LOOP = {}
 LOOP["pose"] = {"distance_m": LOOP}
 

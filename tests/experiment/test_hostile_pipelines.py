@@ -156,6 +156,8 @@ def test_a_list_of_lists_may_be_a_place():
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
     (tmp_path / "p.toml").write_bytes(b"\xef\xbb\xbf" + POSE.encode())
     assert Pipeline.from_toml(tmp_path / "p.toml").fixed["distance_m"] == 1
+    (tmp_path / "p.toml").write_bytes(b"\xff\xfe\x00")
+    assert "expected UTF-8: byte 0 is not" in faults_of(Pipeline.from_toml, tmp_path / "p.toml")[0]
 
 
 @settings(derandomize=True, deadline=None, max_examples=100)

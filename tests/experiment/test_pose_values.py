@@ -328,23 +328,6 @@ def test_coordinates_are_what_was_given_and_none_that_has_no_meaning(tmp_path):
 
 # Rules and choices
 
-@pytest.mark.parametrize(
-    ("pose", "line"),
-    [({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
-      ("pose.camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; "
-       "delete camera_x_m, marker_z_m, or distance_m, roll_deg")),
-     ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
-     ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
-      "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
-     ({"camera_x_m": "left"},
-      'pose.camera_x_m = "left": expected a number from -1e+12 to 1e+12')],
-)
-def test_contradictions_are_refused_in_a_line_that_says_what_to_delete(pose, line):
-    with pytest.raises(PipelineError) as refused:
-        Pipeline.from_dict({"pose": pose})
-    assert [fault.removeprefix("pipeline: ") for fault in refused.value.faults] == [line]
-
-
 @pytest.mark.parametrize(("first", "other"), [
     pair for choice in CHOICES for pair in itertools.combinations(choice, 2)
     if {*pair[0]} <= {*IN_CAMERA}

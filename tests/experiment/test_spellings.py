@@ -85,23 +85,6 @@ def test_a_parameter_in_a_wrong_section_is_told_with_the_right_one(name):
                 Pipeline.from_text("", [f"{section}.{name}=1"])
 
 
-@pytest.mark.parametrize(("text", "told"), [
-    ("[pose]\ntilt_deg = [0, 30]", "an axis: they go under [axes]"),
-    ("[estimator]\nsolver = ['ippe', 'sqpnp']", "an axis: they go under [axes]"),
-    ("[pose]\ntilt_deg = { linspace = [0, 30, 3] }", "goes under [axes]"),
-    ("[pose]\nboth = { zip = { tilt_deg = [0, 1], roll_deg = [1, 2] } }", "under [axes]"),
-    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it under [axes]"),
-    ("solver = 'ippe'", "it under [estimator]"), ("[pose]\nseed = 3", "at the top"),
-    ("[axes]\nseed = [3]", "at the top"),
-    ("[pose]\nvelocity_x = 3", "did you mean velocity_x_m_s under [scene]?"),
-    ("[camera]\nvelocty_x_m_s = 3", "did you mean velocity_x_m_s under [scene]?"),
-])
-def test_what_stands_in_a_wrong_place_is_told_with_the_right_one(text, told):
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(text)
-    assert any(told in line for line in raised.value.faults), raised.value.faults
-
-
 @pytest.mark.parametrize(("wrong", "right"), [
     ("smok.toml", "smoke.toml"), ("Smoke.TOML", "smoke.toml"), ("smoke", "smoke.toml"),
     ("folder/smoek.toml", "folder/smoke.toml"),
@@ -150,33 +133,3 @@ def test_the_canonical_value_is_what_is_kept_and_compared():
     set_so = Pipeline.from_text(
         "[pose]\nside_px = 40", ["solver=SOLVEPNP_IPPE", "guarded=False"])
     assert (set_so.fixed["solver"], set_so.fixed["guarded"]) == ("ippe", False)
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("[detector]\ncornerRefinementMethod = 1", "OpenCV's constant 1 is subpix"),
-        ("[axes]\ncornerRefinementMethod = [0, 1]", "OpenCV's constant 0 is none"),
-        (f"[estimator]\nsolver = {cv2.SOLVEPNP_IPPE_SQUARE}", "is ippe_square"),
-        ("[marker]\ndictionary = 4", "OpenCV's constant 4 is DICT_5X5_50"),
-        ("[detector]\ncornerRefinementMethod = 99", "expected one of none, subpix"),
-        ("[estimator]\nsolver = true", "expected one of ippe"),
-        ('[estimator]\nsolver = "ippe_sqare"', "did you mean ippe_square?"),
-        ('[marker]\ndictionary = "DICT_5X5_51"', "did you mean DICT_5X5_50?"),
-        ("[pose]\nTilt_Deg = 3", "did you mean tilt_deg?"),
-        ("[marker]\nmarkerid = 3", "did you mean marker_id?"),
-        ("[marker]\nMARKER-ID = 3", "did you mean marker_id?"),
-        ("[detector]\ncorner_refinement_method = 'subpix'", "did you mean cornerRefinementMethod?"),
-        ("[axes]\nTrials = 3", "did you mean trial?"),
-        ("[Pose]\ntilt_deg = 3", "did you mean pose?"),
-        ("Seed = 3", "did you mean seed?"),
-        (["Tilt_Deg=3"], "did you mean tilt_deg?"),
-        (["pose.TiltDeg=3"], "did you mean tilt_deg?"),
-    ],
-)
-def test_what_is_nearly_right_is_told_with_what_is_right(text, told):
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(*(("", text) if isinstance(text, list) else (text,)))
-    lines = [line for line in raised.value.faults if "expected distance_m or side_px" not in line]
-    assert len(lines) == 1
-    assert told in lines[0]

@@ -61,32 +61,6 @@ def test_draws_are_those_of_the_same_values_on_axes_of_their_own():
     assert len(set(zipped["tilt_deg"].values.tolist())) == 3
 
 
-@pytest.mark.parametrize(("given", "named"), [
-    ({"fx_px": [600, 800], "fy_px": [600]}, ["axes.lens", "fx_px has 2", "fy_px has 1"]),
-    ({"fx_px": [600, 800]}, ["axes.lens", "at least two parameters"]),
-    ({}, ["axes.lens", "at least two parameters"]),
-    ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]}, ["axes.lens", "of one stage"]),
-    ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]}, ["axes.lens", "600, 600 is repeated"]),
-    ({"fx_px": [600, 800], "fy": [600, 800]}, ["axes.lens.fy: ", "did you mean fy_px?"]),
-    ({"fx_px": [600, 800], "trial": 2}, ["axes.lens.trial = 2", "an axis of its own"]),
-    ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}}, ["axes.lens.fy_px", "[camera]"]),
-    ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
-     ["axes.lens.fy_px", "a name of your own"]),
-    ({"fx_px": [600, -1], "fy_px": [600, 800]}, ["axes.lens.fx_px", "(not -1)"]),
-    ({"fx_px": 600, "fy_px": [700]}, ["axes.lens.fx_px = 600", "expected a list"]),
-    ({"distance_m": [1, 2], "tilt_deg": [1, 2]}, ["axes.lens.distance_m", "pose.distance_m"]),
-    ({"side_px": [10, 20], "tilt_deg": [1, 2]}, ["side_px", "distance_m or side_px, not both"]),
-    ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},
-     ["marker_id", "IDs from 0 to 49"]),
-    ({"adaptiveThreshWinSizeMin": [3, 9], "adaptiveThreshWinSizeMax": [23, 5]},
-     ["adaptiveThreshWinSizeMax", "at least adaptiveThreshWinSizeMin"]),
-])
-def test_what_cannot_go_together_is_one_line(given, named):
-    text = refused({"lens": {"zip": given}})
-    assert all(each in text for each in named), text
-    assert "\n" not in text
-
-
 @pytest.mark.parametrize("lens", [
     {"zip": [600, 800]}, {"fx_px": [600, 800], "fy_px": [600, 805]},
     {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}, "values": [1, 2]},
@@ -99,20 +73,6 @@ def test_an_axis_that_is_almost_of_parameters_that_go_together_is_told_how_to_wr
 
 
 TOGETHER = {"zip": {"fx_px": [600, 800], "fy_px": [600, 800]}}
-
-
-@pytest.mark.parametrize(("axes", "named"), [
-    *(({name: TOGETHER}, f"axes.{name}: expected another name: the dataset")
-      for name in ("detection", "xyz", "jitter_u_px", "solved", "outcome", "cost")),
-    ({"my lens": TOGETHER}, "letters, digits and underscores"),
-    ({"tilt_deg": TOGETHER}, "an axis of tilt_deg alone"),
-    ({"trial": TOGETHER}, "a whole number from 1"),
-    ({"fx_px": [1], "lens": TOGETHER}, "axes.fx_px is given too"),
-    ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
-    ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
-])
-def test_names_are_identifiers_of_their_own_and_a_member_is_given_once(axes, named):
-    assert named in refused(axes)
 
 
 def test_a_member_that_is_fixed_is_given_twice():

@@ -1,0 +1,106 @@
+"""Boards of several kinds in one pipeline, and the most that a board can be."""
+
+import numpy as np
+import pytest
+
+from sweep.errors import PipelineError
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.flags import DetectionStatus
+
+TEXT = """
+[marker]
+dictionary = "DICT_4X4_50"
+size_m = 0.05
+[estimator]
+solver = "iterative"
+[pose]
+distance_m = 0.4
+[board]
+"""
+ONE = "[[board.markers]]\nmarker_id = 1\nx_m = 0\ny_m = 0\n"
+OTHER = "[[board.markers]]\nmarker_id = 2\nx_m = 0.1\ny_m = 0\n"
+GRID = 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.01'
+
+
+def beside(**keys):
+    return "\n[[board.distractors]]\n" + "".join(f"{k} = {v}\n" for k, v in keys.items())
+
+
+TABLE = f'kind = "markers"\n{ONE}{OTHER}'
+
+@pytest.mark.parametrize(("x_m", "size"), [(30, "36,08. x 80"), (3, None)])
+def test_warp_s_bitmap_of_a_board_has_a_limit(x_m, size):
+    """OpenCV warps no more than 2^15 pixels a side."""
+    text = TEXT + TABLE.replace("0.1", str(x_m))
+    if size is None:
+        Pipeline.from_text(text, ["renderer=warp"])
+    else:
+        with pytest.raises(PipelineError, match=f'"warp": expected another renderer.* {size}$'):
+            Pipeline.from_text(text, ["renderer=warp"])
+
+
+def test_distractors_may_touch_share_an_id_and_stand_in_planes_of_their_own():
+    sheet = 0.05 * 8 / 6
+    apart = beside(x_m=0.5, y_m=0) + beside(x_m=0.5 + sheet, y_m=0) + "marker_id = 3"
+    above = beside(x_m=0, y_m=0, z_m=0.1) + beside(x_m=0.5, y_m=0, tilt_deg=20)
+    for board in (GRID + apart, apart, GRID + above, TABLE + above):
+        assert Pipeline.from_text(TEXT + board, []) is not None
+
+
+AXIS = """[axes]
+target = { zip = { kind = ["none", "charuco", "grid"], size_m = [0.1, 0.03, 0.05] } }
+"""
+OF_KINDS = """rows = 2
+columns = 2
+gap_m = 0.01
+squares_x = 3
+squares_y = 3
+square_m = 0.06
+"""
+OF_BOARDS = TEXT.replace("size_m = 0.05\n", "") + OF_KINDS
+
+
+def test_each_of_several_kinds_uses_its_own_keys():
+    pipeline = Pipeline.from_text(OF_BOARDS + AXIS, [])
+    boards = pipeline.experiment.scene_values([np.arange(3)])["board"].listed(3)
+    assert [len(board) for board in boards] == [1, 4, 4]
+
+
+@pytest.mark.parametrize(("kind", "kept"), [
+    ("charuco", {"squares_x", "squares_y", "square_m"}), ("grid", {"rows", "columns", "gap_m"}),
+    ("none", set()),
+])
+def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind, kept):
+    axis = Pipeline.from_text(OF_BOARDS + AXIS, [])
+    fixed = axis.fixed_at({"kind": kind, "size_m": 0.03})
+    assert {name for name in fixed.given if axis.parameters[name].section == "board"} == {
+        "kind", *kept
+    }
+    single = Pipeline.from_text(TEXT + GRID, [f"kind={kind}", *(
+        f"{name}={value}" for name, value in (line.split(" = ") for line in OF_KINDS.splitlines())
+        if name in kept
+    )])
+    assert {name for name in single.given if axis.parameters[name].section == "board"} == {
+        "kind", *kept
+    }
+
+
+def test_rows_of_a_grid_can_be_an_axis():
+    pipeline = Pipeline.from_text(TEXT + GRID, ["rows=[1,2,5]"])
+    boards = pipeline.experiment.scene_values([np.arange(3)])["board"].listed(3)
+    assert [len(board) for board in boards] == [7, 14, 35]
+
+
+def test_cells_of_smaller_boards_fit_the_largest_of_another_grid():
+    flags, errors = (
+        next(each for each in Pipeline.from_text(TEXT + GRID, ["rows=[1,2]"]).experiment.variables
+             if each.name == name)
+        for name in ("marker_detection", "marker_corner_error_px")
+    )
+    some = np.arange(1, 15, dtype=np.uint8).reshape(2, 7)
+    assert (flags.fitted(some)[:, :7] == some).all()
+    assert (flags.fitted(some)[:, 7:] == DetectionStatus.not_on_board).all()
+    wide = np.zeros((3, 35, 4, 2), dtype=np.float32)
+    assert errors.fitted(wide).shape == (3, 14, 4, 2)
+    assert np.isnan(errors.fitted(wide[:, :7])[:, 7:]).all()
+    assert errors.fitted(wide[:, :7]).dtype == np.float32

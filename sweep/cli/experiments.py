@@ -179,8 +179,7 @@ def plan(
     read = read_pipeline(pipeline, settings, precision, max_trials)
     announce_compilation(read)
     facts, listed = read.facts, read.facts.parts
-    switches = [part.switch for part in listed if part.switch and part.active]
-    expected, costs = library.forecast.forecast(read, workers, switches)
+    expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
     refused = library.forecast.objections(
         library.forecast.Demand(
@@ -193,10 +192,7 @@ def plan(
         "Required": _required(read),
         "Trials": [] if read.stopping is None else _rule_lines(read.stopping),
         "Parts": [
-            f"{part.name:17} {'on ' if part.active else 'off'}  {part.reason}"
-            + (f"; {costs[part.switch] * 1e3:.3g} ms a pose" if part.switch in costs else
-               "; cost not measured, poses take too long" if part.switch in switches else "")
-            for part in listed],
+            f"{part.name:17} {'on ' if part.active else 'off'}  {part.reason}" for part in listed],
         "Expected": _expected(read, expected),
     }
     lines = [read.heading]
@@ -211,8 +207,7 @@ def plan(
         "dimensions": {axis.name: len(axis) for axis in read.axes},
         "require": {"all": list(read.requirements), "per": list(read.require_per)},
         **dataclasses.asdict(expected),
-        "parts": [{**dataclasses.asdict(part), "pose_s": costs.get(part.switch)}
-                  for part in listed],
+        "parts": [dataclasses.asdict(part) for part in listed],
     }, 0, quoted("sweep", "run", pipeline, *words))
 
 

@@ -24,6 +24,7 @@ from sweep.isolation.child_process import (
     explained,
     last_line,
 )
+from sweep.messages import notice
 from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
@@ -34,6 +35,10 @@ from sweep.store.receipt import Receipt
 
 MAX_ATTEMPTS = 10
 """How often a block is tried whose worker dies, or fails by a fault of its machine."""
+
+
+SILENCE_S = 60.0
+"""How long no block may be finished before a line says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +102,8 @@ class Executor(ABC):
         # What is out, and how it failed before.
         out: dict[Any, tuple[Work, list[Failed]]] = {}
 
+        last, told_s = time.monotonic(), SILENCE_S
+
         def begin(work: Work, failures: list[Failed]) -> None:
             future = self.submit(task(work), limit_s, failures)
             out[future] = work, failures
@@ -112,8 +119,13 @@ class Executor(ABC):
                 try:
                     future = finished.get(timeout=POLL_S)
                 except Empty:
-                    self.check(len(out), limit_s)
+                    silent_s = time.monotonic() - last
+                    if silent_s >= told_s:
+                        told_s *= 2
+                        notice(f"no block was finished for {silent_s:.0f} s: {len(out)} are with "
+                               f"{self.workers()}; a block ends after at most {limit_s:.0f} s")
                     continue
+                last, told_s = time.monotonic(), SILENCE_S
                 work, failures = out.pop(future)
                 result = self.result(future, failures)
                 if isinstance(result, Failed) and len(failures) + 1 < result.tries:
@@ -135,8 +147,9 @@ class Executor(ABC):
     def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
         """Return the receipts of a future that is done, or why there are none."""
 
-    def check(self, out: int, limit_s: float) -> None:  # noqa: B027  (few have to)
-        """Look after the work that is out while nothing is finished."""
+    @abstractmethod
+    def workers(self) -> str:
+        """Return in words what computes."""
 
     @abstractmethod
     def cancel(self, out: Collection[Any]) -> None:
@@ -199,6 +212,10 @@ class Children(Executor):
         if now > self._began + SMALL_RUN_S:
             self._grow()
         return len(self._children)
+
+    def workers(self) -> str:
+        """Return how many processes there are."""
+        return f"{len(self._children)} processes"
 
     def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
 import resource
@@ -63,9 +62,6 @@ COMPILATION_LIMIT_S = 900.0
 UNMEASURED_S = 0.01
 """Assumed cost of a scene if the measurement crashed."""
 
-ROUNDS = 3
-"""How often pipelines are timed that are compared."""
-
 
 @dataclass(frozen=True, slots=True)
 class Timing:
@@ -86,30 +82,17 @@ class Timing:
     over: bool = False
 
 
-def seconds_of(pipelines: Sequence[Pipeline], count: int) -> tuple[list[float], int]:
-    """Return the seconds that each pipeline takes for the same scenes, and the number of scenes.
+def seconds_of(pipeline: Pipeline, count: int) -> tuple[float, int]:
+    """Return the seconds of a random sample of about ``count`` scenes, and their number.
 
-    Seconds are those of this thread, since others use the processors meanwhile, and compilation
-    does not count. Several pipelines are timed in turns, and the median counts.
-
-    Parameters
-    ----------
-    pipelines
-        Pipelines of the same grid.
-    count
-        Scenes of the sample; of photographs all markers of one.
+    Of photographs, all markers of one. Seconds are those of this thread, since others use the
+    processors meanwhile, and compilation does not count.
     """
-    indices = _sample(pipelines[0], count)
-    spent: list[list[float]] = []
-    for _ in range(ROUNDS if len(pipelines) > 1 else 1):
-        spent.append([])
-        for pipeline in pipelines:
-            begun, compiled = time.thread_time(), compilation_s()
-            run_cells(pipeline.experiment, indices)
-            took_s = time.thread_time() - begun - (compilation_s() - compiled)
-            spent[-1].append(max(took_s, 1e-9))
-    number = len(indices[0]) if indices else 1
-    return [statistics.median(times) for times in zip(*spent, strict=True)], number
+    indices = _sample(pipeline, count)
+    begun, compiled = time.thread_time(), compilation_s()
+    run_cells(pipeline.experiment, indices)
+    took_s = time.thread_time() - begun - (compilation_s() - compiled)
+    return max(took_s, 1e-9), len(indices[0]) if indices else 1
 
 
 def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
@@ -131,10 +114,10 @@ def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
     One scene is computed first, so that code is compiled and caches are filled; batches grow until
     one takes as long.
     """
-    seconds_of([pipeline], 1)
+    seconds_of(pipeline, 1)
     count = 1
     while True:
-        (spent_s,), sampled = seconds_of([pipeline], count)
+        spent_s, sampled = seconds_of(pipeline, count)
         wanted = min(int(budget_s * sampled / spent_s), MAX_BATCH)
         if wanted <= 2 * count:
             return Timing(spent_s / sampled, sampled)
@@ -423,16 +406,10 @@ def scene_s_of(store: RunStore, done: AbstractSet[int], timing: Timing | None = 
 
 
 # --------------------------------------------------------------------------------------------------
-# The forecast of a run: blocks, bytes, memory and time, and what each effect costs.
+# The forecast of a run: blocks, bytes, memory and time.
 
 PLAN_SCENES_S = 1.5
 """Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes."""
-
-PLAN_EFFECTS_S = 1.5
-"""Seconds of a forecast in which effects are measured."""
-
-EFFECT_SCENES = 24
-"""Most scenes on which effects are measured."""
 
 START_S = 1.5
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
@@ -477,13 +454,11 @@ class Forecast:
     least_share: float = 1.0
 
 
-def forecast(
-    pipeline: Pipeline, workers: int | None = None, switches: Sequence[str] = ()
-) -> tuple[Forecast, dict[str, float]]:
-    """Return what a run would take, and the seconds that effects add to a pose; write nothing.
+def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
+    """Return what a run would take; write nothing.
 
     A seeded sample of scenes is measured in a child process, for a few seconds at most,
-    compilation not counted. There are no costs of effects if that is too short.
+    compilation not counted.
 
     Parameters
     ----------
@@ -491,8 +466,6 @@ def forecast(
         Measured on its own grid.
     workers
         Number of workers (default: the available processors).
-    switches
-        Parameters that switch effects on.
 
     Raises
     ------
@@ -503,12 +476,9 @@ def forecast(
     """
     if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
-    costs: dict[str, float] = {}
     try:
         with Child("sweep.execution.forecast") as child:
             timing = measure(child, pipeline, PLAN_SCENES_S)
-            if not timing.over and switches:
-                costs = _effect_costs(child, pipeline, switches, timing.scene_s)
     except (ChildDiedError, ChildRaisedError) as error:
         raise RunError(
             f"a measured scene crashed its process ({last_line(error)}); `sweep run` isolates it "
@@ -536,49 +506,10 @@ def forecast(
         workers=count,
         seconds=START_S + demand.seconds,
         least_share=least,
-    ), costs
+    )
 
 
 def least_share(pipeline: Pipeline) -> float:
     """Return the share of the poses that is computed in any case: in waves, that of the first."""
     rule = make_rule(pipeline)
     return 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
-
-
-def _effect_costs(
-    child: Child, pipeline: Pipeline, switches: Sequence[str], pose_s: float
-) -> dict[str, float]:
-    """Return the seconds that each effect adds to a pose; none if poses take too long.
-
-    All other parameters stay as they are, so that effects that multiply one another's work are
-    each charged with all of it.
-    """
-    variants = [pipeline, *(without_effect(pipeline, switch) for switch in switches)]
-    count = min(int(PLAN_EFFECTS_S / (len(variants) * ROUNDS * pose_s)), EFFECT_SCENES)
-    if count < 1:
-        return {}
-    try:
-        spent, number = child.call(
-            seconds_of, variants, count, limit_s=2 * PLAN_EFFECTS_S,
-            grace_s=COMPILATION_LIMIT_S)
-    except ChildDiedError as error:
-        if not error.timed_out:
-            raise
-        return {}
-    # A difference below 0 is measurement noise.
-    return {switch: max(spent[0] - without_s, 0.0) / number
-            for switch, without_s in zip(switches, spent[1:], strict=True)}
-
-
-def without_effect(pipeline: Pipeline, switch: str) -> Pipeline:
-    """Return the pipeline with an effect switched off everywhere, on the same grid."""
-    off = next(each.off for each in pipeline.experiment.effects if each.switch == switch)
-    return dataclasses.replace(
-        pipeline,
-        fixed={**pipeline.fixed, switch: off},
-        distributions={k: v for k, v in pipeline.distributions.items() if k != switch},
-        axes=tuple(
-            axis.replaced(switch, off) if switch in axis.columns else axis
-            for axis in pipeline.axes
-        ),
-    )

@@ -238,14 +238,8 @@ def silenced_dask_loggers() -> Iterator[None]:
 BLOCKS_PER_THREAD = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
 
-MAX_WORKER_FAULTS = 3
-"""Blocks in a row that a worker fails and others compute, after which it is used no more."""
-
 LOOK_S, LOOK_LIMIT_S = 1.0, 2.0
 """How often the scheduler is asked what workers it has, and how long a run waits for the answer."""
-
-SILENCE_S = 60.0
-"""How long no block may be finished before a line says so."""
 
 AWAY = "the scheduler went away"
 
@@ -253,8 +247,8 @@ AWAY = "the scheduler went away"
 class OnCluster(Executor):
     """Computes blocks on a cluster.
 
-    A block whose worker dies, or whose worker's machine is at fault, is given to others. A worker
-    that fails what others compute is retired.
+    A block whose worker dies, or whose worker's machine is at fault, is given to others; a line
+    names the machine.
 
     Parameters
     ----------
@@ -265,11 +259,9 @@ class OnCluster(Executor):
     def __init__(self, client: Client) -> None:
         self._client = client
         self._states: dict[str, dict[str, Any]] = {}
-        self._faults: Counter[str] = Counter()
-        self._retired: set[str] = set()
+        self._told: set[str] = set()
         self._asked = 0.0
-        self._usable = self._last_block = time.monotonic()
-        self._next_line_s = SILENCE_S
+        self._usable = time.monotonic()
         self._look()
 
     @property
@@ -284,8 +276,7 @@ class OnCluster(Executor):
                 raise ConnectionError(AWAY)
             identity = self._client.sync(
                 self._client.scheduler.identity, n_workers=-1, callback_timeout=LOOK_LIMIT_S)
-            self._states = {worker: state for worker, state in identity["workers"].items()
-                            if worker not in self._retired}
+            self._states = identity["workers"]
         except TimeoutError:
             pass  # it is busy
         except OSError:
@@ -305,23 +296,15 @@ class OnCluster(Executor):
         if time.monotonic() > self._asked + LOOK_S:
             self._look()
         if self._asked > self._usable + WORKERS_S:
-            raise RunError(f"there have been no workers for {WORKERS_S:.0f} s: {self._workers()}")
+            raise RunError(f"there have been no workers for {WORKERS_S:.0f} s: {self.workers()}")
         return BLOCKS_PER_THREAD * self.threads
 
-    def _workers(self) -> str:
+    def workers(self) -> str:
+        """Return how many workers there are, and how many of them Dask has paused."""
         paused = sum(state["status"] == "paused" for state in self._states.values())
         return f"{len(self._states)} workers" + (
             f", {paused} of them paused by Dask because of their memory "
             "(`dask worker --memory-limit`)" if paused else "")
-
-    def check(self, out: int, limit_s: float) -> None:
-        """Say once in a while that no block is finished, and what the workers do."""
-        silent_s = time.monotonic() - self._last_block
-        if silent_s < self._next_line_s:
-            return
-        self._next_line_s *= 2
-        notice(f"no block was finished for {silent_s:.0f} s: {out} are with {self._workers()}; "
-               f"a block ends after at most {limit_s:.0f} s")
 
     def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
         """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
@@ -360,13 +343,11 @@ class OnCluster(Executor):
             fault = machine_fault(result)
             if fault is None:
                 return Failed(f"{type(result).__name__}: {result}")
+            if worker not in self._told:
+                self._told.add(worker)
+                notice(f"worker {worker or 'unknown'}: {fault}; others compute its blocks")
             left = self._others({*(each.worker for each in failures), worker})
             return Failed(str(fault), True, MAX_ATTEMPTS if left else 1, worker)
-        self._last_block, self._next_line_s = time.monotonic(), SILENCE_S
-        self._faults[worker] = 0
-        for failed in failures:
-            if failed.worker not in ("", worker):
-                self._blame(failed)
         receipts: list[Receipt] = result
         return receipts
 
@@ -378,20 +359,6 @@ class OnCluster(Executor):
             raise ConnectionError(AWAY)
         error: BaseException | None = future.exception()
         return error
-
-    def _blame(self, failed: Failed) -> None:
-        """Count a block that a worker failed and another computed; retire it if they are many."""
-        worker = failed.worker
-        self._faults[worker] += 1
-        if (self._faults[worker] < MAX_WORKER_FAULTS or worker not in self._states
-                or len(self._states) == 1):
-            return
-        self._retired.add(worker)
-        del self._states[worker]
-        notice(f"worker {worker} is used no more: {MAX_WORKER_FAULTS} blocks that it failed were "
-               f"computed by others; the last fault: {failed.reason}")
-        with contextlib.suppress(OSError, TimeoutError):
-            self._client.retire_workers([worker], close_workers=True)
 
     def cancel(self, out: Collection[Any]) -> None:
         """Take back what is still out; a caller's cluster outlives the run."""

@@ -16,7 +16,7 @@ from sweep.execution.executors import Failed
 from sweep.execution.waves import AnyOrder, InWaves, Work, condition_count
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import DetectionStatus
-from sweep.messages import duration, notice
+from sweep.messages import notice
 from sweep.store.blocks import RunStore, receipts
 from sweep.store.outcome import MAX_ROWS
 from sweep.store.receipt import Receipt
@@ -155,48 +155,24 @@ def _bar() -> Iterator[Callable[[str, float, float], None]]:
 
 
 class ProgressLines:
-    """Prints how far a run is every :data:`LINE_INTERVAL_S`: poses, rate, and time left.
+    """Prints how far a run is every :data:`LINE_INTERVAL_S`; `sweep status` knows the rate.
 
-    The rate is that since the first report, which a run makes before its first block.
-
-    Examples
-    --------
-    >>> lines = ProgressLines()
-    >>> lines.line(Progress(1000, 5000, 0), now=0.0)
-    '1,000 of 5,000 poses'
-    >>> lines.line(Progress(2000, 5000, 0), now=10.0)
-    '2,000 of 5,000 poses (40 %), 100 poses/s, 30.0 s left'
+    ``ends``: also the first and the last time.
     """
 
     def __init__(self, *, ends: bool = False) -> None:
         self._ends = ends
-        self._first: tuple[float, int] | None = None
-        self._printed = time.monotonic()
+        self._printed: float | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Print a line if the last one was long ago; with ``ends``, the first and the last."""
-        now, first = time.monotonic(), self._first is None
-        line = self.line(progress, now)
-        if self._ends and (first or progress.done == progress.total):
+        """Print a line, if the last one was long ago."""
+        now, first = time.monotonic(), self._printed is None
+        due = self._ends and (first or progress.done == progress.total)
+        due = due or (self._printed is not None and now > self._printed + LINE_INTERVAL_S)
+        if due:
             notice(progress.line)
-        elif now > self._printed + LINE_INTERVAL_S:
-            notice(line)
+        if first or due:
             self._printed = now
-
-    def line(self, progress: Progress, now: float) -> str:
-        """Return the line of a progress at a time in seconds."""
-        computed = progress.done if progress.needed is None else progress.needed
-        self._first = self._first or (now, computed)
-        started, before = self._first
-        if computed == before or now <= started:
-            return progress.line
-        rate = (computed - before) / (now - started)
-        told = f"{rate:,.0f} poses/s" if rate >= 10 else f"{rate:.2g} poses/s"
-        if progress.conditions is not None:
-            return f"{progress.line}, {told}"
-        left = duration((progress.total - progress.done) / rate)
-        share = 100 * progress.done / progress.total
-        return f"{progress.line} ({share:.0f} %), {told}, {left} left"
 
 
 # --------------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def grid_for(seconds, workers):
     """Return a pipeline that keeps ``workers`` busy for about ``seconds``."""
     text, scenes = grid(2)
     one = Pipeline.from_text(text)
-    (spent_s,), sampled = seconds_of([one], 1536)
+    spent_s, sampled = seconds_of(one, 1536)
     trials = max(int(seconds * workers * sampled / (spent_s * scenes)), 8)
     return Pipeline.from_text(grid(trials)[0]), trials
 
@@ -111,7 +111,7 @@ def two_processes(text, trials, workers):
 def engine_against_processes(seconds):
     workers = default_workers()
     pipeline, trials = grid_for(seconds, workers)
-    expected = forecast(pipeline, workers)[0].seconds
+    expected = forecast(pipeline, workers).seconds
     rates = []
     for _ in range(REPEATS):
         bare_rate = two_processes(pipeline.text, trials, workers)

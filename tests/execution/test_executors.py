@@ -7,6 +7,7 @@ import signal
 import subprocess
 import threading
 import time
+from unittest import mock
 
 import psutil
 import pytest
@@ -233,17 +234,19 @@ def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_p
 
 
 @pytest.mark.parametrize(("states", "line"), [
-    (("running", "running"), "4 are with 2 workers; a block ends after at most 7 s"),
-    (("paused", "running"), "4 are with 2 workers, 1 of them paused by Dask"),
+    (("running", "running"), "1 are with 2 workers; a block ends after at most 7 s"),
+    (("paused", "running"), "1 are with 2 workers, 1 of them paused by Dask"),
 ])
 def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch, capsys):
-    monkeypatch.setattr(on_cluster, "SILENCE_S", 0.1)
+    monkeypatch.setattr(executors, "SILENCE_S", 0.1)
+    monkeypatch.setattr(executors, "POLL_S", 0.02)
     monkeypatch.setattr(OnCluster, "_look", lambda _: None)
-    engine = OnCluster(None)
+    engine = OnCluster(mock.Mock(status="closed"))
     engine._states = {str(k): {"nthreads": 1, "status": name} for k, name in enumerate(states)}
-    deadline = time.monotonic() + 0.35
-    while time.monotonic() < deadline:
-        engine.check(4, 7)
+    end = time.monotonic() + 0.35
+    engine.room = lambda: 9 if time.monotonic() < end else pytest.fail("time is up")
+    with Interrupts() as interrupts, pytest.raises(pytest.fail.Exception):
+        list(engine.map(AnyOrder([0]), lambda _: (), 7, interrupts))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # after 0.1 s, and after 0.2 s
     assert all(f"no block was finished for 0 s: {line}" in each for each in lines)

@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from sweep.execution.progress import Progress, ProgressLines
 from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.outcome import FailedCell, failure_groups, outcome_of
@@ -117,12 +116,3 @@ def test_rate_of_a_continued_run_is_not_that_of_a_faster_one_before():
     before = blocks(2, 100, begin=0.0, took=0.5)
     run = blocks(2, 8, begin=110.0, took=5.0)
     assert poses_per_second([*before, *run]) == pytest.approx(40, rel=0.2)
-
-
-# Progress.
-
-def test_lines_tell_poses_rate_and_time_left_of_this_run_alone():
-    lines = ProgressLines()
-    assert lines.line(Progress(500_000, 1_000_000, 0), 10.0) == "500,000 of 1,000,000 poses"
-    assert lines.line(Progress(515_000, 1_000_000, 0), 40.0) == (
-        "515,000 of 1,000,000 poses (52 %), 500 poses/s, 16.2 min left")

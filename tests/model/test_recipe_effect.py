@@ -32,7 +32,6 @@ import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import detections_of, scenes_at, search_windows
-from sweep.execution.forecast import seconds_of, without_effect
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
@@ -85,8 +84,6 @@ print(json.dumps({
     "parts": {part.name: [part.active, part.switch] for part in pipeline.facts.parts},
     "draws": next(part.reason for part in pipeline.facts.parts if part.name == "random draws"),
     "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
-    "costs": seconds_of([without_effect(pipeline, switch)
-                         for switch in ("haze", "column_noise_grey")], 8)[0],
     "broken": [broken("haze_x = 1"), broken("read_noise_e = 3")],
     "table": TABLES["effects"]().rows,
     "parameters": TABLES["scene"]().markdown(),
@@ -121,7 +118,6 @@ def test_all_else_follows_from_the_record(result):
     assert result["parts"]["haze"] == [True, "haze"]
     assert result["parts"]["column noise"] == [True, "column_noise_grey"]
     assert result["draws"] == "column_noise_grey"
-    assert all(cost >= 0 for cost in result["costs"])
     # Neither is part of the bound's model; without them there is no noise.
     assert result["bound"] == ["no_noise"] * 2 + ["not_in_model"] * 6
     quiet, noisy = np.array(result["windows"][0]), np.array(result["windows"][2])

@@ -559,12 +559,12 @@ class SolverTrial:
         """
         experiment = self.pipeline.experiment
         batch = scenes_at(experiment, [np.arange(SCENES)])
-        (searched,), _, _ = detections_of(
+        (searched,), _ = detections_of(
             experiment, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
         (setting,) = experiment.estimators
         rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
         try:
-            build(setting)(detections_for(setting, batch.values, batch.scenes, searched, rows))
+            build(setting)(detections_for(setting, batch, searched, rows))
         except PluginError as error:
             return [str(error)]
         return []

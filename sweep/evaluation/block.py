@@ -34,7 +34,7 @@ from sweep.evaluation.results import (
     note_failure,
     to_dataset_layout,
 )
-from sweep.evaluation.search import SearchResult, detections_of, scenes_at
+from sweep.evaluation.search import SceneBatch, SearchResult, detections_of, scenes_at
 from sweep.evaluation.variables import (
     DETECTION,
     ESTIMATION,
@@ -101,32 +101,30 @@ def assumed_cameras(
 
 
 def detections_for(
-    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
-    result: SearchResult, rows: NDArray[np.intp],
+    estimator: EstimatorSetting, batch: SceneBatch, result: SearchResult, rows: NDArray[np.intp]
 ) -> Detections:
     """Return what was found in scenes ``rows`` (n,), with what an estimator assumes of them."""
+    values, scenes, found, targets = batch.values, batch.scenes, result.found, batch.targets.targets
     cameras, size = assumed_cameras(estimator, values, scenes)
     noise, blur = (
-        np.broadcast_to(scenes.effects[name] if believed is None else believed, len(scenes))
-        for name, believed in (
-            ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
+        np.broadcast_to(truth if believed is None else believed, len(scenes))
+        for truth, believed in (
+            (scenes.effects["noise_grey"], estimator.believed_noise_grey),
+            (scenes.effects["blur_px"], estimator.believed_blur_px),
         )
     )
-    found, targets = result.found, result.targets.targets
     on_board = values["on_board"].values if "on_board" in values else None
-    images = [result.images[row] for row in rows.tolist()] if result.images else []
-    beside: list[Masks] = []
-    if images and any(each.distractors for each in targets):
-        for row, image in zip(rows.tolist(), images, strict=True):
-            left, top = result.origins[row].tolist()
-            box = left, top, left + image.shape[1], top + image.shape[0]
-            beside.append(beside_pixels(scenes, row, box))
+    images, beside = [], list[Masks]()
+    for row in rows.tolist() if result.images else ():
+        images.append(result.images[row])
+        if any(each.distractors for each in targets):
+            (left, top), (height, width) = result.origins[row].tolist(), images[-1].shape
+            beside.append(beside_pixels(scenes, row, (left, top, left + width, top + height)))
     # The detections of all scenes, of which those of the rows are taken.
     everything = Detections(
         found.corners, cameras, size, noise, blur, targets, [], result.origins, found.owner,
-        found.square, size / scenes.size_m, found.chessboard_px, (),
-        None if result.poses is None else result.poses.rotation,
-        None if result.poses is None else result.poses.translation, on_board,
+        found.square, size / scenes.size_m, found.chessboard_px, (), result.poses.rotation,
+        result.poses.translation, on_board,
     )
     return dataclasses.replace(everything.take(rows), images=images, beside=beside)
 
@@ -243,21 +241,18 @@ def _run_batch(
 
     start = time.perf_counter()
     batch = scenes_at(experiment, indices)
-    asked = batch.values["bound"].broadcast(len(need), np.str_)
-    geometry_s = time.perf_counter() - start
-
-    found, render_s, result.row_seconds[part] = detections_of(
+    found, result.row_seconds[part] = detections_of(
         experiment, batch, searched & batch.visible[:, None], failures,
         keep=any(each.needs_images for each in builds),
     )
-
-    start = time.perf_counter()
+    asked = batch.values["bound"].broadcast(len(need), np.str_)
     of_scenes = SceneResults(batch, bounds(batch.scenes, batch.boxes, asked, batch.visible))
     computed = {name: column for name, column in columns.items() if name not in drawn}
     write(computed, SCENE, of_scenes, 0)
     for name, key in drawn.items():
         columns[name][0] = batch.values[key].broadcast(len(need))
-    result.seconds["scene"][0] += geometry_s + render_s + time.perf_counter() - start
+    spent = time.perf_counter() - start
+    result.seconds["scene"][0] += spent - sum(each.seconds for each in found)
 
     for k, each in enumerate(found):
         each.flags = np.where(batch.visible, each.flags, batch.visibility)
@@ -267,7 +262,7 @@ def _run_batch(
         for j, setting in enumerate(experiment.estimators):
             start = time.perf_counter()
             rows = np.flatnonzero((each.flags == DetectionStatus.detected) & need[:, k, j])
-            seen = detections_for(setting, batch.values, batch.scenes, each, rows)
+            seen = detections_for(setting, batch, each, rows)
             poses = estimates_of(seen, builds[j], rows, failures, k, j)
             number = k * len(builds) + j
             for name, flag in WITHOUT_DETECTION.items():

@@ -72,33 +72,33 @@ class SceneInspection:
     values: dict[str, NDArray[Any]]
 
 
-def _single_scene(experiment: Experiment) -> list[NDArray[np.intp]]:
+def _indices(experiment: Experiment) -> list[NDArray[np.intp]]:
     return [np.zeros(1, dtype=np.intp) for _ in experiment.scene_axes]
 
 
-def _searched_window(experiment: Experiment, batch: SceneBatch) -> list[int]:
-    """Return the window that is searched in a run; the whole frame if the target is not seen."""
+def _single_scene(
+    experiment: Experiment, *, whole_frame: bool
+) -> tuple[SceneBatch, Grey, list[int], list[int]]:
+    """Return a single scene, its image (h, w), the image's window, and the one that is searched.
+
+    The latter is that of a run, but the whole frame if the target is not seen.
+    """
+    batch = scenes_at(experiment, _indices(experiment))
     full = whole_frames(batch) | ~batch.visible
-    setting = experiment.detectors[0]
-    window: list[int] = search_windows(batch.scenes, batch.boxes, setting, full)[0].tolist()
-    return window
-
-
-def _drawn(batch: SceneBatch, window: list[int], *, whole_frame: bool) -> tuple[Grey, list[int]]:
-    """Return the image (h, w) of a single scene, and its window in the frame."""
-    left, top, right, bottom = window
-    if whole_frame:
-        left, top, (right, bottom) = 0, 0, batch.scenes.frame[0].tolist()
+    window, frame = (
+        search_windows(batch.scenes, batch.boxes, experiment.detectors[0], whole)[0].tolist()
+        for whole in (full, np.ones_like(full))
+    )
+    left, top, right, bottom = shown = frame if whole_frame else window
     box = batch.boxes[0] if batch.visible[0] else np.zeros_like(batch.boxes[0])
-    return render(batch.scenes, 0, box, (left, top, right, bottom)), [left, top, right, bottom]
+    return batch, render(batch.scenes, 0, box, (left, top, right, bottom)), shown, window
 
 
 @single_threaded()
 def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> Grey:
     """Return the image (h, w) of a pipeline's single scene; it is not searched."""
-    experiment = pipeline.experiment
-    batch = scenes_at(experiment, _single_scene(experiment))
-    return _drawn(batch, _searched_window(experiment, batch), whole_frame=whole_frame)[0]
+    _, image, _, _ = _single_scene(pipeline.experiment, whole_frame=whole_frame)
+    return image
 
 
 @single_threaded()
@@ -119,17 +119,13 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         If the scene's computation raises.
     """
     experiment = pipeline.experiment
-    indices = _single_scene(experiment)
-    result = run_cells(experiment, indices)
+    result = run_cells(experiment, _indices(experiment))
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
     columns = {name: column[0, 0] for name, column in result.columns.items()}
-    batch = scenes_at(experiment, indices)
+    batch, image, window, (x0, y0, x1, y1) = _single_scene(experiment, whole_frame=whole_frame)
     scenes, targets = batch.scenes, batch.targets
-    # Searched in its own window, as in a run, even if the whole frame is shown.
-    x0, y0, x1, y1 = searched = _searched_window(experiment, batch)
-    image, window = _drawn(batch, searched, whole_frame=whole_frame)
-    left, top, _, _ = window
+    left, top, right, bottom = window
     source = detection_sources(experiment, batch)[0]
     output = SearchOutput([], None, [])
     origin = np.array([x0, y0] if source.needs_images else [0, 0], dtype=np.float64)
@@ -152,7 +148,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
-        window=(window[0], window[1], window[2], window[3]),
+        window=(left, top, right, bottom),
         true_corners=scenes.corners_px[0],
         true_markers=true_markers,
         markers=true_markers + columns[error],

@@ -44,19 +44,21 @@ def machine_fault(error: BaseException) -> MachineFaultError | None:
         return error
     if isinstance(error, SweepError):
         return None  # it says itself what is wrong
-    seen: set[int] = set()
-    cause: BaseException | None = error
-    while cause is not None and id(cause) not in seen:
+    for cause in _chain(error):
         if isinstance(cause, MachineFaultError):
             return cause
         if _is_fault(cause):
             return local_fault(exception_line(cause))
-        seen.add(id(cause))
-        following = cause.__cause__
-        if following is None and not cause.__suppress_context__:
-            following = cause.__context__
-        cause = following
     return None
+
+
+def _chain(error: BaseException | None) -> list[BaseException]:
+    """Return an exception, the one that it was raised because of or during, and so on."""
+    chain: list[BaseException] = []
+    while error is not None and error not in chain:
+        chain.append(error)
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return chain
 
 
 def local_fault(fault: str) -> MachineFaultError:

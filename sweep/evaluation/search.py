@@ -125,10 +125,10 @@ class DetectionSource(Protocol):
         """Return what is found in the image of scene ``row``."""
         ...
 
-    def poses(self, found: Findings) -> Poses | None:
+    def poses(self, found: Findings) -> Poses:
         """Return the poses (N, 3, 3), (N, 3) in metres that come with what was found.
 
-        NaN where none does; None if there never are any.
+        NaN where none does; None in the place of both if there never are any.
         """
         ...
 
@@ -165,8 +165,9 @@ class ImageSearch:
         self._last = image, dictionary, output
         return output
 
-    def poses(self, found: Findings) -> None:
-        """Return None: images have no poses."""
+    def poses(self, found: Findings) -> Poses:  # noqa: ARG002
+        """Return that images have no poses."""
+        return Poses(None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,18 +204,13 @@ class RecordedSearch:
         for row in np.flatnonzero(found.flags == DetectionStatus.detected).tolist():
             part = self.recording.rows(self.keys[row])
             of_target = part.start + np.flatnonzero(self.recording.marker_id[part] == OF_TARGET)
-            first, last = np.searchsorted(found.owner, [row, row + 1])
-            squares = found.corners[first:last]
-            chosen = of_target.tolist() + [
-                at for quad, number, at in zip(*self._squares(row), strict=True)
-                if number in self.targets.targets[row].marker_ids
-                and (quad == squares).all(axis=(1, 2)).any()
-            ]
-            for at in chosen:
-                if np.isfinite(self.recording.translation[at]).all():
-                    poses.rotation[row] = self.recording.rotation[at]
-                    poses.translation[row] = self.recording.translation[at]
-                    break
+            quads, ids, at = self._squares(row)
+            used = (quads[:, None] == found.corners[found.owner == row]).all(axis=(2, 3))
+            used &= np.isin(ids, self.targets.targets[row].marker_ids)[:, None]
+            chosen = np.concatenate([of_target, at[used.any(axis=1)]])
+            chosen = chosen[np.isfinite(self.recording.translation[chosen]).all(axis=1)][:1]
+            poses.rotation[row : row + len(chosen)] = self.recording.rotation[chosen]
+            poses.translation[row : row + len(chosen)] = self.recording.translation[chosen]
         return poses
 
     def _squares(self, row: int) -> tuple[Floats, Integers, Integers]:
@@ -284,7 +280,7 @@ class SearchResult:
     origins
         (N, 2) the first pixel of each searched image in the frame.
     poses
-        Those that recorded detections have; None where images are searched.
+        Those that come with what was found (:meth:`DetectionSource.poses`).
     """
 
     targets: TargetScenes
@@ -293,7 +289,7 @@ class SearchResult:
     seconds: float
     images: dict[int, Grey]
     origins: Integers
-    poses: Poses | None = None
+    poses: Poses
 
 
 def whole_frames(batch: SceneBatch) -> Masks:
@@ -360,7 +356,7 @@ def common_windows(windows: Sequence[Integers]) -> Integers:
 def detections_of(
     experiment: Experiment, batch: SceneBatch, wanted: Masks, failures: list[Failure], *,
     keep: bool = False,
-) -> tuple[list[SearchResult], float, Floats]:
+) -> tuple[list[SearchResult], Floats]:
     """Render scenes once and search them with each detector setting, as :func:`search` does."""
     full = whole_frames(batch)
     cuts = [
@@ -377,7 +373,7 @@ def search(
     failures: list[Failure],
     *,
     keep: bool = False,
-) -> tuple[list[SearchResult], float, Floats]:
+) -> tuple[list[SearchResult], Floats]:
     """Render each scene once and search it with each source of detections.
 
     Parameters
@@ -399,10 +395,8 @@ def search(
     -------
     results : list of SearchResult
         One for each source.
-    render_s : float
-        Seconds spent on rendering.
     row_s : ndarray
-        (N,) seconds spent on each scene.
+        (N,) seconds spent on rendering and searching each scene.
     """
     scenes, widest = batch.scenes, common_windows(cuts)
     passes = [
@@ -410,11 +404,11 @@ def search(
         for k, (source, cut) in enumerate(zip(sources, cuts, strict=True))
     ]
     imaged = wanted & np.array([keep or source.needs_images for source in sources])
-    render_s = np.zeros(len(scenes))
+    row_s = np.zeros(len(scenes))
     for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
         begun = time.perf_counter()
         images = images_of(render_all, batch, rows, widest, failures)
-        render_s[rows] = (time.perf_counter() - begun) / len(rows)
+        row_s[rows] = (time.perf_counter() - begun) / len(rows)
         for each in passes:
             for row, image in zip(rows.tolist(), images, strict=True):
                 if imaged[row, each.number]:
@@ -422,10 +416,8 @@ def search(
     for each in passes:
         for row in np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number]).tolist():
             each.search(row, _UNSEEN)
-    return (
-        [each.result(batch.targets, cut[:, :2]) for each, cut in zip(passes, cuts, strict=True)],
-        float(render_s.sum()), render_s + np.sum([each.row_s for each in passes], axis=0),
-    )
+    row_s += np.sum([each.row_s for each in passes], axis=0)
+    return [each.result(batch.targets, cut) for each, cut in zip(passes, cuts, strict=True)], row_s
 
 
 _UNSEEN = np.empty((0, 0), dtype=np.uint8)
@@ -470,9 +462,9 @@ class _Pass:
             self.failed.append(row)
         self.row_s[row] = time.perf_counter() - begun
 
-    def result(self, targets: TargetScenes, origins: Integers) -> SearchResult:
-        """Return what was found in windows whose first pixels are ``origins`` (N, 2)."""
-        begun = time.perf_counter()
+    def result(self, targets: TargetScenes, cuts: Integers) -> SearchResult:
+        """Return what was found in the windows ``cuts`` (N, 4)."""
+        begun, origins = time.perf_counter(), cuts[:, :2]
         offset = origins if self.source.needs_images else np.zeros_like(origins)
         found = classify(targets, self.outputs, offset.astype(np.float64))
         flags = found.flags.copy()

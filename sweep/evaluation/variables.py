@@ -49,14 +49,13 @@ class EstimationResults:
     ----------
     estimates, error
         What the estimator returned, and its errors: n of each.
-    true_rotation, true_translation
-        (n, 3, 3) and (n, 3) in metres, target to camera.
+    true_rotation
+        (n, 3, 3) target to camera.
     """
 
     estimates: Estimates
     error: PoseError
     true_rotation: Floats
-    true_translation: Floats
 
 
 def compared(
@@ -65,7 +64,7 @@ def compared(
     """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
     rotation, translation = scenes.rotation[rows], scenes.translation[rows]
     error = pose_error(estimates.rotation, estimates.translation, rotation, translation)
-    return EstimationResults(estimates, error, rotation, translation)
+    return EstimationResults(estimates, error, rotation)
 
 
 def target_areas_px(scenes: Scenes, targets: TargetScenes) -> Floats:
@@ -106,9 +105,7 @@ def _marker_flags(results: SearchResult) -> NDArray[np.uint8]:
 
 
 def _marker_errors_px(results: SearchResult) -> Floats:
-    errors = results.found.marker_corners - results.targets.corners_px
-    errors[_marker_flags(results) != DetectionStatus.detected] = np.nan
-    return errors
+    return results.found.marker_corners - results.targets.corners_px
 
 
 def _chessboard_errors_px(results: SearchResult) -> Floats:
@@ -164,9 +161,7 @@ SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
 
 DETECTION: dict[str, Callable[[SearchResult], NDArray[Any]]] = {
     "detection": lambda results: results.flags,
-    "corner_error_px": lambda results: (
-        results.found.marker_corners - results.targets.corners_px
-    )[:, 0],
+    "corner_error_px": lambda results: _marker_errors_px(results)[:, 0],
     "marker_detection": _marker_flags,
     "marker_corner_error_px": _marker_errors_px,
     "chessboard_corner_error_px": _chessboard_errors_px,

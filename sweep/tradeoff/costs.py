@@ -348,7 +348,7 @@ class _Configurations:
                 detected_share[c, d] = len(rows) / len(batch.scenes)
                 for setting, estimate in zip(self.settings, self.estimators, strict=True):
                     detections = detections_for(
-                        setting, batch.values, batch.scenes, found,
+                        setting, batch, found,
                         np.resize(rows, BATCH if len(rows) else 0),
                     )
                     parts.append(partial(_estimate_all, estimate, detections))
@@ -400,7 +400,7 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
         return _prepare(pipeline, [index[chosen] for index in indices], most)
     wanted = np.full((count, len(experiment.detectors)), len(rows) > 0)
-    searches, _, _ = detections_of(experiment, batch, wanted, [], keep=True)
+    searches, _ = detections_of(experiment, batch, wanted, [], keep=True)
     return _Condition(batch, searches, detection_sources(experiment, batch))
 
 

@@ -73,7 +73,7 @@ def measured(side, tilt):
     pipeline = Pipeline.from_text(
         TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)).replace("SCENES", str(SCENES)))
     batch = scenes_at(pipeline.experiment, [np.arange(SCENES)])
-    scenes, values = batch.scenes, batch.values
+    scenes = batch.scenes
     box = batch.boxes[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
     view = marker_view(
         scenes.target(0), scenes.size_m[0], scenes.cameras.optics(0), box[:2], noise_variance(2.0)
@@ -81,10 +81,10 @@ def measured(side, tilt):
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()
     image = np.zeros((height, width))
-    found, _, _ = detections_of(
+    found, _ = detections_of(
         pipeline.experiment, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
-    seen = detections_for(pipeline.experiment.estimators[0], values, scenes, found[0], rows)
+    seen = detections_for(pipeline.experiment.estimators[0], batch, found[0], rows)
     return (
         best_ms(lambda: bound_of_scene(state, view, image, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))

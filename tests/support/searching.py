@@ -30,6 +30,6 @@ def searched(scenes, setting, *, full=False, wanted=None, boards=None, keep=Fals
     )
     cut = search_windows(scenes, batch.boxes, setting, np.broadcast_to(full, count))
     wanted = np.broadcast_to(True if wanted is None else wanted, count)
-    (result,), _, _ = search(batch, wanted[:, None], [source], [cut], failures, keep=keep)
+    (result,), _ = search(batch, wanted[:, None], [source], [cut], failures, keep=keep)
     assert not failures
     return result

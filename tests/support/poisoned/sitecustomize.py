@@ -179,9 +179,9 @@ class _Poison:
 
         return Detector
 
-    def detections_for(self, estimator, values, scenes, result, rows):
-        seen = self._real["detections_for"](estimator, values, scenes, result, rows)
-        known = self._cells(scenes)
+    def detections_for(self, estimator, batch, result, rows):
+        seen = self._real["detections_for"](estimator, batch, result, rows)
+        known = self._cells(batch.scenes)
         return _told(seen, [known[row] for row in rows.tolist()]) if known else seen
 
     def build(self, setting):

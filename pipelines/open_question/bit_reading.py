@@ -37,7 +37,7 @@ from quadrilaterals import (
 )
 
 from sweep.measure.detectors import DetectorSetting
-from sweep.measure.photograph_model import from_unit_square
+from sweep.measure.photograph import from_unit_square
 from sweep.model.marker import opencv_dictionary
 from sweep.typing import Floats
 

@@ -21,8 +21,9 @@ from sweep.measure.likelihood import (
     SETTLED,
     SPREAD,
     MarkerView,
+    Pixels,
     curvature,
-    fit,
+    descend,
     marker_view,
     middle_m,
     mirrored_state,
@@ -115,7 +116,7 @@ def bound_of_scene(
 
     ``image`` (height, width) is overwritten, but for its pixels that are NaN: they are left out.
 
-    One function, since each that calls :func:`sweep.measure.likelihood.fit` takes a second to
+    One function, since each that calls :func:`sweep.measure.likelihood.descend` takes a second to
     compile.
 
     Returns
@@ -148,10 +149,13 @@ def bound_of_scene(
     for i in range(height):
         for j in range(width):
             image[i, j] += exact[i, j]
-    chi_square, reached = fit(
-        image, squares(image), mirrored_state(state), view, work,
-        MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, information,
+    mirror = mirrored_state(state)
+    mirror[GREY_LEVELS] = 0.0
+    square_sum, reached = descend(
+        Pixels(image, squares(image), view), mirror, work, 1, MIRROR_STEPS, SETTLED,
+        MAX_MIRROR_DISTANCE**2 * view.variance, information,
     )
+    chi_square = square_sum / view.variance
     if not reached or chi_square < 1e-2:
         chi_square = math.nan
     return covariance, True, kappa, chi_square

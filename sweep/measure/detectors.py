@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
@@ -231,13 +231,13 @@ def opencv_parameters(setting: DetectorSetting) -> cv2.aruco.DetectorParameters:
     """Return a setting as OpenCV's detectors take it."""
     parameters = cv2.aruco.DetectorParameters()
     defaults = DetectorSetting()
-    for field in dataclasses.fields(setting):
-        value = getattr(setting, field.name)
-        if field.name == "cornerRefinementMethod":
+    for each in dataclasses.fields(setting):
+        value = getattr(setting, each.name)
+        if each.name == "cornerRefinementMethod":
             value = REFINEMENTS[value]
-        elif value == getattr(defaults, field.name):
+        elif value == getattr(defaults, each.name):
             continue
-        setattr(parameters, field.name, value)
+        setattr(parameters, each.name, value)
     return parameters
 
 
@@ -301,24 +301,21 @@ class SearchOutput(NamedTuple):
     chessboard_px: Floats = np.zeros((0, 2))
 
 
+@dataclass(frozen=True, slots=True)
 class BoardDetector:
     """What OpenCV does with markers when it knows the board, by one setting.
 
-    Parameters
+    Attributes
     ----------
     setting
         How it uses the board.
-    parameters
-        Those of the detector of markers, of which it takes the refinement of corners.
+    markers
+        The detector of markers, of which it takes the refinement of corners.
     """
 
-    def __init__(
-        self, setting: BoardDetectorSetting, parameters: cv2.aruco.DetectorParameters
-    ) -> None:
-        self._setting = setting
-        self._parameters = parameters
-        self._refining: dict[str, cv2.aruco.ArucoDetector] = {}
-        self._charuco: dict[Board, cv2.aruco.CharucoDetector] = {}
+    setting: BoardDetectorSetting
+    markers: DetectorSetting
+    _made: dict[Any, Any] = field(default_factory=dict)
 
     def complete(
         self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
@@ -332,39 +329,39 @@ class BoardDetector:
         corners, ids, rejected = markers
         if ids is None or not len(ids):
             return SearchOutput(*markers)
-        if self._setting.refineDetectedMarkers and rejected:
-            refine: Any = self._refining_detector(board.dictionary).refineDetectedMarkers
-            corners, ids, rejected, _ = refine(
+        if self.setting.refineDetectedMarkers and rejected:
+            corners, ids, rejected, _ = self._refining(board.dictionary).refineDetectedMarkers(
                 image, _opencv_board(board), list(corners), ids, list(rejected)
             )
             corners, rejected = list(corners), list(rejected)
+        output = SearchOutput(corners, ids, rejected)
         if board.chessboard is None:
-            return SearchOutput(corners, ids, rejected)
-        pixels, found, _, _ = self._charuco_detector(board).detectBoard(
+            return output
+        pixels, found, _, _ = self._charuco(board).detectBoard(
             image, markerCorners=list(corners), markerIds=ids
         )
         if found is None or not len(found):
-            return SearchOutput(corners, ids, rejected)
-        return SearchOutput(
-            corners, ids, rejected, np.asarray(found, dtype=np.int64).ravel(),
-            np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+            return output
+        return output._replace(
+            chessboard_ids=np.asarray(found, dtype=np.int64).ravel(),
+            chessboard_px=np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
         )
 
-    def _refining_detector(self, dictionary: str) -> cv2.aruco.ArucoDetector:
-        if dictionary not in self._refining:
-            self._refining[dictionary] = cv2.aruco.ArucoDetector(
-                opencv_dictionary(dictionary), self._parameters
+    def _refining(self, dictionary: str) -> Any:
+        if dictionary not in self._made:
+            self._made[dictionary] = cv2.aruco.ArucoDetector(
+                opencv_dictionary(dictionary), opencv_parameters(self.markers)
             )
-        return self._refining[dictionary]
+        return self._made[dictionary]
 
-    def _charuco_detector(self, board: Board) -> cv2.aruco.CharucoDetector:
-        if board not in self._charuco:
+    def _charuco(self, board: Board) -> Any:
+        if board not in self._made:
             parameters = cv2.aruco.CharucoParameters()
-            parameters.minMarkers = self._setting.minMarkers
-            self._charuco[board] = cv2.aruco.CharucoDetector(
-                charuco_board(board), parameters, self._parameters
+            parameters.minMarkers = self.setting.minMarkers
+            self._made[board] = cv2.aruco.CharucoDetector(
+                charuco_board(board), parameters, opencv_parameters(self.markers)
             )
-        return self._charuco[board]
+        return self._made[board]
 
 
 @lru_cache(maxsize=64)
@@ -553,7 +550,7 @@ def make_board_detector(
 ) -> BoardDetector:
     """Return what finds corners by means of a board, beside the detector of a setting."""
     of_opencv = setting if isinstance(setting, DetectorSetting) else DetectorSetting()
-    return BoardDetector(board_setting, opencv_parameters(of_opencv))
+    return BoardDetector(board_setting, of_opencv)
 
 
 def _find_nothing(

@@ -105,7 +105,7 @@ OUTSIDE, BLACK, WHITE, OUTSIDE_SHARE, TONE = 13, 14, 15, 16, 17
 """A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
 standard deviation of the point spread in pixels, the levels of outside, black and white; and of
 photographs, as shares of the contrast, the level outside and the tone curve, for which slopes are
-computed (:mod:`sweep.measure.photograph_model`)."""
+computed (:mod:`sweep.measure.photograph`)."""
 
 MIN_SPREAD_PX = 0.1
 """Smallest point spread that is estimated; a smaller one becomes 0 and stays so."""
@@ -577,33 +577,14 @@ def descend(
 
 
 @compiled
-def fit(
-    image: Floats, square_sum: float, state: Floats, view: MarkerView, work: Work, most_steps: int,
-    settled: float, worth: float, information: Floats,
-) -> tuple[float, bool]:
-    """Move ``state`` to the nearest maximum of the likelihood by the exact image.
-
-    As :func:`descend`, with chi-square in the place of squares.
-    """
-    state[GREY_LEVELS] = 0.0
-    squares, reached = descend(
-        Pixels(image, square_sum, view), state, work, 1, most_steps, settled,
-        worth * view.variance, information,
-    )
-    return squares / view.variance, reached
-
-
-@compiled
-def binned(image: Floats) -> Floats:
-    """Return the means of 2 x 2 pixels; an odd last row or column is left out."""
-    half = np.empty((image.shape[0] // 2, image.shape[1] // 2))
-    for i in range(half.shape[0]):
-        for j in range(half.shape[1]):
-            half[i, j] = 0.25 * (
+def halve(image: Floats, share: float, out: Floats) -> None:
+    """Write the sums of 2 x 2 pixels, times ``share``; an odd last row or column is left out."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = share * (
                 image[2 * i, 2 * j] + image[2 * i, 2 * j + 1]
                 + image[2 * i + 1, 2 * j] + image[2 * i + 1, 2 * j + 1]
             )
-    return half
 
 
 @compiled

@@ -1,28 +1,723 @@
-"""What the residuals of a fitted photograph say of its pose: covariance, noise and misfit."""
+"""A photograph of a printed plane: its model, what is fitted of it, and what residuals say."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from sweep.compilation import compiled
-from sweep.measure.likelihood import BLACK, DEPTH, WHITE, solve_positive
-from sweep.measure.photograph_model import (
-    GROUP,
-    LINEAR,
-    MOVED,
-    TILE,
-    PhotographView,
-    System,
-    add_products,
-    add_tile,
-    draw,
-    pixel_count,
-    write_columns,
+from sweep.compilation import compiled, compiled_inline
+from sweep.measure.likelihood import (
+    BLACK,
+    DEPTH,
+    FLAT,
+    MODELS,
+    OUTSIDE,
+    OUTSIDE_SHARE,
+    SPREAD,
+    TONE,
+    WHITE,
+    MarkerView,
+    binned_view,
+    eliminate,
+    halve,
+    plane_of,
+    solve_positive,
 )
+from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.model.board import Board
+from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
-from sweep.typing import Floats
+from sweep.model.lens import jacobian, undistort
+from sweep.model.marker import module_count, overhang
+from sweep.model.polygon import (
+    ModuleEdge,
+    Optics,
+    Projection,
+    chord_count,
+    distorted_point,
+    homogeneous_pixel,
+)
+from sweep.typing import Floats, Grey, Integers
+
+# --------------------------------------------------------------------------------------------------
+# A printed plane's blurred image and its slopes, as a photograph is fitted by them.
+#
+# The level of a pixel is that of area coverage through a Gaussian point spread, as in
+# :mod:`sweep.model.coverage`. Its slopes along x and along y, and by the point spread's variance,
+# are integrals along the same edges. All edges lie in one plane, so that the image's slope by a
+# parameter of the pose is the slope along x and y times the velocity of the plane's point at the
+# pixel: three numbers a pixel in place of seven, where :mod:`sweep.model.derivatives` is exact.
+# The point spread mixes velocities of neighbouring points, which are the same up to its width
+# over the marker's side; that changes the direction of a step, not the pose at which the fit
+# ends.
+
+REACH = 3.5
+"""Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond."""
+
+PANEL = 2.0
+"""Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
+jump."""
+
+MAX_PANELS = 4096
+"""Most panels of one straight segment."""
+
+_STEPS = 64
+_AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
+_DENSITY = np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
+_BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+_BELOW_SUM = _AT * _BELOW + _DENSITY
+"""The normal distribution, its integral, and the integral of that, in steps of 1/64 standard
+deviations."""
+
+
+@compiled_inline
+def _normal(at: float, distance: float, sigma: float) -> tuple[float, float, float]:
+    """Return the normal distribution's integral, the integral of that in px, and its density.
+
+    ``at`` is a place in the tables, that of the px ``distance`` from the middle; beyond their ends
+    the integral is 0 or 1.
+    """
+    if at >= 12.0 * _STEPS:
+        return 1.0, distance, 0.0
+    if at <= 0.0:
+        return 0.0, 0.0, 0.0
+    k = int(at)
+    part = at - k
+    return (
+        _BELOW[k] + part * (_BELOW[k + 1] - _BELOW[k]),
+        sigma * (_BELOW_SUM[k] + part * (_BELOW_SUM[k + 1] - _BELOW_SUM[k])),
+        _DENSITY[k] + part * (_DENSITY[k + 1] - _DENSITY[k]),
+    )
+
+
+class Slopes(NamedTuple):
+    """A box's image and its slopes; all are 0 between calls.
+
+    Attributes
+    ----------
+    rates
+        (height, 4 · (width + 1)): of each pixel the image's step from the pixel before, its
+        slopes by x and by y, and that by the point spread's variance.
+    outside
+        (height, width + 1) steps of the area outside.
+    """
+
+    rates: Floats
+    outside: Floats
+
+
+@compiled
+def slope_space(height: int, width: int) -> Slopes:
+    """Return the scratch space for a box."""
+    return Slopes(np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)))
+
+
+@compiled
+def _add_segment(
+    out: Slopes, jump: float, outside: float, sigma: float, shortest: float,
+    xa: float, ya: float, xb: float, yb: float,
+) -> None:
+    """Add a straight segment from (xa, ya) to (xb, yb) px of the box.
+
+    ``jump`` is the image's step across it, ``outside`` that of the area outside.
+    """
+    rates, outsides = out
+    height, width = outsides.shape[0], outsides.shape[1] - 1
+    reach = REACH * sigma + 0.5
+    if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
+        return
+    panels = min(
+        max(math.ceil(math.hypot(xb - xa, yb - ya) / max(PANEL * sigma, shortest)), 1), MAX_PANELS
+    )
+    dx, dy = (xb - xa) / panels, (yb - ya) / panels
+    most = int(2.0 * reach) + 3
+    basis, along_y, steps = np.empty(4 * most), np.zeros(4 * most), np.empty(most)
+    scale = _STEPS / sigma
+    for panel in range(panels):
+        for node in range(3):
+            t = panel + NODES[node]
+            x, y = xa + t * dx, ya + t * dy
+            first, last = math.floor(x - reach), math.floor(x + reach) + 1
+            top, bottom = max(math.floor(y - reach), 0), min(math.floor(y + reach), height - 1)
+            if first >= width or top > bottom:
+                continue
+            weight_x, weight_y = WEIGHTS[node] * jump * dy, WEIGHTS[node] * jump * dx
+            curved_x, curved_y = 0.5 * weight_x / sigma, 0.5 * weight_y / sigma
+            begin, end = max(first, 0), min(last, width - 1)
+            # Columns left of the box are one step at its first column.
+            passed = before = low = low_sum = low_density = 0.0
+            at = (first - x) * scale + 6.0 * _STEPS
+            if at > 0.0:
+                k = int(at)
+                low, low_sum, low_density = _BELOW[k], sigma * _BELOW_SUM[k], _DENSITY[k]
+            for j in range(first, end + 1):
+                at = (j + 1.0 - x) * scale + 6.0 * _STEPS
+                high, high_sum, high_density = _normal(at, j + 1.0 - x, sigma)
+                share = 1.0 if j == last else high_sum - low_sum
+                if j < 0:
+                    passed += share - before
+                else:
+                    m = j - begin
+                    near = high - low
+                    steps[m] = share - before
+                    basis[4 * m] = weight_x * (share - before)
+                    basis[4 * m + 1] = weight_x * near
+                    basis[4 * m + 2] = -weight_y * near
+                    basis[4 * m + 3] = curved_x * (high_density - low_density)
+                    along_y[4 * m + 3] = curved_y * near
+                before, low, low_sum, low_density = share, high, high_sum, high_density
+            at = (top - y) * scale + 6.0 * _STEPS
+            low, low_density = 0.0, 0.0
+            if at > 0.0:
+                k = int(at)
+                low, low_density = _BELOW[k], _DENSITY[k]
+            count, start = max(end - begin + 1, 0), 4 * begin
+            for i in range(top, bottom + 1):
+                high, _, high_density = _normal((i + 1.0 - y) * scale + 6.0 * _STEPS, 0.0, sigma)
+                share, change = high - low, low_density - high_density
+                low, low_density = high, high_density
+                row = rates[i]
+                for m in range(4 * count):
+                    row[start + m] += share * basis[m] + change * along_y[m]
+                if passed != 0.0:
+                    rates[i, 0] += share * weight_x * passed
+                if outside != 0.0:
+                    factor = share * outside * WEIGHTS[node] * dy
+                    outsides[i, 0] += factor * passed
+                    for m in range(count):
+                        outsides[i, begin + m] += factor * steps[m]
+
+
+@compiled
+def add_plane(
+    out: Slopes, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
+    shortest: float,
+) -> None:
+    """Add the edges of a printed plane to ``out``.
+
+    Parameters
+    ----------
+    out
+        A box whose first pixel is (0, 0) of the projection.
+    edges
+        The edges of what is printed, in modules.
+    values
+        (3,) values of the image on the areas outside, black and white.
+    projection
+        The plane, and the camera.
+    sigma
+        The point spread's standard deviation in px, positive.
+    shortest
+        Least length of a panel of the quadrature in px.
+    """
+    intrinsics = projection.optics.intrinsics
+    shift_x, shift_y = intrinsics[2] + 0.5, intrinsics[3] + 0.5
+    ends, sides = edges.ends, edges.sides
+    for e in range(ends.shape[0]):
+        jump = values[sides[e, 1]] - values[sides[e, 0]]
+        outside = 1.0 * (sides[e, 1] == 0) - 1.0 * (sides[e, 0] == 0)
+        if jump == 0.0 and outside == 0.0:
+            continue
+        edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
+        if not projection.optics.distorted:
+            x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, edge.column, edge.row)
+            x1, y1, z1 = homogeneous_pixel(
+                projection, shift_x, shift_y, edge.to_column, edge.to_row
+            )
+            _add_segment(
+                out, jump, outside, sigma, shortest, x0 / z0, y0 / z0, x1 / z1, y1 / z1
+            )
+            continue
+        chords = chord_count(projection, edge)
+        x, y = distorted_point(0.0, projection, edge)
+        for chord in range(1, chords + 1):
+            u, v = distorted_point(chord / chords, projection, edge)
+            _add_segment(
+                out, jump, outside, sigma, shortest, x + 0.5, y + 0.5, u + 0.5, v + 0.5
+            )
+            x, y = u, v
+
+
+# --------------------------------------------------------------------------------------------------
+# The model of a photograph of a printed plane: its image, and what cameras do to levels.
+#
+# The level of a pixel is modelled as
+#
+#     y = b + c (m + e m (1 - m)) + d p,
+#
+# m is the share of white through a Gaussian point spread, of which the area outside the modelled
+# paper is a part, p the share of that area; b, c, d are levels, e is the tone curve. With c e as a
+# parameter in the place of e, all but the pose and the point spread is linear. The state of a fit
+# is that of :mod:`sweep.measure.likelihood`.
+
+MOVED, LINEAR = POSE + 1, 4
+"""Parameters that are moved, the pose's and the point spread's variance, and the linear ones."""
+
+MAX_TONE = 5.0
+"""Largest tone, as a share of the contrast, for which slopes are computed."""
+
+MAX_OUTSIDE = 2.0
+"""Largest level outside, from black, as a share of the contrast."""
+
+MIN_OUTSIDE_PX = 1.0
+"""Pixels of the area outside, by squares of its shares, below which its level stays as it is."""
+
+MIN_SPREAD_PX = 0.2
+"""Smallest point spread that is estimated."""
+
+LENS_STEP_PX = 8
+"""Pixels between those at which the lens is inverted; between them it is interpolated."""
+
+
+class PhotographView(NamedTuple):
+    """A box of a photograph with what is known of it.
+
+    Attributes
+    ----------
+    marker
+        The plane's edges, the extent that they describe, and the camera; the principal point is
+        relative to the box.
+    levels
+        (height, width) grey levels.
+    spans
+        (height, 2) the first fitted pixel of each row, and the one after the last.
+    rays
+        (6, height, width) undistorted direction x/z, y/z of each pixel, and the derivatives of
+        its u and v by them, row by row, in px.
+    at
+        (2, height, width) x and y relative to the marker's centre, in halves of its extent.
+    panel_px
+        Least length of the pieces in which edges are integrated.
+    toned
+        Whether the tone curve is estimated.
+    """
+
+    marker: MarkerView
+    levels: Floats
+    spans: Integers
+    rays: Floats
+    at: Floats
+    panel_px: float
+    toned: bool
+
+
+class System(NamedTuple):
+    """Scratch space of a fit.
+
+    Attributes
+    ----------
+    slopes
+        As :func:`slope_space` returns it.
+    images
+        (6, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance
+        and the area outside, all as shares of the contrast.
+    """
+
+    slopes: Slopes
+    images: Floats
+
+
+@compiled
+def system(height: int, width: int) -> System:
+    """Return the scratch space for a box."""
+    return System(slope_space(height, width), np.empty((6, height, width)))
+
+
+@compiled
+def pixel_count(view: PhotographView) -> int:
+    """Return how many pixels are fitted."""
+    total = 0
+    for i in range(len(view.spans)):
+        total += view.spans[i, 1] - view.spans[i, 0]
+    return total
+
+
+@compiled
+def rays_of(optics: Optics, height: int, width: int) -> Floats:
+    """Return the rays (6, height, width) of a box, as :class:`PhotographView` has them."""
+    rays = np.empty((6, height, width))
+    fx, fy, cx, cy = optics.intrinsics
+    if not optics.distorted:
+        for i in range(height):
+            for j in range(width):
+                rays[0, i, j], rays[1, i, j] = (j - cx) / fx, (i - cy) / fy
+                rays[2, i, j], rays[3, i, j], rays[4, i, j], rays[5, i, j] = fx, 0.0, 0.0, fy
+        return rays
+    rows = (height - 1) // LENS_STEP_PX + 2
+    columns = (width - 1) // LENS_STEP_PX + 2
+    lattice = np.empty((6, rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            x, y, _ = undistort(
+                (j * LENS_STEP_PX - cx) / fx, (i * LENS_STEP_PX - cy) / fy, optics.lens
+            )
+            a, b, c, d = jacobian(x, y, optics.lens)
+            lattice[0, i, j], lattice[1, i, j] = x, y
+            lattice[2, i, j], lattice[3, i, j] = fx * a, fx * b
+            lattice[4, i, j], lattice[5, i, j] = fy * c, fy * d
+    blended = np.empty(columns)
+    for k in range(6):
+        for i in range(height):
+            row, down = i // LENS_STEP_PX, (i % LENS_STEP_PX) / LENS_STEP_PX
+            for j in range(columns):
+                blended[j] = (
+                    lattice[k, row, j] * (1.0 - down) + lattice[k, row + 1, j] * down
+                )
+            for j in range(width):
+                column, right = j // LENS_STEP_PX, (j % LENS_STEP_PX) / LENS_STEP_PX
+                rays[k, i, j] = blended[column] * (1.0 - right) + blended[column + 1] * right
+    return rays
+
+
+@compiled
+def draw(view: PhotographView, state: Floats, work: System) -> None:
+    """Write the images of a state to ``work.images``."""
+    (rates, outsides), images = work.slopes, work.images
+    height, width = view.levels.shape
+    add_plane(
+        work.slopes, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
+        Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
+        view.panel_px,
+    )
+    tone = min(max(state[TONE], -MAX_TONE), MAX_TONE)
+    for i in range(height):
+        # Beyond the modelled extent is black.
+        level, outside = 0.0, 0.0
+        shares, squares, by_x, by_y = images[0, i], images[1, i], images[2, i], images[3, i]
+        by_spread, outer, row, steps = images[4, i], images[5, i], rates[i], outsides[i]
+        for j in range(width):
+            level += row[4 * j]
+            outside += steps[j]
+            shares[j] = level
+            squares[j] = level * (1.0 - level) if view.toned else 0.0
+            outer[j] = outside
+            gain = 1.0 + tone * (1.0 - 2.0 * level)
+            by_x[j] = gain * row[4 * j + 1]
+            by_y[j] = gain * row[4 * j + 2]
+            by_spread[j] = gain * row[4 * j + 3]
+        row[:] = 0.0
+        steps[:] = 0.0
+
+
+@compiled
+def write_columns(
+    view: PhotographView, state: Floats, contrast: float, images: Floats, i: int, first: int,
+    columns: Floats,
+) -> None:
+    """Write the model's derivatives at pixels of a row to ``columns`` (n, ...), from one on.
+
+    The order: six of the pose and the point spread's variance, which are for a ``contrast``; black,
+    contrast, outside, tone; the level itself.
+    """
+    last = first + len(columns)
+    ray_x, ray_y = view.rays[0, i, first:last], view.rays[1, i, first:last]
+    ux, uy = view.rays[2, i, first:last], view.rays[3, i, first:last]
+    vx, vy = view.rays[4, i, first:last], view.rays[5, i, first:last]
+    shares, squares, outside = (
+        images[0, i, first:last], images[1, i, first:last], images[5, i, first:last]
+    )
+    by_u, by_v, by_spread = (
+        images[2, i, first:last], images[3, i, first:last], images[4, i, first:last]
+    )
+    levels = view.levels[i, first:last]
+    position_x, position_y, position_z = state[9], state[10], state[11]
+    # The plane's normal is the third column of the rotation matrix, position follows it.
+    height = state[2] * position_x + state[5] * position_y + state[8] * position_z
+    normal_x, normal_y, normal_z = state[2] / height, state[5] / height, state[8] / height
+    depth = abs(state[DEPTH])
+    for j in range(len(columns)):
+        column = columns[j]
+        x, y = ray_x[j], ray_y[j]
+        # The slope by the direction, from that by the pixel.
+        du, dv = contrast * by_u[j], contrast * by_v[j]
+        by_x = du * ux[j] + dv * vx[j]
+        by_y = du * uy[j] + dv * vy[j]
+        inverse = normal_x * x + normal_y * y + normal_z
+        px = x - inverse * position_x
+        py = y - inverse * position_y
+        pz = 1.0 - inverse * position_z
+        by_z = x * by_x + y * by_y
+        nearness = depth * inverse
+        column[0] = by_y * pz + by_z * py
+        column[1] = -by_x * pz - by_z * px
+        column[2] = by_x * py - by_y * px
+        column[3] = -by_x * nearness
+        column[4] = -by_y * nearness
+        column[5] = by_z * nearness
+        column[6] = contrast * by_spread[j]
+        column[7] = 1.0
+        column[8] = shares[j]
+        column[9] = outside[j]
+        column[10] = squares[j]
+        column[11] = levels[j]
+
+
+GROUP, TILE = 128, 4
+"""Pixels whose columns are multiplied at once, and the side of the tiles of their products."""
+
+
+@compiled
+def normal_equations(view: PhotographView, state: Floats, work: System, matrix: Floats) -> None:
+    """Sum up JᵀJ, Jᵀy and yᵀy over the used pixels, for a contrast of 1, into a matrix (12, 12)."""
+    size = matrix.shape[0]
+    tiles = (size + TILE - 1) // TILE
+    columns, sums = np.zeros((GROUP, TILE * tiles)), np.zeros((TILE * tiles, TILE * tiles))
+    filled = 0
+    for i in range(len(view.spans)):
+        first, last = view.spans[i]
+        while first < last:
+            count = min(last - first, GROUP - filled)
+            write_columns(view, state, 1.0, work.images, i, first, columns[filled : filled + count])
+            filled += count
+            first += count
+            if filled == GROUP:
+                add_products(columns, filled, sums)
+                filled = 0
+    add_products(columns, filled, sums)
+    for k in range(size):
+        for m in range(k + 1):
+            matrix[k, m] = matrix[m, k] = sums[k, m]
+
+
+@compiled
+def add_products(columns: Floats, count: int, sums: Floats) -> None:
+    """Add the products of the columns of ``count`` pixels to the tiles of the lower triangle."""
+    for k in range(0, sums.shape[0], TILE):
+        for m in range(0, k + 1, TILE):
+            add_tile(columns, k, columns, m, count, sums)
+
+
+@compiled_inline
+def add_tile(left: Floats, k: int, right: Floats, m: int, count: int, sums: Floats) -> None:
+    """Add products of four columns of ``left`` from the k-th on with four of ``right``."""
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for p in range(count):
+        row, other = left[p], right[p]
+        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
+        b0, b1, b2, b3 = other[m], other[m + 1], other[m + 2], other[m + 3]
+        s00, s01, s02, s03 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2, s03 + a0 * b3
+        s10, s11, s12, s13 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2, s13 + a1 * b3
+        s20, s21, s22, s23 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2, s23 + a2 * b3
+        s30, s31, s32, s33 = s30 + a3 * b0, s31 + a3 * b1, s32 + a3 * b2, s33 + a3 * b3
+    _add_to_row(sums[k], m, s00, s01, s02, s03)
+    _add_to_row(sums[k + 1], m, s10, s11, s12, s13)
+    _add_to_row(sums[k + 2], m, s20, s21, s22, s23)
+    _add_to_row(sums[k + 3], m, s30, s31, s32, s33)
+
+
+@compiled_inline
+def _add_to_row(row: Floats, m: int, a: float, b: float, c: float, d: float) -> None:
+    """Add four numbers to a row from column m on."""
+    row[m] += a
+    row[m + 1] += b
+    row[m + 2] += c
+    row[m + 3] += d
+
+
+@compiled
+def _squares_of_photograph(
+    view: PhotographView, state: Floats, work: System, information: Floats, gradient: Floats
+) -> float:
+    """As :func:`sweep.measure.likelihood.squared_residuals`, by the model of photographs."""
+    draw(view, state, work)
+    end = MOVED + LINEAR
+    matrix, linear = np.empty((end + 1, end + 1)), np.zeros(LINEAR)
+    normal_equations(view, state, work, matrix)
+    outside = MOVED + 2
+    if matrix[outside, outside] < MIN_OUTSIDE_PX:
+        matrix[outside, :] = 0.0
+        matrix[:, outside] = 0.0
+    squares = matrix[end, end] - eliminate(
+        matrix[:end, :end], matrix[end, :end], linear, information, gradient
+    )
+    black, contrast, change, toned = linear[0], linear[1], linear[2], linear[3]
+    # The level outside was in the image, as a share of the contrast.
+    state[OUTSIDE] = black + contrast * state[OUTSIDE_SHARE] + change
+    state[BLACK], state[WHITE] = black, black + contrast
+    divisor = contrast if contrast != 0.0 else 1.0
+    share = state[OUTSIDE_SHARE] + min(max(change / divisor, -1.0), 1.0)
+    state[OUTSIDE_SHARE] = min(max(share, -1.0), MAX_OUTSIDE)
+    state[TONE] = toned / divisor
+    for k in range(MOVED):
+        gradient[k] *= contrast
+        for m in range(MOVED):
+            information[k, m] *= contrast**2
+    if state[SPREAD] <= MIN_SPREAD_PX and gradient[POSE] < 0.0:
+        # The squares fall beyond the limit.
+        for k in range(MOVED):
+            information[POSE, k] = information[k, POSE] = 0.0
+        information[POSE, POSE] = 1.0
+        gradient[POSE] = 0.0
+    return max(float(squares), 0.0)
+
+
+MODELS[PhotographView] = _squares_of_photograph
+
+
+# --------------------------------------------------------------------------------------------------
+# The box of a photograph that is fitted: its pixels, and the same of half the resolution.
+
+RING_MODULES = 1.5
+"""Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
+
+PADDING_PX = 2
+"""Pixels around the fitted ones in the box."""
+
+PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
+"""Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
+of 2 x 2 pixels, whose fit is a start."""
+
+MODELLED_PX = 5.0
+"""Pixels around the fitted ones within which print is in the model: what blur carries inwards."""
+
+
+def photograph_view(
+    marker: Board, on_board: BoardMarker | None, size_m: float, corners: Floats, optics: Optics,
+    image: Grey, origin: Integers, toned: bool,
+) -> PhotographView | None:
+    """Return what is fitted of one marker, and what is known of it; None if that is nothing.
+
+    The pixels of the marker and of its quiet zone, as far as its corners tell.
+
+    Parameters
+    ----------
+    marker, on_board, size_m
+        What is printed, and the black square's side.
+    corners
+        (4, 2) px of the frame.
+    optics
+        The camera.
+    image, origin
+        Grey levels, and the image's first pixel in the frame.
+    toned
+        Whether the tone curve is estimated.
+    """
+    dictionary, margin = marker.dictionary, marker.margin or 0.0
+    modules = module_count(dictionary)
+    with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
+        square = from_unit_square(corners[None])[0]
+    side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
+    ring = margin if on_board is None else clear_modules(on_board)
+    ring = min(max(ring, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
+    if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
+        return None
+    to_pixels = square / [modules, modules, 1.0]
+    to_modules = np.asarray(np.linalg.inv(to_pixels), dtype=np.float64)
+    low_end, high_end = -ring, modules + ring
+    outline = to_pixels @ np.array([
+        [low_end, high_end, high_end, low_end], [low_end, low_end, high_end, high_end], [1.0] * 4,
+    ])
+    if not (outline[2] > 0.0).all():
+        return None  # part of it is behind the horizon
+    pixels = (outline[:2] / outline[2]).T
+    low = np.floor(pixels.min(axis=0) - PADDING_PX).astype(np.int64)
+    high = np.ceil(pixels.max(axis=0) + PADDING_PX).astype(np.int64) + 1
+    # A detection may be much wider in the plane than the image that was searched.
+    low = np.maximum(low, origin - PADDING_PX)
+    high = np.minimum(high, origin + image.shape[::-1] + PADDING_PX)
+    width, height = (high - low).tolist()
+    if min(width, height) < 4:
+        return None
+    levels = np.zeros((height, width))
+    start = np.maximum(low, origin)
+    (left, top), (right, bottom) = (start - low).tolist(), (
+        np.minimum(high, origin + image.shape[::-1]) - low
+    ).tolist()
+    (first_column, first_row) = (start - origin).tolist()
+    levels[top:bottom, left:right] = image[
+        first_row : first_row + bottom - top, first_column : first_column + right - left
+    ]
+    local = optics.intrinsics.copy()
+    local[2:] -= low
+    optics = Optics(local, optics.lens, optics.distorted)
+    extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
+    around = (
+        edges_alone(marker, extent) if on_board is None else surroundings(on_board, extent)
+    )
+    known = MarkerView(
+        around, np.repeat([-extent, modules + extent], 2), float(modules), float(size_m), optics,
+        0.0, MIN_SPREAD_PX, FLAT,
+    )
+    to_modules[:, 2] += to_modules[:, :2] @ low
+    at, spans = _fitted_pixels(
+        to_modules, float(modules), ring, height, width, np.array([left, top, right, bottom])
+    )
+    return PhotographView(
+        known, levels, spans, rays_of(optics, height, width), at, PANEL_PX, toned
+    )
+
+
+def from_unit_square(quads: Floats) -> Floats:
+    """Return the homographies (P, 3, 3) of the unit square to quadrilaterals (P, 4, 2).
+
+    (0, 0), (1, 0), (1, 1), (0, 1) become the corners in their order. From Heckbert, "Fundamentals
+    of texture mapping and image warping" (1989), section 2.2.3.
+    """
+    p0, p1, p2, p3 = (quads[:, k] for k in range(4))
+    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+
+    def cross(a: Floats, b: Floats) -> Floats:
+        return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+    area = cross(d1, d2)
+    g, h = (cross(total, d2) / area)[:, None], (cross(d1, total) / area)[:, None]
+    out = np.ones((len(quads), 3, 3))
+    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g * p1, p3 - p0 + h * p3, p0
+    out[:, 2, :2] = np.column_stack([g, h])
+    return out
+
+
+@compiled
+def _fitted_pixels(
+    to_modules: Floats, modules: float, ring: float, height: int, width: int, image: Integers
+) -> tuple[Floats, Integers]:
+    """Return ``at`` and ``spans`` of a view.
+
+    Fitted are pixels up to ``ring`` modules around the square, in the part of the box that is in
+    the image: ``image`` (4,) left, top, right, bottom. A row's pixels are one span: both areas are
+    convex.
+    """
+    at, spans = np.empty((2, height, width)), np.zeros((height, 2), dtype=np.int64)
+    half = 0.5 * modules
+    for i in range(height):
+        first, last = width, 0
+        for j in range(width):
+            x = to_modules[0, 0] * j + to_modules[0, 1] * i + to_modules[0, 2]
+            y = to_modules[1, 0] * j + to_modules[1, 1] * i + to_modules[1, 2]
+            z = to_modules[2, 0] * j + to_modules[2, 1] * i + to_modules[2, 2]
+            inverse = 1.0 / z if z > 0.0 else 0.0
+            right, down = (x * inverse - half) / (half + ring), (y * inverse - half) / (half + ring)
+            at[0, i, j], at[1, i, j] = min(max(right, -2.0), 2.0), min(max(down, -2.0), 2.0)
+            inside = image[0] <= j < image[2] and image[1] <= i < image[3]
+            if inside and z > 0.0 and abs(right) < 1.0 and abs(down) < 1.0:
+                first, last = min(first, j), j + 1
+        if first < last:
+            spans[i, 0], spans[i, 1] = first, last
+    return at, spans
+
+
+@compiled
+def binned_photograph(view: PhotographView) -> PhotographView:
+    """Return the view of the means of 2 x 2 pixels; an odd last row or column is left out."""
+    height, width = view.levels.shape[0] // 2, view.levels.shape[1] // 2
+    levels, spans = np.empty((height, width)), np.empty((height, 2), dtype=np.int64)
+    at, rays = np.empty((2, height, width)), np.empty((6, height, width))
+    halve(view.levels, 0.25, levels)
+    for k in range(2):
+        halve(view.at[k], 0.25, at[k])
+    for k in range(6):
+        halve(view.rays[k], 0.25 if k < 2 else 0.125, rays[k])
+    for i in range(height):
+        first = max(view.spans[2 * i, 0], view.spans[2 * i + 1, 0])
+        last = min(view.spans[2 * i, 1], view.spans[2 * i + 1, 1])
+        spans[i, 0] = (first + 1) // 2
+        spans[i, 1] = max(last // 2, spans[i, 0])
+    marker = binned_view(view.marker)
+    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX, view.toned)
+
 
 # --------------------------------------------------------------------------------------------------
 # What residuals of a fitted photograph say: noise, its correlation, and misfit of the geometry.
@@ -32,8 +727,8 @@ from sweep.typing import Floats
 # and compress: its covariance between pixels is taken as variance · x^|columns| · y^|rows|, with
 # x and y the correlations of neighbours. The rest is geometry: parts of the marker lie beside the
 # plane's image (lens, rolling shutter, bent sheet, rows of a screen). A field of shifts, bilinear
-# between :data:`NODES` x :data:`NODES` nodes over the marker, accounts for it: both components
-# have the standard deviation s and the correlation exp(-distance / :data:`CORRELATED`), R. On
+# between :data:`SHIFT_NODES` along each side of the marker, accounts for it: both components have
+# the standard deviation s and the correlation exp(-distance / :data:`CORRELATED`), R. On
 # photographs a marker as a whole is shifted about as much as its parts are against each other,
 # and only the latter are in residuals. s² is estimated by moments: with D the levels' slopes by
 # the nodes' shifts after those by the fitted parameters have been eliminated, S = DᵀD, and u =
@@ -45,7 +740,7 @@ from sweep.typing import Floats
 # covariance matrix estimator and a direct test for heteroskedasticity", Econometrica 48, 1980,
 # for the form.
 
-NODES = 4
+SHIFT_NODES = 4
 """Nodes of the field of shifts along each side of the marker."""
 
 CORRELATED = 1.0
@@ -72,14 +767,14 @@ WIDE, RESIDUAL = 2 * TILE, POSE
 @compiled
 def _node(at: float) -> int:
     """Return the node before a coordinate from -1 to 1."""
-    return min(int(min(max(0.5 * (at + 1.0), 0.0), 1.0) * (NODES - 1)), NODES - 2)
+    return min(int(min(max(0.5 * (at + 1.0), 0.0), 1.0) * (SHIFT_NODES - 1)), SHIFT_NODES - 2)
 
 
 @compiled
 def _component(cell: int, k: int) -> int:
     """Return the number, among all components, of the k-th of those that a cell holds."""
-    row, column = cell // (NODES - 1), cell % (NODES - 1)
-    return 2 * ((row + k // 4) * NODES + column + k // 2 % 2) + k % 2
+    row, column = cell // (SHIFT_NODES - 1), cell % (SHIFT_NODES - 1)
+    return 2 * ((row + k // 4) * SHIFT_NODES + column + k // 2 % 2) + k % 2
 
 
 @compiled
@@ -88,12 +783,12 @@ def _write_shifts(
     columns: Floats, k: int,
 ) -> None:
     """Write the slopes by the components of a cell's nodes as columns (n, ...) from the k-th on."""
-    top, left = float(cell // (NODES - 1)), float(cell % (NODES - 1))
+    top, left = float(cell // (SHIFT_NODES - 1)), float(cell % (SHIFT_NODES - 1))
     scale = state[WHITE] - state[BLACK]
     for j in range(len(columns)):
         at_x, at_y = view.at[0, i, first + j], view.at[1, i, first + j]
-        right = min(max(0.5 * (at_x + 1.0), 0.0), 1.0) * (NODES - 1) - left
-        down = min(max(0.5 * (at_y + 1.0), 0.0), 1.0) * (NODES - 1) - top
+        right = min(max(0.5 * (at_x + 1.0), 0.0), 1.0) * (SHIFT_NODES - 1) - left
+        down = min(max(0.5 * (at_y + 1.0), 0.0), 1.0) * (SHIFT_NODES - 1) - top
         by_x, by_y = -scale * images[2, i, first + j], -scale * images[3, i, first + j]
         column = columns[j]
         column[k], column[k + 1] = (1 - down) * (1 - right) * by_x, (1 - down) * (1 - right) * by_y
@@ -112,7 +807,7 @@ def _run_of_a_cell(view: PhotographView, i: int, first: int, last: int) -> tuple
         and _node(view.at[0, i, stop]) == column and _node(view.at[1, i, stop]) == row
     ):
         stop += 1
-    return row * (NODES - 1) + column, stop
+    return row * (SHIFT_NODES - 1) + column, stop
 
 
 @compiled
@@ -140,7 +835,7 @@ def _products(
     Columns are those by the ``size`` parameters, the level, and those by the nodes' components.
     """
     tiles = (size + 1 + HELD + TILE - 1) // TILE
-    sums = np.zeros(((NODES - 1) ** 2, TILE * tiles, TILE * tiles))
+    sums = np.zeros(((SHIFT_NODES - 1) ** 2, TILE * tiles, TILE * tiles))
     columns = np.zeros((GROUP, TILE * tiles))
     for i in range(len(view.spans)):
         first, last = view.spans[i]
@@ -219,14 +914,14 @@ def _ratio(lagged: float, variance: float) -> float:
 @compiled
 def _correlations() -> Floats:
     """Return the correlations (n, n) of the components of the nodes' shifts."""
-    count = 2 * NODES * NODES
+    count = 2 * SHIFT_NODES * SHIFT_NODES
     correlations = np.zeros((count, count))
     for a in range(count):
         for b in range(count):
             if a % 2 == b % 2:
-                across = a // 2 % NODES - b // 2 % NODES
-                down = a // 2 // NODES - b // 2 // NODES
-                distance = 2.0 / (NODES - 1) * math.sqrt(across**2 + down**2)
+                across = a // 2 % SHIFT_NODES - b // 2 % SHIFT_NODES
+                down = a // 2 // SHIFT_NODES - b // 2 // SHIFT_NODES
+                distance = 2.0 / (SHIFT_NODES - 1) * math.sqrt(across**2 + down**2)
                 correlations[a, b] = math.exp(-distance / CORRELATED)
     return correlations
 
@@ -244,7 +939,7 @@ def judge(
     draw(view, state, work)
     size = MOVED + LINEAR
     height, width = view.levels.shape
-    pixels, nodes = pixel_count(view), 2 * NODES * NODES
+    pixels, nodes = pixel_count(view), 2 * SHIFT_NODES * SHIFT_NODES
     sums = _products(view, state, work.images, size)
     matrix, levels = np.zeros((size, size)), np.zeros((size, 1))
     crossed, inner, pull = np.zeros((size, nodes)), np.zeros((nodes, nodes)), np.zeros((nodes, 1))

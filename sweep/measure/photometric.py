@@ -27,9 +27,9 @@ from sweep.measure.likelihood import (
     WHITE,
     MarkerView,
     Pixels,
-    binned,
     binned_view,
     descend,
+    halve,
     is_before_camera,
     marker_view,
     middle_m,
@@ -46,12 +46,12 @@ from sweep.measure.likelihood import (
     turn_between,
     unit_of,
 )
-from sweep.measure.photograph import judge
-from sweep.measure.photograph_model import (
+from sweep.measure.photograph import (
     LINEAR,
     MOVED,
     PhotographView,
     binned_photograph,
+    judge,
     photograph_view,
     pixel_count,
     system,
@@ -248,7 +248,8 @@ def locate_exactly(
 ) -> tuple[Floats, float, bool, Floats, int]:
     """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
     freedom = known_pixels(image) - len(information) - LEVELS
-    small = binned(image)
+    small = np.empty((image.shape[0] // 2, image.shape[1] // 2))
+    halve(image, 0.25, small)
     found = locate(
         Pixels(image, squares(image), view),
         work_space(image.shape[0], image.shape[1]), freedom,

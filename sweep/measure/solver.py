@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from sweep.model.camera import Cameras
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import side_lengths, signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # OpenCV's solvers, and poses of N markers at once, from four corners each.
@@ -194,10 +194,7 @@ def _guarded(
     right = points[:, 1] + points[:, 2] - points[:, 0] - points[:, 3]
     roll = np.arctan2(right[:, 1], right[:, 0])
     turns = np.nan_to_num(np.round(roll / (np.pi / 2))).astype(np.int64) % 4
-    matrices = np.zeros((len(points), 3, 3))
-    matrices[:, 0, 0], matrices[:, 1, 1] = cameras.view[:, 0], cameras.view[:, 1]
-    matrices[:, 0, 2], matrices[:, 1, 2] = cameras.view[:, 2], cameras.view[:, 3]
-    matrices[:, 2, 2] = 1.0
+    matrices = np.array([cameras.matrix(i) for i in range(len(points))]).reshape(-1, 3, 3)
 
     rotation, translation = _solve_turned(points, matrices, turns, method)
     pinhole = Cameras(cameras.view, cameras.lenses, np.zeros(len(points), dtype=bool))
@@ -208,55 +205,45 @@ def _guarded(
     def errors(rows: NDArray[np.intp], r: Floats, t: Floats) -> Floats:
         return reprojection_errors_px(r, t, unit[rows], pixels[rows], pinhole.take(rows))
 
+    def solved(rows: NDArray[np.intp], turn: int, by: int) -> tuple[Floats, Floats, Floats]:
+        """Return other solutions, with the labels turned on, and the first ones' errors."""
+        others = _solve_turned(points[rows], matrices[rows], (turns[rows] + turn) % 4, by)
+        return *others, errors(rows, others[0][:, 0], others[1][:, 0])
+
+    def take(rows: NDArray[np.intp], better: Masks, others: tuple[Floats, Floats, Floats]) -> None:
+        chosen = rows[better]
+        rotation[chosen], translation[chosen], error[chosen] = (each[better] for each in others)
+
     error = errors(np.arange(len(points)), rotation[:, 0], translation[:, 0])
-    with np.errstate(invalid="ignore"):
-        doubtful = ~(error <= CREDIBLE_SHARE * side)
-    rows = np.flatnonzero(doubtful & known)
+    rows = np.flatnonzero(~(error <= CREDIBLE_SHARE * side) & known)
     if len(rows):
         for k in range(1, 4):
-            others = _solve_turned(points[rows], matrices[rows], (turns[rows] + k) % 4, method)
-            other = errors(rows, others[0][:, 0], others[1][:, 0])
-            with np.errstate(invalid="ignore"):
-                better = ~np.isfinite(error[rows]) & np.isfinite(other)
-            chosen = rows[better]
-            rotation[chosen], translation[chosen] = others[0][better], others[1][better]
-            error[chosen] = other[better]
+            others = solved(rows, k, method)
+            take(rows, ~np.isfinite(error[rows]) & np.isfinite(others[2]), others)
         if method != cv2.SOLVEPNP_ITERATIVE:
-            others = _solve_turned(
-                points[rows], matrices[rows], turns[rows], cv2.SOLVEPNP_ITERATIVE
-            )
-            other = errors(rows, others[0][:, 0], others[1][:, 0])
-            with np.errstate(invalid="ignore"):
-                better = ~(error[rows] <= CREDIBLE_RATIO * other) & np.isfinite(other)
-            chosen = rows[better]
-            rotation[chosen], translation[chosen] = others[0][better], others[1][better]
-            error[chosen] = other[better]
+            others = solved(rows, 0, cv2.SOLVEPNP_ITERATIVE)
+            worse = ~(error[rows] <= CREDIBLE_RATIO * others[2])
+            take(rows, worse & np.isfinite(others[2]), others)
     far = side < _FAR_SHARE * cameras.view[:, :2].min(axis=1)
     rows = np.flatnonzero((far | (method in ASTRAY_RATIO)) & known)
     if len(rows) and method != cv2.SOLVEPNP_IPPE:
-        others = _guarded(corners[rows], cameras.take(rows), unit[rows], cv2.SOLVEPNP_IPPE)
-        other = errors(rows, others[0][:, 0], others[1][:, 0])
+        turned, moved = _guarded(corners[rows], cameras.take(rows), unit[rows], cv2.SOLVEPNP_IPPE)
+        other = errors(rows, turned[:, 0], moved[:, 0])
         ratio = np.where(far[rows], _FAR_RATIO, ASTRAY_RATIO.get(method, np.inf))
         least = np.where(far[rows], 0.0, ASTRAY_SHARE * side[rows])
-        with np.errstate(invalid="ignore"):
-            better = ~(error[rows] <= np.maximum(ratio * other, least)) & np.isfinite(other)
+        better = ~(error[rows] <= np.maximum(ratio * other, least)) & np.isfinite(other)
         astray = np.flatnonzero(better & ~far[rows])
         if method == cv2.SOLVEPNP_ITERATIVE and len(astray):
             at = rows[astray]
             for k in range(2):
-                again = _iterated(
-                    points[at], matrices[at], others[0][astray, k], others[1][astray, k]
-                )
+                again = _iterated(points[at], matrices[at], turned[astray, k], moved[astray, k])
                 now = errors(at, *again)
-                with np.errstate(invalid="ignore"):
-                    lower = now < other[astray]
-                others[0][astray[lower], 0] = again[0][lower]
-                others[1][astray[lower], 0] = again[1][lower]
+                lower = now < other[astray]
+                turned[astray[lower], 0], moved[astray[lower], 0] = again[0][lower], again[1][lower]
                 other[astray[lower]] = now[lower]
-        chosen = rows[better]
-        rotation[chosen], translation[chosen] = others[0][better], others[1][better]
+        take(rows, better, (turned, moved, other))
         if method not in _TWO_SOLUTIONS:
-            rotation[chosen, 1], translation[chosen, 1] = np.nan, np.nan
+            rotation[rows[better], 1], translation[rows[better], 1] = np.nan, np.nan
     return rotation, translation * size_m[:, None, None]
 
 
@@ -447,17 +434,6 @@ MIN_POINTS = 4
 """The fewest points that a pose is estimated from."""
 
 
-def one_by_one(
-    detections: Detections, write: Callable[[Detections, int, Estimates], None]
-) -> Estimates:
-    """Return the estimates that ``write`` writes of each target, as the number that it gets."""
-    count = len(detections)
-    out = Estimates.none(count, EstimateStatus.solver_failed)
-    for i in range(count):
-        write(detections.take(np.array([i])), i, out)
-    return out
-
-
 class _Solution(NamedTuple):
     """A pose (3, 3), (3,) in metres, its reprojection error, and the points (k, 3) that gave it.
 
@@ -501,7 +477,10 @@ class PointSolver:
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with covariances if the corners' noise is given."""
         if not detections.are_markers:
-            return one_by_one(detections, self._estimate)
+            out = Estimates.none(len(detections), EstimateStatus.solver_failed)
+            for i in range(len(detections)):
+                self._estimate(detections.take(np.array([i])), i, out)
+            return out
         rotation, translation = square_poses(
             detections.corners, detections.cameras, detections.size_m, self.solver, self.guarded
         )

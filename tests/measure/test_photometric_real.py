@@ -14,7 +14,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import state_of
-from sweep.measure.photograph_model import draw, photograph_view, system
+from sweep.measure.photograph import draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
 from sweep.model.board import single_marker

@@ -26,7 +26,8 @@ from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import (
     SETTLED,
-    fit,
+    Pixels,
+    descend,
     marker_view,
     noise_variance,
     squares,
@@ -183,11 +184,12 @@ def chi_square_from(seen, rotation, translation):
         seen.targets[0], seen.size_m[0], seen.cameras.optics(0), seen.origins[0] + (left, top),
         noise_variance(float(seen.noise_grey[0])),
     )
-    chi_square, _ = fit(
-        image, squares(image), state_of(rotation, translation, seen.blur_px[0], np.zeros(LEVELS)),
-        view, work_space(*image.shape), 100, SETTLED, math.inf, np.empty((POSE, POSE)),
+    square_sum, _ = descend(
+        Pixels(image, squares(image), view),
+        state_of(rotation, translation, seen.blur_px[0], np.zeros(LEVELS)),
+        work_space(*image.shape), 1, 100, SETTLED, math.inf, np.empty((POSE, POSE)),
     )
-    return chi_square, image.size - POSE - LEVELS
+    return square_sum / view.variance, image.size - POSE - LEVELS
 
 
 def above_that_from_truth(cell, keeper):

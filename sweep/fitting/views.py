@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
-from sweep.measure.photograph_model import add_plane, slope_space
+from sweep.measure.photograph import add_plane, slope_space
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
 from sweep.model.board import Board
 from sweep.model.camera import Column

@@ -20,6 +20,7 @@ from sweep.experiment.parameters import (
 )
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.calibration import CalibrationError
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.model.effects import Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin
@@ -106,6 +107,26 @@ class Grid:
         sd, covariance = (self.fixed[name] for name in STATED)
         count = len(sd) or round(len(covariance) ** 0.5)
         return CalibrationError.of(sd, covariance, count - 4)
+
+    @property
+    def view(self) -> tuple[float, ...] | None:
+        """The numbers fx, fy, cx, cy of the camera, if there is a single one."""
+        if any(name not in self.fixed for name in VIEW_PARAMETERS):
+            return None
+        return tuple(map(float, intrinsics(*(self.fixed[name] for name in VIEW_PARAMETERS))))
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """The true value of each belief, None where it varies."""
+        names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
+        lens = self.fixed.get("distortion")
+        return {
+            **dict(zip(names, self.view or (None,) * 4, strict=True)),
+            "believed_focal_scale": 1.0,
+            "believed_distortion": None if lens is None else canonical_distortion(lens),
+            **{f"believed_{name}": self.fixed.get(name)
+               for name in ("size_m", "blur_px", "noise_grey")},
+        }
 
     def arrangements(self, names: Collection[str] = ARRANGING) -> Iterator[tuple[Any, ...]]:
         """Yield the values of `ARRANGING` of each combination of the axes of some parameters.

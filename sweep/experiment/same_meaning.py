@@ -15,7 +15,7 @@ from sweep.experiment.parameters import STATED
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS
-from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion
 
 # --------------------------------------------------------------------------------------------------
 # The settings that a configuration uses: an axis may hold others, which change nothing for it.
@@ -79,9 +79,6 @@ def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[
 # --------------------------------------------------------------------------------------------------
 # Values that mean the same in two pipelines: a belief that is not given, and the truth.
 
-FRAME = ("width_px", "height_px")
-
-
 def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
     """Return two pipelines with fixed values that are equal where they mean the same.
 
@@ -89,15 +86,22 @@ def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
     cells that both have are its. A camera's values may be given in other words, or by a file.
     """
     pair = first, second
-    views = [_view(pipeline) for pipeline in pair]
-    truth = next((_truth(pipeline, view) for pipeline, view in zip(pair, views, strict=True)
-                  if view is not None), {})
+    truth: dict[str, Any] = next((each.truth for each in pair if each.view is not None), {})
     ignored: dict[str, Any] = {"camera_file": None}
-    if views[0] is not None and views[0] == views[1]:
-        ignored |= {name: first.fixed[name] for name in VIEW_PARAMETERS if name not in FRAME}
+    if first.view is not None and first.view == second.view:
+        ignored |= {name: first.fixed[name] for name in VIEW_PARAMETERS
+                    if name not in ("width_px", "height_px")}
     if first.calibration is None and second.calibration is None:
         ignored |= dict.fromkeys(STATED, ())
-    return _with(first, truth, ignored), _with(second, truth, ignored)
+    changed = []
+    for pipeline in pair:
+        fixed = {name: ignored.get(name, value) for name, value in pipeline.fixed.items()}
+        for name in fixed.keys() & {"distortion", "believed_distortion"}:
+            if fixed[name] is not None:
+                fixed[name] = canonical_distortion(fixed[name])
+        fixed |= {name: truth[name] for name in fixed.keys() & truth.keys() if fixed[name] is None}
+        changed.append(dataclasses.replace(pipeline, fixed=fixed))
+    return changed[0], changed[1]
 
 
 def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
@@ -112,8 +116,7 @@ def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
     >>> wrong_beliefs(pipeline, pipeline.axes[0])
     (True, False)
     """
-    view = _view(pipeline)
-    truths = _truth(pipeline, view or (None,) * 4) | {"believed": "truth"}
+    truths = pipeline.truth | {"believed": "truth"}
     return tuple(
         any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
         for k in range(len(axis))
@@ -139,37 +142,3 @@ def _differs(believed: Any, truth: Any) -> bool:
     if isinstance(believed, str):
         return bool(believed != truth)
     return not math.isclose(believed, truth, rel_tol=1e-9)
-
-
-def _with(pipeline: Pipeline, truth: dict[str, Any], ignored: dict[str, Any]) -> Pipeline:
-    fixed = {**pipeline.fixed, **{name: value for name, value in ignored.items()
-                                  if name in pipeline.fixed}}
-    for name in ("distortion", "believed_distortion"):
-        if fixed.get(name) is not None:
-            fixed[name] = canonical_distortion(fixed[name])
-    fixed |= {name: value for name, value in truth.items()
-              if name in fixed and fixed[name] is None}
-    return dataclasses.replace(pipeline, fixed=fixed)
-
-
-def _view(pipeline: Pipeline) -> tuple[float, ...] | None:
-    """Return fx, fy, cx, cy of a pipeline that has a single camera."""
-    if any(name not in pipeline.fixed for name in VIEW_PARAMETERS):
-        return None
-    numbers = intrinsics(*(pipeline.fixed[name] for name in VIEW_PARAMETERS))
-    return tuple(float(number) for number in numbers)
-
-
-def _truth(pipeline: Pipeline, view: tuple[float | None, ...]) -> dict[str, Any]:
-    """Return the true value of each belief, None where it varies."""
-    fixed = pipeline.fixed
-    names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
-    lens = fixed.get("distortion")
-    return {
-        **dict(zip(names, view, strict=True)),
-        "believed_focal_scale": 1.0,
-        "believed_distortion": None if lens is None else canonical_distortion(lens),
-        "believed_size_m": fixed.get("size_m"),
-        "believed_blur_px": fixed.get("blur_px"),
-        "believed_noise_grey": fixed.get("noise_grey"),
-    }

@@ -45,7 +45,8 @@ from sweep.evaluation.variables import (
     write,
 )
 from sweep.experiment.draws import CALIBRATED
-from sweep.experiment.grid import Block, Experiment, block_indices
+from sweep.experiment.experiment import Experiment
+from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bounds, outside_model

@@ -19,7 +19,7 @@ from sweep.evaluation.search import (
     search_windows,
     whole_frames,
 )
-from sweep.experiment.grid import Experiment
+from sweep.experiment.experiment import Experiment
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import SearchOutput

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.machine_faults import raise_machine_fault
-from sweep.experiment.experiment import Grid
-from sweep.experiment.grid import Block, Experiment
+from sweep.experiment.experiment import Experiment
+from sweep.experiment.grid import Block, Grid
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import Variable
 from sweep.typing import Floats

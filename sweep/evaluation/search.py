@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.results import Failure, all_or_each, note_failure
-from sweep.experiment.grid import Experiment
+from sweep.experiment.experiment import Experiment
 from sweep.measure.classify import Findings, TargetScenes, classify, target_scenes
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,

@@ -48,7 +48,7 @@ class ImageBatch:
     numbers
         (N,) places in the grid of scene axes, the last axis fastest.
     keys
-        (N,) keys of the images (:func:`sweep.experiment.grid.image_keys`).
+        (N,) keys of the images (:func:`sweep.experiment.experiment.Experiment.image_keys`).
     scenes, targets, values
         Geometry, what is shown, and parameters.
     visible

@@ -27,7 +27,7 @@ from sweep.experiment.axes import (
     zipped_axis,
 )
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.experiment import Grid
+from sweep.experiment.grid import Grid
 from sweep.experiment.parameters import (
     EFFECTS_KEY,
     NAMED_BY,

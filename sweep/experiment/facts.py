@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.experiment.grid import Experiment
+from sweep.experiment.experiment import Experiment
 from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, STATED, WORLD
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,

@@ -1,47 +1,192 @@
-"""Pieces of the grid: blocks of scene cells, every parameter's values on them."""
+"""The grid: the value, axis or distribution of every parameter; its blocks of scene cells."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from functools import cached_property, partial
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import TRIAL, Axis, combinations
-from sweep.experiment.draws import (
-    CALIBRATED,
-    bits,
-    calibrated_columns,
-    even_uniform,
-    geometry_keys,
-    hashed,
-    jointly_drawn,
-    key_texts,
-    resolve_pose,
-    uniform,
+from sweep.experiment.axes import Axis, Distribution, combinations
+from sweep.experiment.parameters import (
+    PHOTOGRAPHS,
+    SIMULATED,
+    STATED,
+    Parameter,
+    Stage,
+    parameters_with,
 )
-from sweep.experiment.experiment import (
-    Grid,
-    effect_of,
-    imported,
-)
-from sweep.experiment.parameters import PARAMETERS, Stage
-from sweep.experiment.photographs import recorded_poses
-from sweep.experiment.schema import Variable, drawn_variables, variables_of
-from sweep.measure.bound import BoundSetting
-from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
-from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
-from sweep.model.board_kinds import ARRANGING, arranged_board
-from sweep.model.camera import Column, canonical_distortion, map_columns
-from sweep.model.effects import EFFECTS, Effect, ScenePlugins
-from sweep.plugins.declared import DeclaredPlugin, PluginSetting
-from sweep.typing import Floats
+from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
+from sweep.model.calibration import CalibrationError
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.plugins.declared import DeclaredPlugin
+
+# --------------------------------------------------------------------------------------------------
+# What a document and the pipeline that is read from it have in common: values on a grid.
+
+@dataclass(frozen=True)
+class Grid:
+    """The value, the axis or the distribution of every parameter.
+
+    Attributes
+    ----------
+    seed, sampling
+        The seed of all random draws, and how those of a cell's trials relate
+        (:data:`sweep.experiment.draws.SAMPLINGS`).
+    fixed
+        Value of every parameter that is neither an axis nor drawn.
+    given
+        Names of the parameters that the document has, even with a value that cannot be.
+    distributions
+        Distribution of every parameter that is drawn per trial.
+    axes
+        The grid's dimensions, in the document's order.
+    plugins
+        The plug-ins that the document names.
+    files
+        Path as written -> SHA-256 of every file that the document refers to.
+    folder
+        Where relative paths start.
+    """
+
+    seed: int
+    sampling: str
+    fixed: Mapping[str, Any]
+    given: AbstractSet[str]
+    distributions: dict[str, Distribution]
+    axes: Sequence[Axis]
+    plugins: tuple[DeclaredPlugin, ...]
+    files: Mapping[str, str]
+    folder: str
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Every parameter by its name: our own, and the settings of its plug-ins."""
+        return parameters_with(self.plugins)
+
+    def plugin(self, kind: str, name: str) -> DeclaredPlugin | None:
+        """Return the plug-in of a kind by its name; None if it is not one of the document's."""
+        return next((p for p in self.plugins if (p.kind, p.name) == (kind, name)), None)
+
+    def axis(self, name: str) -> Axis | None:
+        """Return an axis by name."""
+        return next((axis for axis in self.axes if axis.name == name), None)
+
+    def axis_of(self, parameter: str) -> Axis | None:
+        """Return the axis along which a parameter varies, alone or together with others."""
+        return next((axis for axis in self.axes if parameter in axis.columns), None)
+
+    def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
+        """Return the axes that bind to the given stages, in the document's order."""
+        return tuple(axis for axis in self.axes if axis.stage in stages)
+
+    def size(self, *stages: Stage) -> int:
+        """Return the number of grid points over the axes of the given stages."""
+        return math.prod(len(axis) for axis in self.axes_of(*stages))
+
+    def values_of(self, name: str) -> Sequence[Any]:
+        """Return the values of a parameter on the grid; empty if it is drawn, or at fault."""
+        axis = self.axis_of(name)
+        if axis is not None:
+            return axis.columns[name]
+        return (self.fixed[name],) if name in self.fixed else ()
+
+    def any_value(self, name: str, condition: Callable[[Any], bool]) -> bool:
+        """Return whether a parameter takes a value for which ``condition`` holds."""
+        return any(condition(value) for value in self.values_of(name) if value is not None)
+
+    @property
+    def calibration(self) -> CalibrationError | None:
+        """The error of the calibration that an estimator believes; None if none does."""
+        if "calibration" not in self.values_of("believed"):
+            return None
+        sd, covariance = (self.fixed[name] for name in STATED)
+        count = len(sd) or round(len(covariance) ** 0.5)
+        return CalibrationError.of(sd, covariance, count - 4)
+
+    @property
+    def view(self) -> tuple[float, ...] | None:
+        """The numbers fx, fy, cx, cy of the camera, if there is a single one."""
+        if any(name not in self.fixed for name in VIEW_PARAMETERS):
+            return None
+        return tuple(map(float, intrinsics(*(self.fixed[name] for name in VIEW_PARAMETERS))))
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """The true value of each belief, None where it varies."""
+        names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
+        lens = self.fixed.get("distortion")
+        return {
+            **dict(zip(names, self.view or (None,) * 4, strict=True)),
+            "believed_focal_scale": 1.0,
+            "believed_distortion": None if lens is None else canonical_distortion(lens),
+            **{f"believed_{name}": self.fixed.get(name)
+               for name in ("size_m", "blur_px", "noise_grey")},
+        }
+
+    def arrangements(self, names: Collection[str] = ARRANGING) -> Iterator[tuple[Any, ...]]:
+        """Yield the values of `ARRANGING` of each combination of the axes of some parameters.
+
+        Those along other axes have their first value.
+        """
+        first = {name: self.values_of(name)[0] for name in ARRANGING}
+        axes = [axis for axis in self.axes if not set(axis.columns).isdisjoint(names)]
+        for chosen in combinations(axes):
+            board = first | chosen
+            yield tuple(board[name] for name in ARRANGING)
+
+    @property
+    def shows_boards(self) -> bool:
+        """Whether scenes show boards, or something beside a marker; all markers are boards then."""
+        return any(self.values_of("distractors")) or self.any_value(
+            "kind", lambda kind: kind != SINGLE)
+
+    @property
+    def target_word(self) -> str:
+        """What the scenes show, in a word: marker, board, or target if both."""
+        if not self.shows_boards:
+            return "marker"
+        return "target" if self.any_value("kind", lambda kind: kind == SINGLE) else "board"
+
+    @cached_property
+    def largest_board(self) -> tuple[int, int]:
+        """The most markers and the most chessboard corners of a target."""
+        if not self.shows_boards:
+            return 1, 0
+        markers, corners = zip(
+            *(arranged(values).counts for values in self.arrangements(_SIZED_BY)), strict=True)
+        return max(markers), max(corners)
+
+    @property
+    def relative_sizes(self) -> tuple[float, float]:
+        """The least and the largest side of a marker over ``size_m``: listed ones have own."""
+        listed = [
+            each.size_m / values[ARRANGING.index("size_m")]
+            for values in self.arrangements(("kind", "size_m", "markers"))
+            if isinstance(board := arranged(values), Markers) for each in board.markers
+        ] if self.any_value("markers", bool) else []
+        return min(listed, default=1.0), max(listed, default=1.0)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether images are simulated at the poses of photographs."""
+        return self.fixed.get(SIMULATED) is True
+
+    @property
+    def shows_photographs(self) -> bool:
+        """Whether the images are photographs, not simulated at their poses."""
+        return PHOTOGRAPHS in self.given and not self.is_simulated
+
+
+_SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_pattern", "tagCols",
+             "tagRows", "markers")
+"""The parameters that a board's numbers of markers and corners depend on."""
+
 
 # --------------------------------------------------------------------------------------------------
 # Pieces of the grid: blocks of scene cells, and every parameter's values on them.
@@ -117,255 +262,9 @@ class Blocks:
         return int(np.ravel_multi_index(index, self.counts)) if index else 0
 
 
-def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
-    """Return a parameter's values along an axis at indices (N,)."""
-    low, high = int(indices.min()), int(indices.max()) + 1
-    part = values[low:high]
-    if isinstance(part, range):
-        return Column.of(part.start + part.step * (indices - low))
-    if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
-        return Column.of(np.asarray(part, dtype=np.float64)[indices - low])
-    return Column.of([part[i] for i in (indices - low).tolist()])
-
-
-ANY_MARKER = {
-    name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
-}
-"""Values of what differs from marker to marker in a photograph, as if it did not."""
-
-
-def _absolute(folder: str, background: Any) -> Any:
-    """Return an image's absolute path; a grey level as it is."""
-    return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
-
-
 def block_indices(block: Block) -> list[NDArray[np.intp]]:
     """Return the indices (N,) of a block's cells along each scene axis, the last fastest."""
     grids = np.meshgrid(
         *(np.arange(a, b) for a, b in zip(block.starts, block.stops, strict=True)), indexing="ij"
     )
     return [grid.ravel() for grid in grids]
-
-
-OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
-BOARD_FIELDS = tuple(field.name for field in dataclasses.fields(BoardDetectorSetting))
-ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))
-
-NOT_IN_IMAGE = {
-    "window", "camera_file", "calibration_sd", "calibration_covariance",
-    *(field.name for field in dataclasses.fields(BoundSetting)),
-}
-"""Parameters of the scene's stage that do not change its image."""
-
-
-TARGET_SECTIONS = ("marker", "board", "target")
-"""Sections of a pipeline whose parameters tell targets apart."""
-
-
-# --------------------------------------------------------------------------------------------------
-# The experiment: what a pipeline asks for, resolved once in each process.
-
-class Experiment:
-    """What follows from a checked pipeline: axes, draws, settings and variables, resolved once.
-
-    Attributes
-    ----------
-    grid
-        The values, axes and distributions of the pipeline.
-    """
-
-    def __init__(self, grid: Grid) -> None:
-        self.grid = grid
-
-    @cached_property
-    def scene_axes(self) -> tuple[Axis, ...]:
-        """The axes that blocks are cut along."""
-        return self.grid.axes_of(Stage.scene)
-
-    @cached_property
-    def target_axes(self) -> tuple[Axis, ...]:
-        """The axes along which targets differ by more than a number: compared, never averaged."""
-        return tuple(
-            axis for axis in self.scene_axes
-            if len(axis) > 1 and axis.name != TRIAL and not axis.is_numeric and any(
-                PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
-                if name in PARAMETERS))
-
-    @cached_property
-    def detectors(self) -> list[AnyDetectorSetting]:
-        """The detector settings, in the order of the detection axes."""
-        return [
-            DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
-            if (plugin := self.grid.plugin("detector", values["detector"])) is None
-            else self._plugged(plugin, values)
-            for values in self._settings("detector", Stage.detection)
-        ]
-
-    @cached_property
-    def board_settings(self) -> list[BoardDetectorSetting]:
-        """What the detector settings do with boards, in their order."""
-        return [
-            BoardDetectorSetting(**{name: values[name] for name in BOARD_FIELDS})
-            for values in self._settings("detector", Stage.detection)
-        ]
-
-    @cached_property
-    def estimators(self) -> list[EstimatorSetting]:
-        """The estimators, in the order of the estimation axes."""
-        return [
-            EstimatorSetting(**common)
-            if (plugin := self.grid.plugin("estimator", values["solver"])) is None
-            else PluggedEstimatorSetting(**common, own=self._plugged(plugin, values))
-            for values in self._settings("estimator", Stage.estimation)
-            for common in [{name: values[name] for name in ESTIMATOR_FIELDS}]
-        ]
-
-    def _settings(self, section: str, stage: Stage) -> list[dict[str, Any]]:
-        """Return the values of a section at all combinations of a stage's axes, in their order."""
-        fixed = {
-            p.name: self.grid.fixed.get(p.name, p.default)
-            for p in self.grid.parameters.values() if p.section == section
-        }
-        return [fixed | chosen for chosen in combinations(self.grid.axes_of(stage))]
-
-    def _plugged(self, plugin: DeclaredPlugin, values: Mapping[str, Any]) -> PluginSetting:
-        own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
-        return PluginSetting(plugin, own, self.grid.folder)
-
-    @cached_property
-    def effects(self) -> tuple[Effect, ...]:
-        """The built-in effects and those of plug-ins, which are not imported for it."""
-        return (*EFFECTS, *(effect_of(each) for each in self.grid.plugins if each.kind == "effect"))
-
-    @property
-    def scene_plugins(self) -> ScenePlugins:
-        """What plug-ins add to the scenes, imported.
-
-        Raises
-        ------
-        PluginError
-            If one is not the plug-in that was declared; in one line.
-        """
-        return imported(self.grid.plugins, self.grid.folder)
-
-    @cached_property
-    def variables(self) -> tuple[Variable, ...]:
-        """The variables of the dataset: the schema's, then draws."""
-        return variables_of(self.grid)
-
-    @cached_property
-    def drawn(self) -> tuple[Variable, ...]:
-        """Those of them that hold what is drawn for each scene."""
-        return drawn_variables(self.grid)
-
-    def bytes_of(self, scenes: int) -> int:
-        """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
-        return scenes * sum(
-            variable.configurations(self.grid) * math.prod(variable.inner_shape)
-            * np.dtype(variable.dtype).itemsize for variable in self.variables)
-
-    @cached_property
-    def _constants(self) -> dict[str, Column]:
-        """The scene's parameters that are fixed."""
-        return {
-            name: Column(value, constant=True) for name, value in self.grid.fixed.items()
-            if self.grid.parameters[name].stage is Stage.scene
-        }
-
-    def scene_values(self, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
-        """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
-
-        Random ones are drawn (those of later stages too), the pose is resolved, lenses are
-        canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
-        """
-        grid = self.grid
-        count = len(indices[0]) if self.scene_axes else 1
-        values = dict(self._constants)
-        for axis, index in zip(self.scene_axes, indices, strict=True):
-            for name, along in axis.columns.items():
-                values[name] = _column(along, index)
-        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
-        values["distortion"] = values["distortion"].map(canonical_distortion)
-        if grid.shows_boards:
-            values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
-        drawn = grid.distributions
-        if "background" not in drawn:
-            values["background"] = values["background"].map(partial(_absolute, grid.folder))
-        jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
-        values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
-        noisy = any(
-            effect.switch in drawn or values[effect.switch].differs_from(effect.off)
-            for effect in self.effects if effect.random
-        )
-        poses = {} if values["photographs"].missing else self._photographed(values, trials)
-        if grid.shows_photographs:
-            return values | poses
-        calibration = grid.calibration
-        if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
-            resolve_pose(values)
-            return values | poses
-        keys = geometry_keys(values, drawn, count)
-        draw: Callable[..., Floats] = uniform
-        if grid.sampling == "sobol":
-            calibrated = () if calibration is None else calibration.names
-            quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
-            draw = partial(even_uniform, quantities=quantities)
-        # What is drawn for a photograph is the same for all its markers; their noise is not.
-        shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
-        for name, distribution in drawn.items():
-            number = draw(grid.seed, name, keys=shared, trials=trials)
-            values[name] = Column.of(distribution.at(number))
-        if (jitter > 0).any():
-            for name in ("shift_u_px", "shift_v_px"):
-                number = draw(grid.seed, name, keys=keys, trials=trials)
-                values[name] = Column.of(jitter * (2 * number - 1))
-        if calibration is not None:
-            values |= calibrated_columns(
-                calibration, values, count,
-                lambda quantity: draw(grid.seed, quantity, keys=keys, trials=trials),
-            )
-        if noisy:
-            values["noise_key"] = Column.of(bits(grid.seed, "noise", keys, trials))
-        resolve_pose(values)
-        return values | poses
-
-    def _photographed(
-        self, values: Mapping[str, Column], trials: NDArray[np.int64]
-    ) -> dict[str, Column]:
-        """Return the parameters of scenes at the poses of photographs ``trials`` (N,)."""
-        names = values["photographs"].listed(len(trials))
-        ids = values["marker_id"].broadcast(len(trials), np.int64)
-        poses = recorded_poses(
-            names, self.grid.folder, trials, ids, simulated=self.grid.is_simulated
-        )
-        return {name: Column.of(column) for name, column in poses.items()}
-
-    # A key of each image: a function of its scene's own parameters and draws, not of the grid.
-    #
-    # By it an image that was exported is recognised again: on another grid that has the same
-    # scene, or as a single cell. Keys are hashes of the texts of all parameters that change the
-    # image, sorted by name, defaults left out, numbers rounded to 12 significant digits, mixed
-    # with the seed and the trial.
-
-    def image_keys(self, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
-        """Return the keys (N,) of the images of scenes at ``indices`` (N,) along the scene axes."""
-        grid = self.grid
-        count = len(indices[0]) if self.scene_axes else 1
-        values = dict(self._constants)
-        for axis, index in zip(self.scene_axes, indices, strict=True):
-            for name, along in axis.columns.items():
-                values[name] = Column.of([along[i] for i in index.tolist()])
-        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
-        if "background" in values:  # an image is known by its content
-            values["background"] = values["background"].map(
-                lambda value: grid.files.get(value) or value)
-        texts = [
-            key_texts(name, values[name], grid.parameters[name].default)
-            for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())
-        ]
-        texts += [
-            Column.of(f"{name}={distribution}")
-            for name, distribution in sorted(grid.distributions.items())
-            if grid.parameters[name].stage is Stage.scene
-        ]
-        return bits(grid.seed, f"image {grid.sampling}", hashed(texts, count), trials)

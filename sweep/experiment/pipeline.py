@@ -26,9 +26,9 @@ from sweep.experiment.document import (
     section_of,
     toml_item,
 )
-from sweep.experiment.experiment import Grid
+from sweep.experiment.experiment import Experiment
 from sweep.experiment.facts import Facts
-from sweep.experiment.grid import Experiment
+from sweep.experiment.grid import Grid
 from sweep.experiment.parameters import (
     EFFECTS_KEY,
     NAMED_BY,

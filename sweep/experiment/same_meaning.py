@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sweep.experiment.axes import Axis
-from sweep.experiment.experiment import Grid
-from sweep.experiment.grid import OPENCV_FIELDS
+from sweep.experiment.experiment import OPENCV_FIELDS
+from sweep.experiment.grid import Grid
 from sweep.experiment.parameters import STATED
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import OPENCV

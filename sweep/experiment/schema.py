@@ -30,7 +30,7 @@ from sweep.model.calibration import VIEW
 if TYPE_CHECKING:
     import xarray as xr
 
-    from sweep.experiment.experiment import Grid
+    from sweep.experiment.grid import Grid
 
 
 # --------------------------------------------------------------------------------------------------

@@ -93,7 +93,7 @@ class _Poison:
         self._real = {name: getattr(home, name) for name, home in homes.items()}
         for name, home in homes.items():
             setattr(home, name, getattr(self, name))
-        from sweep.experiment.grid import Experiment  # noqa: PLC0415
+        from sweep.experiment.experiment import Experiment  # noqa: PLC0415
 
         self._real["scene_values"] = Experiment.scene_values
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import interpolate, special
+from scipy import special
 
-from sweep.analysis.intervals import LEVEL, TAIL
+from sweep.analysis.intervals import TAIL
 from sweep.errors import ArgumentError
 from sweep.fitting.photograph_fit import (
     ALONG_MODULES,
@@ -35,10 +35,13 @@ from sweep.model.board import Board
 from sweep.model.derivatives import POSE
 from sweep.photographs.pose_fit import fit_pose
 from sweep.photographs.truth import marker_frames
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Means over photographs, each of which is one draw, and their intervals.
+
+SAID = 5
+"""Photographs from one line of progress to the next."""
 
 MIN_PHOTOGRAPHS = 4
 """Photographs from which intervals are given: with three, Student's are 2.5 standard deviations of
@@ -86,6 +89,23 @@ def estimate(values: Floats) -> Estimate:
     return Estimate(mean, mean - half, mean + half)
 
 
+def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estimate]:
+    """Return estimates of a function (k,) of photographs, by leaving each of them out.
+
+    ``function`` takes the numbers of those that count. The interval is that of the pseudo-values.
+    """
+    every = np.arange(count)
+    whole = function(every)
+    if count < MIN_PHOTOGRAPHS:
+        return [Estimate(value) for value in whole.tolist()]
+    without = np.array([function(np.delete(every, k)) for k in range(count)])
+    spread = [estimate(each) for each in (count * whole - (count - 1) * without).T]
+    return [
+        Estimate(value, value + each.low - each.value, value + each.high - each.value)
+        for value, each in zip(whole.tolist(), spread, strict=True)
+    ]
+
+
 # --------------------------------------------------------------------------------------------------
 # The fits of all photographs: which effects there are.
 
@@ -95,36 +115,42 @@ class CameraFit:
 
     Attributes
     ----------
-    fits
-        One of each photograph in which a marker could be fitted.
-    tested
-        Estimates of (variance, amount, bloom) while all of them were fitted: what is absent is
-        judged by these.
+    fits, tested_fits
+        One of each photograph in which a marker could be fitted: with what is kept, and with all
+        effects.
     kept
-        (3,) which of these are kept.
-    tested_fits
-        The fits of which ``tested`` is.
+        (3,) which of variance, amount and bloom are kept.
     """
 
     fits: tuple[PhotographFit, ...]
-    tested: tuple[Estimate, ...]
-    kept: Masks
     tested_fits: tuple[PhotographFit, ...]
+    kept: Masks
+
+    @property
+    def tested(self) -> list[Estimate]:
+        """Estimates of (variance, amount, bloom) of all effects: what is absent is judged so."""
+        return [estimate(each) for each in np.transpose([fit.parameters for fit in
+                                                         self.tested_fits])]
 
     @property
     def estimates(self) -> list[Estimate]:
         """Estimates of (variance, amount, bloom); of what is not kept those tested."""
+        found = np.transpose([fit.parameters for fit in self.fits])
         return [
-            estimate(np.array([fit.parameters[k] for fit in self.fits])) if self.kept[k] else one
-            for k, one in enumerate(self.tested)
+            estimate(each) if kept else tested
+            for each, kept, tested in zip(found, self.kept, self.tested, strict=True)
         ]
+
+
+Say = Callable[[str], None]
+"""Is told, in a line, how far a fit is."""
 
 
 def fit_camera(
     photographs: Sequence[FittedPhotograph], without: Collection[int] = (),
-    known: Sequence[PhotographFit] = (),
-) -> CameraFit:
-    """Return the fit of a camera's photographs.
+    known: Sequence[PhotographFit] = (), say: Say = lambda _: None,
+) -> CameraFit | None:
+    """Return the fit of a camera's photographs; None if no marker fits.
 
     Parameters
     ----------
@@ -134,25 +160,30 @@ def fit_camera(
         Parameters that are left out whatever their intervals: of AMOUNT and BLOOM.
     known
         Fits of all effects of these photographs, which are then not made again.
+    say
+        Is told how many photographs are fitted.
     """
     every = np.ones(len(START), dtype=bool)
-    fits = tuple(known) or _fitted(photographs, every, START)
-    tested = tuple(
-        estimate(np.array([fit.parameters[k] for fit in fits])) for k in range(len(START))
-    )
+    fits = tuple(known) or _fitted(photographs, every, START, say)
+    if not fits:
+        return None
+    tested = CameraFit(fits, fits, every).tested
     kept = np.array([each.excludes(0.0) or not each.judged for each in tested])
     kept[list(without)] = False
     start = START.copy()
     if not (kept[VARIANCE] and tested[VARIANCE].value > 0):
         kept[VARIANCE], start[VARIANCE] = False, 0.0
-    chosen = fits if kept.all() else _fitted(photographs, kept, start)
-    return CameraFit(chosen, tested, kept, fits)
+    return CameraFit(fits if kept.all() else _fitted(photographs, kept, start, say), fits, kept)
 
 
 def _fitted(
-    photographs: Sequence[FittedPhotograph], moved: Masks, start: Floats
+    photographs: Sequence[FittedPhotograph], moved: Masks, start: Floats, say: Say
 ) -> tuple[PhotographFit, ...]:
-    fits = [fit_photograph(each, moved, start) for each in photographs]
+    fits = []
+    for number, each in enumerate(photographs):
+        if number % SAID == 0:
+            say(f"fitting photograph {number + 1} of {len(photographs)}")
+        fits.append(fit_photograph(each, moved, start))
     return tuple(each for each in fits if each is not None)
 
 
@@ -208,24 +239,20 @@ def edge_field(shifts: Sequence[EdgeShifts], module_px: float) -> EdgeField:
     sums = sums[(sums[:, 1] > 0) & (sums[:, 3] > 0)]
     variance, covariance = _edge_means()
 
-    def length(rows: Floats) -> float:
-        squares, edges, products, pairs = rows.sum(axis=0).tolist()
-        ratio = products / pairs / (squares / edges) if squares > 0 else 0.0
-        return float(np.interp(ratio, covariance / variance, EDGE_LENGTHS))
-
     if not len(sums):
         return EdgeField(Estimate(math.nan), Estimate(math.nan))
-    whole, count = length(sums), len(sums)
-    # Jackknife: pseudo-values of the photographs.
-    each = np.array([
-        count * whole - (count - 1) * length(np.delete(sums, k, axis=0)) for k in range(count)
-    ]) if count > 1 else np.array([whole])
-    spread = estimate(each)
-    share = float(np.interp(whole, EDGE_LENGTHS, variance))
+
+    def logarithm(rows: Integers) -> Floats:
+        squares, edges, products, pairs = sums[rows].sum(axis=0).tolist()
+        ratio = products / pairs / (squares / edges) if squares > 0 else 0.0
+        return np.log([np.interp(ratio, covariance / variance, EDGE_LENGTHS)])
+
+    (length,) = jackknife(logarithm, len(sums))
+    length = length.mapped(math.exp)
+    share = float(np.interp(length.value, EDGE_LENGTHS, variance))
     return EdgeField(
         estimate(sums[:, 0] / sums[:, 1] / share),
-        Estimate(whole, max(spread.low, EDGE_LENGTHS[0]), min(spread.high, EDGE_LENGTHS[-1]))
-        .mapped(lambda modules: max(modules * module_px, 1.0)),
+        length.mapped(lambda modules: max(modules * module_px, 1.0)),
     )
 
 
@@ -235,22 +262,16 @@ def edge_field(shifts: Sequence[EdgeShifts], module_px: float) -> EdgeField:
 # The fitted corners of a photograph's markers minus those of the board's pose, fitted to the same
 # corners, are (1 - P) (shifts + noise), P being the projection on what a pose explains. The
 # shifts are a Gaussian field of covariance s² exp(-d² / (2 l²)), as
-# :mod:`sweep.model.scene_sheet` draws it. Two sums of squares say s and l (the method of
+# ``geometry_px`` has it in scenes. Two sums of squares say s and l (the method of
 # moments): that of the markers' centres, and that of their corners beside the centres, which turn
 # a pose. The farther the field reaches, the smaller is the second one beside the first.
 #
-# Their covariance follows from the field, too: that of xᵀAx and xᵀBx is 2 tr(AVBV) for normal x
-# of covariance V (Searle, "Linear Models", 1971, section 2.5). The interval has the sizes and
-# lengths that the logarithms of the sums do not refuse. An interval from the spread of the sums
-# would end too early where they are small: their spread is then small, too.
+# The intervals are the jackknife's by photograph, of logarithms (Efron and Stein, "The jackknife
+# estimate of variance", Annals of Statistics 9, 1981).
 
 LENGTHS = np.geomspace(0.01, 0.4, 24)
 """Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
 longer ones: their size cannot be said."""
-
-SIZES_PX, FINER = np.geomspace(3e-3, 10.0, 400), 8
-"""Sizes that are tried for the interval, and how many lengths from one of :data:`LENGTHS` to the
-next."""
 
 CELLS = 6
 """Cells along each side of a marker in which the field is taken as constant."""
@@ -265,18 +286,14 @@ class Residuals:
 
     Attributes
     ----------
-    squares, noise
-        (2,) px², and what the pixels' noise is expected to add to them.
+    squares
+        (2,) px², beyond what the pixels' noise and single edges are expected to add to them.
     fields
         (2, lengths) what a field of standard deviation 1 px adds, for each of :data:`LENGTHS`.
-    covariance
-        (3, lengths, 2, 2) of both sums: of the noise alone, and the factors of s² and s⁴.
     """
 
     squares: Floats
-    noise: Floats
     fields: Floats
-    covariance: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -360,34 +377,26 @@ def residuals_of(
     points = np.concatenate([each.points for each in corners])
     distances = ((points[:, None] - points[None]) ** 2).sum(axis=2)
 
-    def shifted(covariance: Floats) -> Floats:
-        return np.asarray(sum(each @ covariance @ each.T for each in moved))
+    forms = [part.T @ part for part in parts]
+
+    def sums(covariance: Floats) -> Floats:
+        """Return what a field of shifts adds to both sums of squares."""
+        shifted = sum(each @ covariance @ each.T for each in moved)
+        return np.array([float((form * shifted).sum()) for form in forms])
 
     cell_px = float(np.mean([
         state.marker.modules * state.marker.module_px for state in states
     ])) / CELLS
-    added = noises.reshape(size, size) + shifted(edges.covariance(distances, cell_px))
-    forms = [part.T @ part for part in parts]
-    by_noise = [form @ added for form in forms]
-    fields, covariance = np.empty((2, len(LENGTHS))), np.empty((3, len(LENGTHS), 2, 2))
-    for k, length in enumerate(LENGTHS * width_px):
-        moving = shifted(np.exp(-0.5 * distances / length**2))
-        by_field = [form @ moving for form in forms]
-        fields[:, k] = [np.trace(each) for each in by_field]
-        mixed = _traces(by_noise, by_field)
-        covariance[:, k] = (
-            _traces(by_noise, by_noise), mixed + mixed.T, _traces(by_field, by_field)
-        )
+    added = sums(edges.covariance(distances, cell_px)) + [
+        float((form * noises.reshape(size, size)).sum()) for form in forms
+    ]
     flat = shifts.ravel()
     return Residuals(
-        np.array([flat @ form @ flat for form in forms]),
-        np.array([np.trace(each) for each in by_noise]), fields, covariance,
+        np.array([flat @ form @ flat for form in forms]) - added,
+        np.stack([
+            sums(np.exp(-0.5 * distances / length**2)) for length in LENGTHS * width_px
+        ], axis=1),
     )
-
-
-def _traces(first: Sequence[Floats], second: Sequence[Floats]) -> Floats:
-    """Return twice the traces (2, 2) of the products of two matrices with two others."""
-    return np.array([[2.0 * float((one * other.T).sum()) for other in second] for one in first])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -409,90 +418,29 @@ class Shifts:
 
 def shifts_of(residuals: Sequence[Residuals], width_px: float) -> Shifts:
     """Return the field of shifts that has the sums of squares of n photographs' residuals."""
-    total = Residuals(*(
-        np.sum([getattr(each, name) for each in residuals], axis=0)
-        for name in ("squares", "noise", "fields", "covariance")
-    ))
-    size, length = _matched(total.squares - total.noise, total.fields)
-    first, last = np.log(LENGTHS[[0, -1]]).tolist()
-    finer = np.linspace(first, last, FINER * (len(LENGTHS) - 1) + 1)
-    expected, covariance = _expected(total, SIZES_PX[:, None], finer)
-    refused = _distance(
-        np.log(total.squares / expected),
-        covariance / (expected[..., None] * expected[..., None, :]),
-    ) / _excess(residuals, math.exp(size), length)
-    limit = float(special.chdtri(1, 1 - LEVEL))
-    sizes, lengths = (
-        Estimate(value, *_ends(grid, refused.min(axis=axis), limit)).mapped(math.exp)
-        for value, grid, axis in ((size, np.log(SIZES_PX), 1), (length, finer, 0))
-    )
-    return Shifts(sizes, lengths.mapped(lambda share: share * width_px), np.array([
-        float((each.squares - each.noise).sum()) / np.interp(
-            length, np.log(LENGTHS), each.fields.sum(axis=0)
-        ) for each in residuals
-    ]))
+    squares = np.array([each.squares for each in residuals])
+    fields = np.array([each.fields for each in residuals])
 
+    def matched(rows: Integers) -> Floats:
+        return _matched(squares[rows].sum(axis=0), fields[rows].sum(axis=0))
 
-def _expected(
-    sums: Residuals, size_px: Floats | float, length: Floats | float
-) -> tuple[Floats, Floats]:
-    """Return what sums of squares are (..., 2), and their covariance (..., 2, 2), with a field.
-
-    ``length`` has the logarithms of shares of the width.
-    """
-    at, square = np.log(LENGTHS), np.asarray(size_px)[..., None] ** 2
-    fields = interpolate.interp1d(at, sums.fields.T, axis=0)(length)
-    none, mixed, both = interpolate.interp1d(at, sums.covariance, axis=1)(length)
-    square2 = square[..., None]
-    return sums.noise + square * fields, none + square2 * (mixed + square2 * both)
-
-
-def _distance(deviations: Floats, covariance: Floats) -> Floats:
-    """Return the squares (...) of deviations (..., 2), in units of their covariance."""
-    first, second = deviations[..., 0], deviations[..., 1]
-    one, both, other = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    return np.asarray(
-        (first**2 * other - 2 * first * second * both + second**2 * one) / (one * other - both**2)
+    (size, length) = jackknife(matched, len(residuals))
+    added = [np.interp(length.value, np.log(LENGTHS), each.sum(axis=0)) for each in fields]
+    return Shifts(
+        size.mapped(math.exp), length.mapped(lambda share: math.exp(share) * width_px),
+        squares.sum(axis=1) / added,
     )
 
 
-def _excess(residuals: Sequence[Residuals], size_px: float, length: float) -> float:
-    """Return how many times as much photographs vary as photographs with one field do; 1 or more.
-
-    It is 1 if chance does it with more than 5 %.
-    """
-    total = 0.0
-    for each in residuals:
-        expected, covariance = _expected(each, size_px, length)
-        total += float(_distance(each.squares - expected, covariance))
-    freedom = 2 * len(residuals) - 2
-    return total / freedom if total > special.chdtri(freedom, 1 - LEVEL) else 1.0
-
-
-def _ends(grid: Floats, distance: Floats, limit: float) -> tuple[float, float]:
-    """Return the first and the last point of a grid within the limit; where lines cross it."""
-    inside = np.flatnonzero(distance <= limit)
-    if not len(inside):
-        return math.nan, math.nan
-    ends = []
-    for k, step in ((int(inside[0]), -1), (int(inside[-1]), 1)):
-        if not 0 <= k + step < len(grid):
-            ends.append(float(grid[k]))
-            continue
-        share = (limit - distance[k]) / (distance[k + step] - distance[k])
-        ends.append(float(grid[k] + share * (grid[k + step] - grid[k])))
-    return ends[0], ends[1]
-
-
-def _matched(squares: Floats, fields: Floats) -> tuple[float, float]:
-    """Return the logarithms of size in px and length, a share of the width."""
+def _matched(squares: Floats, fields: Floats) -> Floats:
+    """Return the logarithms of size in px and length, a share of the width, (2,)."""
     at = np.log(LENGTHS)
     ratio = np.log(fields[1] / fields[0])
     wanted = np.log(max(squares[1], 1e-12) / max(squares[0], 1e-12))
     # The ratio falls with the length.
     length = float(np.interp(-wanted, -ratio, at))
     total = np.interp(length, at, fields.sum(axis=0))
-    return 0.5 * math.log(max(float(squares.sum()), 1e-12) / total), length
+    return np.array([0.5 * math.log(max(float(squares.sum()), 1e-12) / total), length])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -657,6 +605,7 @@ def scene_views(
 def fit_scene(
     views: Sequence[FittedPhotograph], taken: PhotographScenes, board: Board | None,
     without: Mapping[str, str] | None = None, known: Sequence[PhotographFit] = (),
+    say: Say = lambda _: None,
 ) -> SceneFit:
     """Return the scene of a camera from its photographs.
 
@@ -670,6 +619,8 @@ def fit_scene(
         Switches of effects that are left out, and why.
     known
         Fits of all effects, of an earlier scene's (:attr:`SceneFit.tested_fits`).
+    say
+        Is told how far the fit is.
 
     Raises
     ------
@@ -680,9 +631,9 @@ def fit_scene(
     numbers = {each.number for each in views}
     camera = fit_camera(
         views, [number for name, number in FITTED.items() if name in refused],
-        [each for each in known if each.number in numbers],
+        [each for each in known if each.number in numbers], say,
     )
-    if not camera.fits:
+    if camera is None:
         raise ArgumentError(
             "folders", "no marker fits",
             "expected markers whose pixels are black and white at their true poses; check the "

@@ -23,10 +23,10 @@ from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.photographs import SUFFIX, PhotographRecord, read_board, read_record
 from sweep.experiment.pipeline import Pipeline
-from sweep.fitting.fit import MARKERS, SceneFit, Term, fit_scene, scene_views, shortened
+from sweep.fitting.fit import MARKERS, Say, SceneFit, Term, fit_scene, scene_views, shortened
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_scenes
 from sweep.measure.surroundings import BoardMarker, clear_modules
-from sweep.messages import plain
+from sweep.messages import notice, plain
 from sweep.model.board import Board
 from sweep.photographs.folder import name_of, setting_name
 from sweep.photographs.prepare import prepare
@@ -72,15 +72,19 @@ class HeldOut:
         Of the photographs.
     folder
         Where the stores of simulations go.
+    say
+        Is told what is simulated.
     """
 
     pipeline: Pipeline
     results: xr.Dataset
     folder: Path
+    say: Say
 
     def gap(self, scene: Mapping[str, Any], name: str) -> xr.Dataset:
         """Return the photographs beside simulations with a scene."""
-        store = str(self.folder / f"{name}.zarr")
+        self.say(f"simulating them with {name}")
+        store = str(self.folder / f"{name.replace(' ', '-')}.zarr")
         execute(twin_pipeline(self.pipeline, scene, REPEATS), store, overwrite=True)
         return simulation_gap(self.results, open_dataset(store)).load()
 
@@ -94,8 +98,9 @@ class HeldOut:
         rest
             Switch of an effect -> the scene without it.
         """
+        size = gap_size(full, full)
         return {
-            switch: gap_size(self.gap(scene, switch), full) - gap_size(full, full) > MIN_GAIN
+            switch: gap_size(self.gap(scene, f"all but {switch}"), full) - size > MIN_GAIN
             for switch, scene in rest.items()
         }
 
@@ -121,40 +126,32 @@ def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
 
 
 def held_out(
-    pipeline: Pipeline, taken: PhotographScenes, numbers: Integers, record: PhotographRecord,
-    folder: Path,
+    pipeline: Pipeline, numbers: Integers, record: PhotographRecord, folder: Path, say: Say
 ) -> HeldOut:
     """Measure photographs that are held out.
 
     Parameters
     ----------
     pipeline, record
-        Of all photographs; of a stereo camera the left one's.
-    taken
-        Their scenes, with the poses that count as true.
+        Of all photographs.
     numbers
         Of the photographs that are held out.
     folder
         Where the record and the stores go.
+    say
+        Is told what is simulated of them.
     """
-    shape = len(record.paths), len(record.marker_id)
     chosen = dataclasses.replace(
-        record, paths=tuple(
-            str((folder / record.paths[k]).resolve()) for k in numbers.tolist()
-        ), digests=tuple(record.digests[k] for k in numbers.tolist()),
-        rotation=taken.scenes.rotation.reshape(*shape, 3, 3)[numbers],
-        translation=taken.scenes.translation.reshape(*shape, 3)[numbers],
-        std=record.std[numbers], source=taken.source.reshape(shape)[numbers],
+        record,
+        paths=tuple(str((folder / record.paths[k]).resolve()) for k in numbers.tolist()),
+        digests=tuple(record.digests[k] for k in numbers.tolist()),
+        **{name: getattr(record, name)[numbers]
+           for name in ("rotation", "translation", "std", "source")},
     )
     name = "held-out"
     write_whole(folder / f"{name}{SUFFIX}", chosen.content())
     document = read_document(pipeline.to_toml())
     axes = document["axes"]
-    stereo = axes.pop("stereo_camera", None)
-    if stereo is not None:
-        document["camera"] |= {
-            key: values[0] for key, values in stereo["zip"].items() if key != PHOTOGRAPHS
-        }
     document["scene"][PHOTOGRAPHS] = f"{name}{SUFFIX}"
     axes["trial"] = len(numbers)
     if "marker_id" in axes:
@@ -164,7 +161,7 @@ def held_out(
     smaller = Pipeline.from_dict(document, name=name, source="held out", folder=folder)
     store = str(folder / f"{name}.zarr")
     execute(smaller, store, overwrite=True)
-    return HeldOut(smaller, open_dataset(store), folder)
+    return HeldOut(smaller, open_dataset(store), folder, say)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -221,12 +218,8 @@ def _between(values: Floats) -> Any:
 
 
 def _camera(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the camera's parameters; of two cameras the left one's."""
-    along = {
-        name: values[0] for axis in pipeline.axes for name, values in axis.columns.items()
-        if name in CAMERA
-    }
-    values = {name: along.get(name, pipeline.fixed.get(name)) for name in CAMERA}
+    """Return the camera's parameters."""
+    values = {name: pipeline.fixed.get(name) for name in CAMERA}
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in values.items() if value is not None
@@ -307,7 +300,7 @@ def fit_folder(
     folders: Sequence[PathName], camera: PathName | None = None, *,
     board: PathName | None = None, poses: PathName | None = None,
     stereo: PathName | None = None, settings: Sequence[str] = (), markers: int = MARKERS,
-    check: bool = True,
+    check: bool = True, say: Say = notice,
 ) -> FittedScene:
     """Return the scene of the camera that took the photographs of a folder.
 
@@ -319,8 +312,10 @@ def fit_folder(
     markers
         The most markers of a photograph that are fitted.
     check
-        Whether half of the photographs are held out, to see which effects move their errors, and
-        what gap is left.
+        Whether half of the photographs are held out, to see which effects bring errors nearer to
+        theirs, and what gap is left.
+    say
+        Is told, in lines, how far it is.
 
     Raises
     ------
@@ -336,16 +331,17 @@ def fit_folder(
         home = Path(written).resolve()
         prepared = prepare(
             folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
+            one_camera=True,
         )
         pipeline = prepared.pipeline
         name = name_of(Path(folders[0]))
         record, _ = read_record(home / pipeline.values_of(PHOTOGRAPHS)[0])
-        taken = photograph_scenes(pipeline, target)
+        taken = photograph_scenes(pipeline)
         views, lines = scene_views(taken, target, markers)
-        found, gap = fit_scene(views, taken, target), None
+        found, gap = fit_scene(views, taken, target, say=say), None
         if check:
             if len(views) >= 2 * MIN_HELD_OUT:
-                found, gap = _checked(found, views, taken, target, pipeline, record, home)
+                found, gap = _checked(found, views, taken, target, pipeline, record, home, say)
             else:
                 lines.append(
                     f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to "
@@ -360,17 +356,18 @@ def fit_folder(
 
 def _checked(
     found: SceneFit, views: Sequence[FittedPhotograph], taken: PhotographScenes,
-    board: Board | None, pipeline: Pipeline, record: PhotographRecord, home: Path,
+    board: Board | None, pipeline: Pipeline, record: PhotographRecord, home: Path, say: Say,
 ) -> tuple[SceneFit, xr.Dataset]:
     """Return the scene with what moves errors of held-out photographs, and the gap that is left.
 
     Every other photograph is held out, and the scene of the others simulated.
     """
     others, held = views[::2], np.array([each.number for each in views[1::2]])
-    photographs = held_out(pipeline, taken, held, record, home)
+    say(f"measuring {len(held)} photographs that the scene of the others is compared with")
+    photographs = held_out(pipeline, held, record, home, say)
     known = found.tested_fits
     half = fit_scene(others, taken, board, known=known)
-    gap = photographs.gap(half.scene, "whole")
+    gap = photographs.gap(half.scene, "the whole scene")
     worth = photographs.worth(gap, {
         switch: fit_scene(others, taken, board, {switch: NOT_NEEDED}, known).scene
         for switch in SWITCHES if switch in half.scene
@@ -379,5 +376,5 @@ def _checked(
     if refused:
         found = fit_scene(views, taken, board, refused, known)
         half = fit_scene(others, taken, board, refused, known)
-        gap = photographs.gap(half.scene, "final")
+        gap = photographs.gap(half.scene, "what is kept")
     return found, gap

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,20 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import TruthSource
 from sweep.measure.photograph import add_plane, slope_space
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
 from sweep.model.board import Board
-from sweep.model.camera import Column
 from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
-from sweep.model.pose import angles_of_rotation
 from sweep.model.scene import Scenes, build_scenes
-from sweep.photographs.folder import find_corners, reference_detector
 from sweep.photographs.pose_fit import Lens
-from sweep.photographs.truth import board_poses
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -63,55 +57,19 @@ class PhotographScenes:
         return Lens(cameras.matrix(row), cameras.lenses[row, :14])
 
 
-def photograph_scenes(pipeline: Pipeline, board: Board | None) -> PhotographScenes:
-    """Return the scenes of the pipeline of photographs; of a stereo camera the left one's.
-
-    A board that is in them says better where its markers are than the other camera, whose poses
-    have the error of a single marker.
-    """
+def photograph_scenes(pipeline: Pipeline) -> PhotographScenes:
+    """Return the scenes of a pipeline of one camera's photographs."""
     axes = pipeline.experiment.scene_axes
-    lengths = [1 if axis.name == "stereo_camera" else len(axis) for axis in axes]
-    indices = [each.ravel() for each in np.indices(lengths)]
+    indices = [each.ravel() for each in np.indices([len(axis) for axis in axes])]
     count = len(indices[0])
     trial = next(
         (index for axis, index in zip(axes, indices, strict=True) if axis.name == "trial"),
         np.zeros(count, dtype=np.int64),
     )
     values = pipeline.experiment.scene_values(indices)
-    taken = PhotographScenes(
+    return PhotographScenes(
         build_scenes(values, count), trial, values["truth"].broadcast(count, np.uint8)
     )
-    stereo = (taken.source == TruthSource.stereo_partner).any()
-    return _by_board(taken, values, board) if stereo and board is not None else taken
-
-
-def _by_board(
-    taken: PhotographScenes, values: Mapping[str, Column], board: Board
-) -> PhotographScenes:
-    """Return the scenes with the poses of the board's markers, by its other corners."""
-    find, scenes, count = reference_detector(), taken.scenes, len(taken.trial)
-    rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
-    for number in np.unique(taken.trial).tolist():
-        rows = np.flatnonzero(taken.trial == number)
-        image = photograph_image(str(scenes.background[rows[0]]))
-        poses = board_poses(
-            board, taken.lens(rows[0]), image.shape[::-1], [find_corners(find, image, board)]
-        ).poses
-        for row in rows.tolist():
-            marker = board.marker_ids.index(scenes.marker_id[row])
-            rotation[row] = poses.rotation[0, marker]
-            translation[row] = poses.translation[0, marker]
-    with np.errstate(invalid="ignore"):
-        angles = [np.degrees(each) for each in angles_of_rotation(rotation)]
-    names = "resolved_tilt_deg", "resolved_azimuth_deg", "resolved_roll_deg"
-    known = np.isfinite(translation[:, 2])
-    source = np.where(known, TruthSource.board_without_this_marker, TruthSource.none)
-    posed = {**values, **{
-        name: Column.of(each) for name, each in zip(
-            (*names, "x_m", "y_m", "distance_m"), (*angles, *translation.T), strict=True
-        )
-    }}
-    return PhotographScenes(build_scenes(posed, count), taken.trial, source.astype(np.uint8))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -205,18 +205,11 @@ class FoundCorners:
         (n, 3) in the board's frame in m, and (n, 2) px.
     number
         (n,) numbers of the corners: of the chessboard's, or 4 · marker + corner.
-    marker, quads
-        (k,) indices of the detected markers in the board, and their corners (k, 4, 2) px.
-    unknown
-        IDs that were detected and the board does not have.
     """
 
     points: Floats
     pixels: Floats
     number: Integers
-    marker: Integers
-    quads: Floats
-    unknown: tuple[int, ...]
 
 
 def reference_detector() -> FindFunction:
@@ -237,20 +230,20 @@ def detect_markers(
     return numbers[once], corners[once]
 
 
-def find_corners(find: FindFunction, image: NDArray[np.uint8], board: Board) -> FoundCorners:
-    """Return the corners of a board in an image."""
-    ids, quads = detect_markers(find, image, board.dictionary)
+def find_corners(
+    image: NDArray[np.uint8], board: Board, ids: Integers, quads: Floats
+) -> FoundCorners:
+    """Return the corners of a board in an image in which markers (k,), (k, 4, 2) were detected."""
     index = {marker_id: k for k, marker_id in enumerate(board.marker_ids)}
     known = np.array([each in index for each in ids.tolist()], dtype=bool)
     marker = np.array([index[each] for each in ids[known].tolist()], dtype=np.int64)
-    quads, unknown = quads[known], tuple(ids[~known].tolist())
     if len(board.chessboard_m):
-        number, pixels = _chessboard(image, board, marker, quads)
-        points = board.chessboard_m[number]
-    else:
-        number = (4 * marker[:, None] + np.arange(4)).ravel()
-        pixels, points = quads.reshape(-1, 2), board.corners_m[marker].reshape(-1, 3)
-    return FoundCorners(points, pixels, number, marker, quads, unknown)
+        number, pixels = _chessboard(image, board, marker, quads[known])
+        return FoundCorners(board.chessboard_m[number], pixels, number)
+    return FoundCorners(
+        board.corners_m[marker].reshape(-1, 3), quads[known].reshape(-1, 2),
+        (4 * marker[:, None] + np.arange(4)).ravel(),
+    )
 
 
 def _chessboard(

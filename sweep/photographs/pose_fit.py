@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sweep.measure.flags import TruthSource
 from sweep.model.pose import rotation_of_vector
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # The pose of a rigid target from many points: least squares, with its covariance.
@@ -121,8 +121,9 @@ def fit_pose(
 ) -> FittedPose | None:
     """Return the pose of least squares from a start; None without 4 points, or if it diverges.
 
-    Gauss-Newton. Without ``used`` outliers are left out: those beyond :data:`OUTLIER` robust
-    standard deviations, in two rounds.
+    Gauss-Newton steps in the camera's frame: a rotation vector, as OpenCV's functions have it, is
+    singular at the half turn of a board that faces the camera. Without ``used`` outliers are left
+    out: those beyond :data:`OUTLIER` robust standard deviations, in two rounds.
 
     Parameters
     ----------
@@ -222,6 +223,13 @@ class Poses:
         self.translation[photograph, marker] = translation
         self.std[photograph, marker] = std
         self.source[photograph, marker] = source
+
+    def take(self, markers: Integers) -> Poses:
+        """Return the poses of some markers, by their indices."""
+        return Poses(
+            self.rotation[:, markers], self.translation[:, markers], self.std[:, markers],
+            self.source[:, markers],
+        )
 
     @property
     def known(self) -> Masks:

@@ -15,7 +15,6 @@ from sweep.errors import ArgumentError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.experiment.photographs import board_document, board_of
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
 from sweep.model.board import Board
@@ -23,6 +22,7 @@ from sweep.model.image_file import Part
 from sweep.photographs.board_check import calibrate, check_board, check_resolution
 from sweep.photographs.folder import (
     Folder,
+    FoundCorners,
     KnownCamera,
     Prepared,
     WantedMarkers,
@@ -65,6 +65,7 @@ def prepare(
     home: str | Path = "runs",
     name: str = "",
     overwrite: bool = False,
+    one_camera: bool = False,
 ) -> Prepared:
     """Find out the truth of photographs, record it, and return the experiment.
 
@@ -85,6 +86,9 @@ def prepare(
         Folder and name of the record (default: the first folder's name).
     overwrite
         Whether another record of that name is replaced.
+    one_camera
+        Of two cameras the left one alone, with a board's truth where there is one: poses by the
+        other camera have the error of a single marker.
 
     Raises
     ------
@@ -95,41 +99,40 @@ def prepare(
     with single_threaded():  # OpenCV's calibration is the same to the bit only then
         return _prepare(
             folders, camera, board, poses, stereo, list(settings), Path(home), name,
-            overwrite=overwrite,
+            overwrite=overwrite, one_camera=one_camera,
         )
 
 
 def _prepare(
     folders: Sequence[PathName], camera: PathName | None, board: PathName | None,
     poses: PathName | None, stereo: PathName | None, settings: list[str], home: Path,
-    name: str, *, overwrite: bool,
+    name: str, *, overwrite: bool, one_camera: bool,
 ) -> Prepared:
     document = None if board is None else board_document(Path(board))
     target = None if document is None else board_of(document, plain(board))
-    halves = [Part.whole]
-    if stereo is not None and len(folders) == 1:
-        halves = [Part.left, Part.right]
-    where = list(folders) * (2 if len(halves) == 2 else 1)
-    parts = halves if len(halves) == 2 else [Part.whole] * len(where)
+    side_by_side = stereo is not None and len(folders) == 1
+    parts = [Part.left, Part.right] if side_by_side else [Part.whole] * len(folders)
+    where = list(folders) * 2 if side_by_side else folders
     found = [read_folder(Path(each), part) for each, part in zip(where, parts, strict=True)]
     lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
     if stereo is not None:
         _check_pairs(found)
-    find = reference_detector()
-    first = found[0]
-    seen_ids = [
-        [detect_markers(find, each.image, _dictionary(target, settings))
-         for each in folder.photographs]
+    find, first = reference_detector(), found[0]
+    dictionary = _dictionary(target, settings)
+    detected = [
+        [detect_markers(find, each.image, dictionary) for each in folder.photographs]
         for folder in found
     ]
-    markers = _markers(target, settings, [ids for side in seen_ids for ids, _ in side])
-    if document is not None:
-        written = json.dumps(document, sort_keys=True)
-        markers = dataclasses.replace(markers, board=written)
+    markers = _markers(target, settings, [ids for side in detected for ids, _ in side])
     if target is not None and board is not None:
-        check_board(Path(board), target, [each for side in seen_ids for each in side], find,
+        markers = dataclasses.replace(markers, board=json.dumps(document, sort_keys=True))
+        check_board(Path(board), target, [each for side in detected for each in side], find,
                     first.photographs)
-    seen = [[_seen(markers, *each) for each in side] for side in seen_ids]
+    seen = [[_seen(markers, *each) for each in side] for side in detected]
+    corners = [] if target is None else [
+        find_corners(each.image, target, *one)
+        for each, one in zip(first.photographs, detected[0], strict=True)
+    ]
     if stereo is not None:
         rig, calibrations = stereo_of_file(str(stereo), first.size)
         cameras = [known_camera(each) for each in calibrations]
@@ -139,19 +142,19 @@ def _prepare(
                 (rig, seen[0], seen[1]), (rig.swapped(), seen[1], seen[0]),
             )
         ]
+        if one_camera:
+            found, parts, cameras, truth = found[:1], parts[:1], cameras[:1], truth[:1]
     else:
-        one, poses_of_board, said = _with_one_camera(
-            first, camera, target, find, need_board=poses is None
-        )
-        lines += said
-        cameras = [one]
-        if poses is not None:
-            given, said = poses_of_file(Path(poses), first, markers, one.lens, seen[0])
-            truth, lines = [given], lines + said
-        elif poses_of_board is not None:
-            truth = [poses_of_board]
-        else:
-            truth = [own_poses(one.lens, markers.sizes_m, seen[0])]
+        cameras = [_camera(first, camera, corners)]
+        lines += [each.line for each in cameras if each.line]
+    if poses is not None:
+        given, said = poses_of_file(Path(poses), first, markers, cameras[0].lens, seen[0])
+        truth, lines = [given], lines + said
+    elif target is not None and (stereo is None or one_camera):
+        by_board, said = _poses_of_board(first, cameras[0], str(camera), target, corners)
+        truth, lines = [by_board], lines + said
+    elif stereo is None:
+        truth = [own_poses(cameras[0].lens, markers.sizes_m, seen[0])]
     lines += _summary(found, truth)
     return write_record(
         found, parts, cameras, markers, truth, settings, home,
@@ -247,45 +250,38 @@ def _seen(markers: WantedMarkers, ids: Any, quads: Floats) -> SeenMarkers:
     )
 
 
-def _with_one_camera(
-    folder: Folder, camera: PathName | None, board: Board | None, find: FindFunction, *,
-    need_board: bool,
-) -> tuple[KnownCamera, Poses | None, list[str]]:
-    """Return the camera, the poses of the board's markers if wanted, and lines."""
-    if str(camera) == CALIBRATE and board is None:
+def _camera(
+    folder: Folder, camera: PathName | None, corners: Sequence[FoundCorners]
+) -> KnownCamera:
+    """Return the camera of a file, or by a board's corners."""
+    if str(camera) != CALIBRATE:
+        return known_camera(camera_of_file(str(camera), folder.size))
+    if not corners:
         raise ArgumentError(
             "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
         )
-    corners = None
-    if board is not None and (need_board or str(camera) == CALIBRATE):
-        corners = [find_corners(find, each.image, board) for each in folder.photographs]
-    if str(camera) == CALIBRATE:
-        if corners is None:
-            raise AssertionError(camera)
-        known = calibrate(folder.size, corners)
-    else:
-        known = known_camera(camera_of_file(str(camera), folder.size))
-    lines = [known.line] if known.line else []
-    if board is None or corners is None or not need_board:
-        return known, None, lines
-    result = board_poses(board, known.lens, folder.size, corners, known.covariance)
+    return calibrate(folder.size, corners)
+
+
+def _poses_of_board(
+    folder: Folder, camera: KnownCamera, written: str, board: Board,
+    corners: Sequence[FoundCorners],
+) -> tuple[Poses, list[str]]:
+    """Return the poses of a board's markers in the order of their IDs, and a line on them."""
+    result = board_poses(board, camera.lens, folder.size, corners, camera.covariance)
     fits = [each for each in result.boards if each is not None]
+    lines = []
     if fits:
         rms = float(np.median([each.rms_px for each in fits]))
-        if str(camera) != CALIBRATE:
-            check_resolution(str(camera), known.lens, folder.size, corners, rms)
+        if written not in (CALIBRATE, "None"):
+            check_resolution(written, camera.lens, folder.size, corners, rms)
         lines.append(
             f"board: {rms:.2f} px RMS of its corners in the median photograph"
             + ("" if np.isnan(result.halves_ratio) else
                "; the poses of halves of its corners differ by "
                f"{result.halves_ratio:.2g} of what their residuals predict")
         )
-    order = np.argsort(board.marker_ids)
-    poses = result.poses
-    return known, Poses(
-        poses.rotation[:, order], poses.translation[:, order], poses.std[:, order],
-        poses.source[:, order],
-    ), lines
+    return result.poses.take(np.argsort(board.marker_ids)), lines
 
 
 def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:

@@ -460,7 +460,8 @@ def board_poses(
         (c, c) of fx, fy, cx, cy and the coefficients; None if it is not known.
     """
     boards = tuple(fitted_board(lens, each) for each in found)
-    ratio = _halves_ratio(lens, boards, found)
+    # Every other corner of a chessboard's row, every other marker of a grid.
+    ratio = _halves_ratio(lens, boards, found, 1 if len(board.chessboard_m) else 4)
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     own, frames = own_corners(board), marker_frames(board)
     poses = Poses.none(len(found), len(board))
@@ -559,15 +560,17 @@ def markers_within(
 
 
 def _halves_ratio(
-    lens: Lens, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners]
+    lens: Lens, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners], together: int
 ) -> float:
-    """Return how far the poses of two halves differ, in predicted standard deviations."""
+    """Return how far the poses of two halves differ, in predicted standard deviations.
+
+    ``together`` corners of following numbers are in the same half.
+    """
     squares = []
     for pose, corners in zip(boards, found, strict=True):
         if pose is None:
             continue
-        # Every other corner of a chessboard's row, every other marker of a grid.
-        first = (corners.number // (1 if _is_dense(corners) else 4)) % 2 == 0
+        first = (corners.number // together) % 2 == 0
         centre = corners.points.mean(axis=0)
         halves = [
             fit_pose(lens, corners.points - centre, corners.pixels, pose.rotation,
@@ -583,8 +586,3 @@ def _halves_ratio(
         covariance = one.covariance + other.covariance
         squares.append(float(difference @ np.linalg.solve(covariance, difference)) / 6)
     return float(np.sqrt(np.mean(squares))) if squares else float("nan")
-
-
-def _is_dense(corners: FoundCorners) -> bool:
-    """Return whether the corners are a chessboard's: their numbers are not four a marker."""
-    return not np.array_equal(corners.number, (4 * corners.marker[:, None] + np.arange(4)).ravel())

@@ -29,7 +29,7 @@ class Simulated(HeldOut):
 
 
 def test_an_effect_is_kept_where_it_brings_errors_nearer_to_those_of_photographs():
-    photographs = Simulated(None, None, None)
+    photographs = Simulated(None, None, None, None)
     full = gap(1.2)
     # The intervals' half-widths are 0.5: without an effect the gap of 0.4 of them becomes 1.0,
     # 0.42, and, though the errors move by as much as in the first case, 0.2 on the other side.
@@ -38,13 +38,16 @@ def test_an_effect_is_kept_where_it_brings_errors_nearer_to_those_of_photographs
 
 
 @pytest.mark.long
-def test_a_scene_is_checked_against_photographs_that_were_not_fitted(tmp_path):
+def test_a_scene_is_checked_against_photographs_that_were_not_fitted(tmp_path, capsys):
     # Without the shifts the gap is wider by 0.21 half-widths, four times MIN_GAIN. With 0.15 px, as
     # in EFFECTS, it is by 0.02 with this scene of five photographs (whose shifts come out at 0.10
     # px), by 0.03 to 0.28 with the true one: ten photographs do not always tell that they matter.
     effects = EFFECTS | {"sharpening": 1.2, "bloom": 0.4, "geometry_px": 0.3}
     folders, options = taken(tmp_path, effects, 31, 10)
     fitted = sweep.fit(*folders, **options, markers=6)
+    said = capsys.readouterr().err
+    assert "fitting photograph 6 of 10" in said
+    assert "simulating them with all but edge_px" in said
     assert {"blur_px", "sharpening", "bloom", "geometry_px"} <= set(fitted.found.scene)
     assert terms_of(fitted)["geometry_px"].kept
     simulated = fitted.gap.sel(source="simulated", cornerRefinementMethod="subpix")

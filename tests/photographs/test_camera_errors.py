@@ -12,7 +12,6 @@ from sweep.photographs.pose_fit import Lens, fit_pose
 from sweep.photographs.truth import camera_of_file, known_camera, unshared_variance
 
 LENS = Lens.of(*VIEW, (0.1, -0.2, 0.001, -0.001, 0.05))
-NONE = np.empty(0, dtype=np.int64)
 
 
 def seen(number, rng, sd_px):
@@ -20,7 +19,7 @@ def seen(number, rng, sd_px):
     turn, shift = POSES[number]
     points = board().chessboard_m
     pixels = LENS.project(points, turn, np.array(shift)) + rng.normal(0, sd_px, (len(points), 2))
-    return FoundCorners(points, pixels, np.arange(len(points)), NONE, np.empty((0, 4, 2)), ())
+    return FoundCorners(points, pixels, np.arange(len(points)))
 
 
 def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():

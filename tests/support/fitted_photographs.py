@@ -22,13 +22,18 @@ PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0}
 
 
 def taken(folder, effects, seed, count):
-    """Write photographs, the camera's file and the board's; return `sweep.fit`'s arguments."""
+    """Write photographs, the camera's file and the board's; return `sweep.fit`'s arguments.
+
+    Of a ``marker_scale`` the board's file has smaller markers than are printed."""
+    effects = dict(effects)
+    scale = effects.pop("marker_scale", 1.0)
     shots = photographs(board_of(BOARD, "board"), CAMERA, count, seed, effects, 0.9)
     camera = save(folder / "shots", shots, CAMERA)
     camera = camera.rename(folder / "camera.yml")
     (folder / "shots" / "truth.json").unlink()
     (folder / "board.toml").write_text(
-        "".join(f"{key} = {json.dumps(value)}\n" for key, value in BOARD.items()))
+        "".join(f"{key} = {json.dumps(value)}\n" for key, value in
+                {**BOARD, "marker_m": BOARD["marker_m"] / scale}.items()))
     return (folder / "shots",), {"camera": camera, "board": folder / "board.toml"}
 
 

@@ -61,6 +61,7 @@ from sweep.store.locations import (
     POINTER,
     check_writable,
     checked_url,
+    exists,
     is_remote,
     not_a_store,
     open_group,
@@ -238,11 +239,17 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     root = _sealed(_group_document(root_attributes(pipeline, planned, metadata)))
     with translate_errors(url, "written"):
         if is_remote(url):
-            write_files(storage_at(f"{url}/{run_id}", read_only=False), {
-                **files, "zarr.json": encoded(root)})
+            storage = storage_at(url, read_only=False)
+            write_files(storage, {
+                f"{run_id}/{key}": content
+                for key, content in {**files, "zarr.json": encoded(root)}.items()})
+            try:
+                _check_free(url)
+            except BaseException:
+                sync(storage.delete_dir(run_id))
+                raise
             # The URL points to it once it is complete.
-            write_document(
-                storage_at(url, read_only=False), "zarr.json", _group_document({POINTER: run_id}))
+            write_document(storage, "zarr.json", _group_document({POINTER: run_id}))
         else:
             check_writable(url)
             path = Path(url).resolve()  # a link may lead there
@@ -251,11 +258,18 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             building = _beside(path, "new")
             try:
                 write_files(LocalStore(building), {**files, "zarr.json": encoded(root)})
+                _check_free(url)
                 building.rename(path)
             except BaseException:
                 shutil.rmtree(building, ignore_errors=True)
                 raise
     return open_store(url, "r+")
+
+
+def _check_free(url: str) -> None:
+    """Raise StoreError if another process has created a store meanwhile."""
+    if exists(url):
+        raise StoreError(f"{url}: another process has made it meanwhile; run it again to continue")
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -227,8 +227,7 @@ def _account():
     return key
 
 
-@pytest.mark.usefixtures("bucket")
-def test_server_refuses_changes_while_a_process_writes(monkeypatch):
+def test_server_refuses_changes_while_a_process_writes(bucket, monkeypatch):
     monkeypatch.setattr("sweep.store.lock.SILENCE_S", 3.0)
     url = "s3://bucket/written.zarr"
     pipeline = Pipeline.from_text("axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40")
@@ -242,7 +241,11 @@ def test_server_refuses_changes_while_a_process_writes(monkeypatch):
         ):
             with pytest.raises(StoreError, match="is writing it"):
                 change()
+    with pytest.raises(StoreError, match="has made it meanwhile"):
+        create_store(url, pipeline, (2,))
     assert open_store(url).run_id == store.run_id
+    assert {key.split("/")[1] for key in bucket.keys("written.zarr/")} == {
+        "zarr.json", store.run_id}
     remove_store(url)
     assert not exists(url)
 

@@ -55,6 +55,13 @@ def test_one_process_changes_a_store_and_others_are_refused(store):
                 pass
 
 
+def test_of_two_processes_that_make_a_store_the_later_one_is_told(store, pipeline):
+    with pytest.raises(StoreError, match="another process has made it meanwhile; run it again"):
+        create_store(store.url, pipeline, (4,))
+    assert open_store(store.url).run_id == store.run_id
+    assert [path.name for path in Path(store.url).parent.iterdir()] == ["held.zarr"]
+
+
 @pytest.fixture
 def another_storage(monkeypatch):
     """A storage that is no folder of this machine, as an object store's."""

@@ -111,7 +111,7 @@ def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, caps
         assert float(line.split()[1]) == pytest.approx(value, rel=1e-5), line
     line = next(line for line in told.splitlines() if line.split()[:1] == ["true_tvec_m"])
     assert float(line.split()[3]) == pytest.approx(depth, rel=1e-5)
-    assert re.search(r"^ +detection +detected$", told, re.MULTILINE)
+    assert re.search(r"^ *detection +detected *$", told, re.MULTILINE)
     shown = tmp_path / "shown.png"
     assert main(["show", str(pipeline), "--at", NEAR, "-o", str(shown), "--plain"]) == 0
     image = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)

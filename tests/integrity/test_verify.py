@@ -314,7 +314,7 @@ def test_attributes_and_coordinates_that_were_changed_are_named_and_mended(
     group["solver"][:] = np.array(["p3p", "sqpnp"], dtype=object)
     wanted = {
         (key, None) for key in (
-            "detection/zarr.json", "side_px/zarr.json", "zarr.json", "solver/c/0",
+            "detection/zarr.json", "side_px/zarr.json", "zarr.json", "side_px/c/0", "solver/c/0",
         )
     }
     assert named(verify(str(copied), 0)) == wanted

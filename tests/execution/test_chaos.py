@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -15,6 +16,7 @@ import psutil
 import pytest
 import xarray as xr
 
+from support.clusters import Cluster, workers_below
 from support.commands import command, complaints, started
 from support.lengths import lengths
 from support.stores import by_hand, same
@@ -69,14 +71,14 @@ largest = "distance_m"
 }
 
 CLIENT = """
-import sys
+import json, sys
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
-    pipeline, store, scheduler = sys.argv[1:]
+    pipeline, store, scheduler, options = sys.argv[1:]
     execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
-            block_s=0.05)
+            block_s=0.05, **json.loads(options))
 """
 
 
@@ -92,7 +94,7 @@ def whole(url, pipeline, reference):
     assert same(url, reference)
     with xr.open_zarr(url) as opened:  # a warning where its metadata is not in one place
         assert opened.sizes
-    computed = sum(receipt.scenes_needed > 0 for _, receipt in told)
+    computed = sum(receipt.computed["scenes"] > 0 for _, receipt in told)
     with xr.open_zarr(url, group="cost") as cost:
         assert cost.sizes["block"] == computed
 
@@ -109,12 +111,14 @@ def prepared(folder, text, name):
 class Chaos:
     """Runs into new stores, again and again, and kills what runs them at random instants.
 
-    In turn: a worker, the scheduler, the client; with a cluster inside the client, and with one
-    outside of it that goes on when the client dies.
+    In turn: a worker, the scheduler, the client; with processes of the client's, and with a cluster
+    outside of it that goes on when the client dies. Cells of an ``older`` store are reused, and
+    every other store stands in the place of an older one.
     """
 
-    def __init__(self, folder, pipeline, path, reference, seed):
+    def __init__(self, folder, pipeline, path, reference, seed, older=""):
         self._folder, self._pipeline, self._path = folder, pipeline, path
+        self._older = older
         self._reference = reference
         self._random = random.Random(seed)
         self._left = contextlib.ExitStack()
@@ -145,6 +149,10 @@ class Chaos:
     def _next_store(self):
         self.stores += 1
         self._url = str(self._folder / f"chaos{self.stores}.zarr")
+        self._overwritten = None
+        if self._older and self.stores % 2 == 0:
+            shutil.copytree(self._older, self._url)
+            self._overwritten = open_store(self._url).run_id
 
     def _receipts(self):
         try:
@@ -155,8 +163,13 @@ class Chaos:
     def _client(self, scheduler=""):
         log = (self._folder / "client.log").open("w")
         self._left.callback(log.close)
+        options = {"reuse": [self._older]} if self._older else {}
+        if self._overwritten is not None:
+            with contextlib.suppress(StoreError):  # it may be gone, and the new one not there
+                options["overwrite"] = open_store(self._url).run_id == self._overwritten
         return started(
-            ["-c", CLIENT, self._path, self._url, scheduler], stdout=log, stderr=log,
+            ["-c", CLIENT, self._path, self._url, scheduler, json.dumps(options)],
+            stdout=log, stderr=log,
         )
 
     def _told(self):
@@ -198,46 +211,15 @@ class Chaos:
             assert client.wait(timeout=900) == 0, self._told()
         whole(self._url, self._pipeline, self._reference)
 
-    def _workers(self, process):
-        """Return the worker processes below one."""
-        with contextlib.suppress(psutil.NoSuchProcess):
-            below = psutil.Process(process.pid).children(recursive=True)
-            return [one for one in below if "spawn_main" in " ".join(self._words(one))]
-        return []
-
-    @staticmethod
-    def _words(process):
-        try:
-            return process.cmdline()
-        except psutil.Error:
-            return []
-
     def _outside(self):
         """Return scheduler, workers' parent and address of the cluster outside; start one."""
         if self._cluster is None:
-            stack = contextlib.ExitStack()
-            self._left.push(stack)
-            file = self._folder / "scheduler.json"
-            file.unlink(missing_ok=True)
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            scheduler = stack.enter_context(started(
-                ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
-                 "--no-dashboard", "--scheduler-file", file], **quiet,
-            ))
-            workers = stack.enter_context(started(
-                ["-m", "distributed.cli.dask_worker", "--scheduler-file", file, "--nworkers", "2",
-                 "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1",
-                 "--local-directory", self._folder], **quiet,
-            ))
-            deadline = time.monotonic() + 60
-            while not (file.exists() and file.stat().st_size):
-                assert time.monotonic() < deadline, "no scheduler came up"
-                time.sleep(0.05)
-            self._cluster = stack, scheduler, workers, json.loads(file.read_text())["address"]
+            cluster = self._left.enter_context(Cluster(self._folder))
+            self._cluster = cluster, cluster.scheduler, cluster.nannies(2), cluster.address
         return self._cluster[1:]
 
     def _end_outside(self):
-        self._cluster[0].close()
+        self._cluster[0].__exit__()
         self._cluster = None
 
     def _scheduler_outside(self):
@@ -288,7 +270,7 @@ class Chaos:
     def _kill_worker(self, client, parent):
         self._some_blocks(client)
         time.sleep(self._random.uniform(0.0, 0.5))
-        there = self._workers(parent)
+        there = workers_below(parent)
         if client.poll() is None and there:
             with contextlib.suppress(psutil.NoSuchProcess):
                 self._random.choice(there).kill()
@@ -301,11 +283,14 @@ class Chaos:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("count", [6, 200])
-def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, tmp_path):
+@pytest.mark.parametrize(("count", "older"), [(6, False), (6, True), (200, False)])
+def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, older, tmp_path):
     trials = SHORT_TRIALS if count < 100 else LONG_TRIALS
     pipeline, path, reference = prepared(tmp_path, GRID % trials, "undisturbed")
-    chaos = Chaos(tmp_path, pipeline, path, reference, SEED)
+    old = str(tmp_path / "old.zarr") if older else ""
+    if older:
+        by_hand(old, Pipeline.from_text(GRID % 20))
+    chaos = Chaos(tmp_path, pipeline, path, reference, SEED, old)
     begun = time.monotonic()
     chaos.run(count)
     print(

@@ -19,6 +19,7 @@ import pytest
 import trustme
 
 from support.blocks import run_block
+from support.clusters import Cluster
 from support.commands import complaints
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
@@ -279,51 +280,11 @@ def client_environment(settings):
     }
 
 
-class Cluster:
-    """A scheduler and workers, each a process; all end with the ``with`` block."""
-
-    def __init__(self, folder, settings=None):
-        folder.mkdir()
-        self._folder = folder
-        self._stack = contextlib.ExitStack()
-        self._count = 0
-        self._options = [] if settings is None else [
-            "--tls-ca-file", settings["ca"], "--tls-cert", settings["cert"],
-            "--tls-key", settings["key"],
-        ]
-        self._protocol = "tcp" if settings is None else "tls"
-
-    def __enter__(self):
-        file = self._folder / "scheduler.json"
-        self.scheduler = self._start(
-            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--protocol", self._protocol,
-            "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file,
-        )
-        wait_until(lambda: file.exists() and file.stat().st_size, "the scheduler does not start")
-        self.address = json.loads(file.read_text())["address"]
-        return self
-
-    def __exit__(self, *_):
-        self._stack.close()
-
-    def worker(self):
-        """Start a worker of one thread, without a nanny that would begin it again."""
-        return self._start(
-            "dask_worker", self.address, "--host", "127.0.0.1", "--nthreads", "1",
-            "--no-nanny", "--dashboard-address", "127.0.0.1:0", "--local-directory", self._folder,
-        )
-
-    def log(self):
-        """What all its processes said."""
-        return "\n".join(path.read_text() for path in self._folder.glob("*.log"))
-
-    def _start(self, name, *arguments):
-        self._count += 1
-        return self._stack.enter_context(started(
-            self._folder / f"{name}-{self._count}.log", "-m", f"distributed.cli.{name}",
-            *arguments, *self._options,
-            environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s"},
-        ))
+def tls(settings):
+    """Return what makes a cluster's processes use certificates."""
+    return {"protocol": "tls", "options": (
+        "--tls-ca-file", settings["ca"], "--tls-cert", settings["cert"], "--tls-key",
+        settings["key"])}
 
 
 # --- stores on the server ---
@@ -335,7 +296,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
 ):
     url = "s3://bucket/all.zarr"
     told = ""
-    with Cluster(tmp_path / "cluster", certificates["ours"]) as cluster:
+    with Cluster(tmp_path / "cluster", **tls(certificates["ours"])) as cluster:
         cluster.worker()
         ran = sweep_command(
             "run", small, "--store", url, "--scheduler", cluster.address, "--json",

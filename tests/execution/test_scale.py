@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -12,6 +11,7 @@ import pytest
 import xarray as xr
 from zarr.storage import LocalStore, WrapperStore
 
+from support.clusters import Cluster
 from sweep.experiment.grid import Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -32,6 +32,7 @@ import json, sys
 import synthetic
 synthetic.install()
 from sweep.execution.runner import execute
+from support.clusters import Cluster
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
 import sweep.execution.runner as engine
@@ -60,41 +61,18 @@ class CountingStore(WrapperStore[LocalStore]):
 def run_synthetic(folder, trials):
     """Run a grid of 10,000 x ``trials`` poses on a scheduler process with two workers."""
     path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": path}
     pipeline, store = folder / f"grid{trials}.toml", folder / f"{trials}.zarr"
     pipeline.write_text(GRID % trials)
-    address = folder / f"address{trials}.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    with subprocess.Popen(
-        [*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file",
-         str(address)], **quiet,
-    ) as scheduler:
-        try:
-            deadline = time.monotonic() + 60
-            while not address.exists():
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-            worker = [
-                sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file",
-                str(address), "--nworkers", "2", "--nthreads", "1", "--no-dashboard",
-                "--preload", "synthetic",
-            ]
-            with subprocess.Popen(worker, **quiet, cwd=folder) as workers:
-                try:
-                    url = json.loads(address.read_text())["address"]
-                    ran = subprocess.run(
-                        [sys.executable, "-c", CLIENT, str(pipeline), str(store), url,
-                         str(trials)],
-                        env=environment, capture_output=True, text=True, check=False,
-                    )
-                    assert ran.returncode == 0, ran.stderr
-                    grown = psutil.Process(scheduler.pid).memory_info().rss
-                    return {**json.loads(ran.stdout), "scheduler": grown, "store": store}
-                finally:
-                    workers.terminate()
-        finally:
-            scheduler.terminate()
+    with Cluster(folder / f"cluster{trials}", environment={"PYTHONPATH": path}) as cluster:
+        cluster.nannies(2, "--preload", "synthetic")
+        ran = subprocess.run(
+            [sys.executable, "-c", CLIENT, str(pipeline), str(store), cluster.address,
+             str(trials)],
+            env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False,
+        )
+        assert ran.returncode == 0, ran.stderr
+        grown = psutil.Process(cluster.scheduler.pid).memory_info().rss
+        return {**json.loads(ran.stdout), "scheduler": grown, "store": store}
 
 
 @pytest.mark.long

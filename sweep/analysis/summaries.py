@@ -744,26 +744,21 @@ def covariance_trust(
     if scale is not None:
         nees = _scaled(results, nees, scale)
     limits = special.chdtri(len(POSE_PARAMETERS), 1.0 - nominal).tolist()
-    inputs = pose_arrays(results, ESTIMATE_INPUTS) | {"nees": nees}
-    table = aggregate(results, inputs, kept, _nees_statistics(limits), Poses)
-    level = xr.DataArray(nominal, dims="level", attrs={
-        "long_name": "nominal probability of the covariance's region", "units": "1"})
-
-    def over_levels(name: str) -> xr.DataArray:
-        return stacked([table[name.format(at)] for at in range(len(limits))], "level")
-
-    right = ((over_levels("joint {}_low") - TOLERANCE <= level)
-             & (level <= over_levels("joint {}_high") + TOLERANCE)).all("level")
-    variables = {name: table[name] for name in (
-        "nees_mean", "nees_mean_low", "nees_mean_high", "nees_count")}
-    variables["covariance_trusted"] = (right & (table["draws"] >= MIN_DRAWS)).assign_attrs(
+    inputs = {name: array.compute() for name, array in (
+        pose_arrays(results, ESTIMATE_INPUTS) | {"nees": nees}).items()}
+    table = aggregate(results, inputs, kept, [NEES_MEAN.statistic], Poses)
+    at_levels = stacked([
+        aggregate(results, inputs, kept, _within(limit, len(limits)), Poses) for limit in limits],
+        "level").assign_coords(level=("level", nominal, {
+            "long_name": "nominal probability of the covariance's region", "units": "1"}))
+    level = at_levels["level"]
+    right = ((at_levels["joint_low"] - TOLERANCE <= level)
+             & (level <= at_levels["joint_high"] + TOLERANCE)).all("level")
+    one = at_levels.isel(level=-1, drop=True)
+    trusted = (right & (one["draws"] >= MIN_DRAWS)).assign_attrs(
         long_name="whether the coverage is the level, at every level", units="1")
-    for ending, words in INTERVAL.items():
-        variables[f"covariance_coverage{ending}"] = over_levels(
-            f"coverage {{}}{ending}").assign_attrs(
-                long_name=f"{words}share of estimates within the covariance's region of a level",
-                units="1")
-    return xr.Dataset(variables, dict(table.coords)).assign_coords(level=level)
+    return table.assign(nees_count=one["nees_count"], covariance_trusted=trusted).assign(
+        at_levels[[f"covariance_coverage{end}" for end in INTERVAL]])
 
 
 def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.DataArray:
@@ -780,25 +775,16 @@ def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.
     return nees * scale
 
 
-def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses]]:
-    """Return the mean of ``nees``, and the shares below each limit with two intervals.
+def _within(limit: float, levels: int) -> list[Statistic[Poses]]:
+    """Return the share below a limit, with its interval and one of several levels together."""
+    def within(poses: Poses) -> Masks:
+        return np.asarray(_nees(poses) <= limit)
 
-    "coverage 0" has the interval of its level alone, "joint 0" that of all levels together.
-    """
-    joint = 1.0 - (1.0 - LEVEL) / len(limits)
-
-    statistics: list[Statistic[Poses]] = [NEES_MEAN.statistic]
-    for at, limit in enumerate(limits):
-        def within(poses: Poses, most: float = limit) -> Masks:
-            return np.asarray(_nees(poses) <= most)
-
-        statistics += [
-            Rate(f"coverage {at}", "within the region of used", within, _with_nees,
-                 counts=(("nees_count", "estimates with a normalised estimation error squared"),
-                         (f"hits {at}", ""))),
-            Rate(f"joint {at}", "within the region of used", within, _with_nees, joint),
-        ]
-    return statistics
+    words = "share of estimates within the covariance's region of a level"
+    return [
+        Rate("covariance_coverage", words, within, _with_nees, counts=(
+            ("nees_count", "estimates with a normalised estimation error squared"), ("hits", ""))),
+        Rate("joint", "", within, _with_nees, 1.0 - (1.0 - LEVEL) / levels)]
 
 
 # --------------------------------------------------------------------------------------------------

@@ -380,37 +380,29 @@ class Decider:
         starts = tuple(first if k == trial else start for k, start in enumerate(span.starts))
         stops = tuple(last if k == trial else stop for k, stop in enumerate(span.stops))
         part = region(variable, pipeline, Block(starts, stops))
-        return in_order_of_results(pipeline, variable, np.asarray(self.store.array(name)[part]))
+        names, order = variable.dimensions(pipeline), result_dimensions(pipeline, variable)
+        return np.asarray(self.store.array(name)[part]).transpose(
+            [names.index(each) for each in order])
 
 
-def in_order_of_results(
-    pipeline: Pipeline, variable: Variable, values: NDArray[Any]
-) -> NDArray[Any]:
-    """Return values in the dataset's dimensions in those of `GroupResults`."""
+def result_dimensions(pipeline: Pipeline, variable: Variable) -> list[str]:
+    """Return the dimensions of a variable's values in `GroupResults`, in their order."""
     names = variable.dimensions(pipeline)
-    scene = [axis.name for axis in pipeline.experiment.scene_axes if axis.name != TRIAL]
     order = [
-        *scene, TRIAL,
-        *(axis.name for axis in pipeline.axes_of(Stage.detection)),
-        *(axis.name for axis in pipeline.axes_of(Stage.estimation)), *variable.inner,
+        *(axis.name for axis in condition_axes(pipeline)), TRIAL,
+        *(axis.name for stage in (Stage.detection, Stage.estimation)
+          for axis in pipeline.axes_of(stage)), *variable.inner,
     ]
-    return values.transpose([names.index(each) for each in order if each in names])
-
-
-def by_scene(
-    variable: Variable, pipeline: Pipeline, block: Block, values: NDArray[Any]
-) -> NDArray[Any]:
-    """Return a block's values of a variable in the dimensions (N, configurations)."""
-    names = variable.dimensions(pipeline)
-    scene = [axis.name for axis in pipeline.experiment.scene_axes]
-    order = [*(names.index(name) for name in scene),
-             *(k for k, name in enumerate(names) if name not in scene)]
-    return values.transpose(order).reshape(len(block), -1)
+    return [name for name in order if name in names]
 
 
 def scenes_needed(store: RunStore, block: Block) -> Masks:
     """Return which of a committed block's scenes (N,) were needed, as its flags say."""
     variable, pipeline = VARIABLES["detection"], store.pipeline
     values = np.asarray(store.array(variable.name)[region(variable, pipeline, block)])
-    flags = by_scene(variable, pipeline, block, values)
-    return np.asarray((flags != DetectionStatus.not_needed).all(axis=1))
+    names = variable.dimensions(pipeline)
+    scene = [names.index(axis.name) for axis in pipeline.experiment.scene_axes]
+    needed = values != DetectionStatus.not_needed
+    settings = tuple(k for k in range(len(names)) if k not in scene)
+    whole = needed.all(axis=settings, keepdims=True)
+    return np.asarray(whole.transpose([*scene, *settings]).reshape(-1))

@@ -43,9 +43,9 @@ from sweep.experiment.axes import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
-from sweep.experiment.schema import LABELS, VARIABLES, Variable
+from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.messages import refusal
-from sweep.sampling.rules import GroupResults, condition_axes
+from sweep.sampling.rules import GroupResults, condition_axes, result_dimensions
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -70,24 +70,13 @@ def group_dataset(results: GroupResults) -> xr.Dataset:
     arrays: dict[str, Any] = {}
     for name in dict.fromkeys([*REQUIRED_VARIABLES, *results.values]):
         variable = VARIABLES[name]
-        dims = _dimensions(pipeline, variable)
+        dims = result_dimensions(pipeline, variable)
         if name in results.values:
             arrays[name] = (dims, results.values[name])
         else:
             shape = [sizes[dim] if dim in sizes else len(LABELS[dim]) for dim in dims]
             arrays[name] = (dims, np.broadcast_to(np.float32(np.nan), shape))
     return xr.Dataset(arrays, coordinates)
-
-
-def _dimensions(pipeline: Pipeline, variable: Variable) -> list[str]:
-    """Return the dimensions of a variable's values in a group, in their order."""
-    names = variable.dimensions(pipeline)
-    order = [
-        *(axis.name for axis in condition_axes(pipeline)), TRIAL,
-        *(axis.name for stage in (Stage.detection, Stage.estimation)
-          for axis in pipeline.axes_of(stage)), *variable.inner,
-    ]
-    return [name for name in order if name in names]
 
 
 # --------------------------------------------------------------------------------------------------

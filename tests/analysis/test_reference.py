@@ -20,7 +20,6 @@ from support.small_datasets import (
     QUANTITIES,
     SHARES,
     SIZE_M,
-    VALUES,
     assert_values,
     draws_in,
     freedom_in,
@@ -42,6 +41,8 @@ from support.small_datasets import (
     wilson,
 )
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
+from sweep.analysis.estimator import MeanEstimate, length_interval
+from sweep.analysis.summaries import hypergeometric_moments
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -308,27 +309,8 @@ def test_a_coordinate_that_is_no_dimension_can_be_binned():
                      ("solver", "distance_m"), expected_errors)
 
 
-def test_failures_in_bins_are_those_of_plain_loops():
-    results, bins = GRIDS["all"], {"marker_area_px": EDGES}
-    answer = failure_composition(results, ("solver",), bins=bins)
-    groups = poses(results, "estimate", ("solver",), bins)
-    assert_all_agree(by_outcome(answer), groups, ("solver", *bins), expected_composition)
-
-
 FUNCTIONS_OF_ONE = pytest.mark.parametrize(
     "function", [detection_rate, flip_rate, failure_composition, error_statistics])
-
-
-@FUNCTIONS_OF_ONE
-def test_variables_are_described_and_lie_in_their_intervals(function):
-    answer = function(GRIDS["draws"], ("tilt_deg",)).compute()
-    for name, array in answer.data_vars.items():
-        assert array.attrs["long_name"], name
-        assert "units" in array.attrs or "flag_meanings" in array.attrs, name
-        if f"{name}_low" in answer:
-            assert not (answer[f"{name}_low"] > array).any(), name
-            assert not (answer[f"{name}_high"] < array).any(), name
-    assert answer["tilt_deg"].values.tolist() == VALUES["tilt_deg"][:2]
 
 
 def test_a_small_spread_about_a_large_bias_keeps_its_digits():
@@ -400,6 +382,27 @@ def test_a_draw_with_more_solved_settings_counts_more():
     answer = flip_rate(results)
     assert answer["solved"] == 10 * 30 + 90
     assert answer["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16
+
+
+@pytest.mark.parametrize(("components", "freedom"), [(2, 1.0), (3, 2.0), (3, 2.5), (3, 30.0)])
+def test_the_interval_of_a_length_is_scheffes_and_students(components, freedom):
+    one = MeanEstimate(*map(np.atleast_1d, (10.0, 0.5, freedom)))
+    value, low, high = (each.item() for each in length_interval(one, components))
+    rest = freedom - components + 1
+    reach = math.sqrt(components * freedom / rest * stats.f.ppf(0.95, components, rest)
+                      ) if rest > 0 else math.inf
+    assert (value, low) == (10.0, pytest.approx(max(0.0, 10.0 - 0.5 * reach), rel=1e-9))
+    assert high == pytest.approx(10.0 + 0.5 * stats.t.ppf(0.975, freedom), rel=1e-9)
+
+
+@pytest.mark.parametrize(("own", "total", "hits"), [(1, 2, 1), (1, 3, 1), (2, 5, 3), (4, 9, 2)])
+def test_moments_of_hits_are_those_of_the_hypergeometric_distribution(own, total, hits):
+    k = np.arange(own + 1)
+    chance = stats.hypergeom.pmf(k, total, hits, own)
+    mean = (chance * k).sum()
+    expected = mean, (chance * (k - mean)**2).sum(), (chance * (k - mean)**3).sum()
+    found = hypergeometric_moments(*map(np.float64, (own, total, hits)))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_a_solved_pose_without_a_number_counts_in_no_mean():

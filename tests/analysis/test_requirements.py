@@ -221,6 +221,19 @@ def test_requirements_hold_at_all_tilts_together():
     assert together["fails_where"].item() == "tilt_deg = 30"
 
 
+@pytest.mark.parametrize(("axis", "met", "ends"), [
+    ("distance_m", True, (0.8, np.inf)), ("distance_m", False, (-np.inf, -np.inf)),
+    ("side_px", True, (-np.inf, 12.0)), ("side_px", False, (np.inf, np.inf)),
+])
+def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
+    results = perfect(np.random.default_rng(1), {axis: 3, "trial": 100})
+    if not met:
+        results["detection"][:] = DetectionStatus.no_candidate
+    one = farthest_met(results, ["detection >= 0.9"], axis)
+    assert (float(one["low"]), float(one["high"])) == ends
+    assert Reach(int(one["reach"])) is (Reach.always if met else Reach.never)
+
+
 def test_sides_go_from_large_to_small():
     results = perfect(np.random.default_rng(1), {"side_px": 3, "trial": 100, "solver": 1})
     results["detection"].values[0] = DetectionStatus.no_candidate

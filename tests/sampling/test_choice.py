@@ -7,11 +7,13 @@ import pytest
 import xarray as xr
 
 import sweep
-from sweep.analysis.decisions import answers
-from sweep.analysis.requirements import Decision
+from support.small_datasets import perfect
+from sweep.analysis.decisions import answers, choice_cells
+from sweep.analysis.requirements import Decision, ErrorShares
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
@@ -272,3 +274,15 @@ def test_answers_name_the_next_size_and_what_it_fails_by():
     assert some.next_cause.condition == {"tilt_deg": 60.0}
     assert some.next_cause.value == pytest.approx(0.3, abs=0.15)
     assert some.next_cause.draws == 400
+
+
+@pytest.mark.parametrize(("most", "hopeless"), [(2450, True), (2500, False)])
+def test_what_too_few_poses_have_a_number_of_is_given_up(most, hopeless):
+    # 1 of 50 poses is solved: 2,450 trials are worth 49 draws, one fewer than means need.
+    results = perfect(np.random.default_rng(1), {"side_px": 2, "trial": 50})
+    results["estimate"].values[:, 1:] = EstimateStatus.solver_failed
+    rule = StoppingRule(kind="smallest", along="side_px", max_trials=most, unit=50,
+                        requirements=("rotation_rmse_deg <= 5",))
+    cells = choice_cells(results, rule, ErrorShares(met=0.1, not_met=0.05))
+    assert cells.hopeless.all() == hopeless
+    assert bool(cells.needed().any()) != hopeless

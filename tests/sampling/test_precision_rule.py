@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sweep.analysis.decisions import wanted_precisions
+from sweep.analysis.estimator import stopped_level
+from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -111,3 +114,11 @@ def test_unknown_quantities_are_named_all_at_once():
     assert "did you mean detection_rate?" in str(error.value)
     with pytest.raises(PipelineError, match="another half-width"):
         make_rule(pipeline_of("detection_rate = 0.1, detection = 0.2"))
+
+
+@pytest.mark.parametrize("width", [0.49, 0.2, 0.05, 0.01])
+def test_no_fewer_draws_than_are_told_make_an_interval_as_narrow(width):
+    fewest = wanted_precisions({"detection_rate": width})[0].fewest_draws
+    widths = [clopper_pearson(0, n, stopped_level(LEVEL))[1] / 2 for n in (fewest - 1, fewest)]
+    assert widths[1] <= width < widths[0]
+    assert wanted_precisions({"rotation_rmse_deg": width})[0].fewest_draws == 450

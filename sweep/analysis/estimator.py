@@ -726,13 +726,13 @@ class Sums(NamedTuple):
     run
         Whether the draw was run (groups, cells, draws).
     largest
-        The largest first component (groups,); -inf of none.
+        The largest first component (groups,); -inf of none; where it is asked for.
     """
 
     values: Floats
     used: Integers
     run: Masks
-    largest: Floats
+    largest: Floats = np.empty(0)
 
     @property
     def mean(self) -> Floats:
@@ -786,12 +786,15 @@ class Mean(Statistic[ViewT]):
             if centre is not None:
                 values = component_sum(
                     np.square(values - centre[groups, None, None, None]))[..., None]
+            sums = np.where(used[..., None], values, 0.0), used, poses.draws[..., None]
+            if not getattr(self, "guarded", False):
+                return sums
             largest = np.where(used, values[..., 0], -np.inf).max(axis=3, initial=-np.inf)
-            return (np.where(used[..., None], values, 0.0), used, poses.draws[..., None],
-                    largest[..., None])
+            return *sums, largest[..., None]
 
-        values, used, run, largest = columns.by_draw(parts)
-        return Sums(values, used, run > 0, largest.max(axis=(1, 2), initial=-np.inf))
+        values, used, run, *largest = columns.by_draw(parts)
+        return Sums(values, used, run > 0, *(
+            each.max(axis=(1, 2), initial=-np.inf) for each in largest))
 
 
 class MeanLength(Mean[ViewT]):
@@ -881,7 +884,7 @@ class StandardDeviation(RootMeanSquare[ViewT]):
         with np.errstate(all="ignore"):
             factor = n / (n - 1.0)
             return sums._replace(values=sums.values * factor[:, None, None, None],
-                                 largest=sums.largest * factor)
+                                 largest=sums.largest * factor if self.guarded else sums.largest)
 
 
 # --------------------------------------------------------------------------------------------------

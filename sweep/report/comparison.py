@@ -18,7 +18,6 @@ from sweep.report.report_data import (
     CONFIGURATION,
     Configurations,
     ReportData,
-    by_configuration,
     configurations,
 )
 from sweep.report.table import Column, Table, Value, number
@@ -252,8 +251,7 @@ def _against_each(
     reference = with_configuration(data.results, at).isel(chosen)
     tables = data.once(("against", tuple(at.items()), grouping), lambda: paired(
         data.results.isel(chosen), reference, grouping.dims))
-    shown, deciding = (
-        by_configuration(data.pipeline, each, grouping.dims)[1] for each in tables)
+    shown, deciding = map(known.settings.stacked, tables)
     return [() if k == best else _differences(*(
         each.isel({CONFIGURATION: k}) for each in (shown, deciding)))
             for k in range(len(known.names))]

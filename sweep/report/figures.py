@@ -43,7 +43,6 @@ from sweep.report.report_data import (
     ReportData,
     Settings,
     best_first,
-    by_configuration,
     configurations,
     course_of,
     settings_of,
@@ -199,8 +198,7 @@ def grouped(
     groups = groups or Grouping()
     settings = settings_of(data, stages, without)
     grouping = settings.grouping + groups
-    _, summary = by_configuration(
-        data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
+    summary = settings.stacked(data.analysed(analysis, grouping))
     return Grouped(data, settings, summary, groups.dims, grouping.notes)
 
 
@@ -479,7 +477,7 @@ def _ambiguity(data: ReportData) -> Figure | None:
             "largest angle", data.results[["viewing_angle_deg"]].max
     )["viewing_angle_deg"] > FRONTAL_DEG:
         return None
-    pooled = _by_configuration(data, Grouping())
+    pooled = grouped(data, ambiguity).summary
     curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values
                             & (pooled["flipped"] > 0).values)
     if not curved.size:
@@ -505,7 +503,7 @@ def threshold_tables(data: ReportData) -> list[Table]:
         return []
     along = data.size or data.angle_axis
     grouping = data.along(along, CONDITIONS) if along else Grouping()
-    table = _by_configuration(data, grouping)
+    table = grouped(data, ambiguity, grouping).summary
     usual = {f"{column.variable}{end}": table[f"{column.variable}{end}"].sel(
                  threshold=USUAL, drop=True)
              for column in KEPT_AT_USUAL for end in ("", "_low", "_high")
@@ -518,15 +516,6 @@ def threshold_tables(data: ReportData) -> list[Table]:
         table.assign(usual).assign(choice=words),
         f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
         [CONFIGURATION, *grouping.dims], KEPT_AT_USUAL, data.results)]
-
-
-def _by_configuration(data: ReportData, grouping: Grouping) -> xr.Dataset:
-    """Return `ambiguity` by all configurations (configuration, ...), which it never pools."""
-    table = data.analysed(ambiguity, grouping)
-    single = [str(name) for name in table.dims
-              if name not in (*grouping.dims, *data.setting_axes, "threshold")]
-    table = table.isel(dict.fromkeys(single, 0), drop=True)
-    return by_configuration(data.pipeline, table, data.setting_axes)[1].assign_attrs(table.attrs)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -99,25 +99,6 @@ def chosen_of(name: str, length: int, most: int) -> Grouping:
     return Grouping((name,), chosen=((name, chosen),), notes=(note,))
 
 
-def by_configuration(
-    pipeline: Pipeline, table: xr.Dataset, dims: Sequence[str]
-) -> tuple[list[str], xr.Dataset]:
-    """Return the labels of all combinations of the settings ``dims``, and the table by them.
-
-    In the table the dimension ``configuration`` stands in place of ``dims``; without any it has
-    one row. Combinations that differ in settings alone which they do not use are one.
-    """
-    values = [table[dim].values.tolist() for dim in dims]
-    combinations = [dict(zip(dims, chosen, strict=True)) for chosen in itertools.product(*values)]
-    kept = distinct(pipeline, combinations)
-    labels = [configuration_label(used_settings(pipeline, combinations[k])) for k in kept]
-    stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False) if dims else (
-        table.expand_dims(CONFIGURATION))
-    stacked = stacked.isel({CONFIGURATION: kept}).drop_vars([*dims], errors="ignore")
-    stacked = stacked.assign_coords({CONFIGURATION: labels})
-    return labels, stacked.transpose(CONFIGURATION, ...)
-
-
 # --------------------------------------------------------------------------------------------------
 # The data of a report: a store's results, the roles of its axes, and analyses computed once.
 
@@ -436,17 +417,29 @@ class Settings:
     kept
         Which of all combinations, the last axis fastest, are configurations of their own: the first
         of those that differ in settings alone which they do not use.
+    names
+        The labels of those.
     """
 
     axes: dict[str, tuple[int, ...]]
     grouping: Grouping
     kept: tuple[int, ...]
+    names: tuple[str, ...]
 
     @property
     def combinations(self) -> list[dict[str, int]]:
         """The index along each axis, of every configuration; one that is empty without axes."""
         every = list(itertools.product(*self.axes.values()))
         return [dict(zip(self.axes, every[k], strict=True)) for k in self.kept]
+
+    def stacked(self, table: xr.Dataset) -> xr.Dataset:
+        """Return a table by these axes with the dimension ``configuration`` in their place."""
+        dims = list(self.axes)
+        flat = table.stack({CONFIGURATION: dims}, create_index=False) if dims else (
+            table.expand_dims(CONFIGURATION))
+        flat = flat.isel({CONFIGURATION: list(self.kept)}).drop_vars(dims, errors="ignore")
+        named = flat.assign_coords({CONFIGURATION: list(self.names)})
+        return named.transpose(CONFIGURATION, ...).assign_attrs(table.attrs)
 
 
 def settings_of(
@@ -470,9 +463,10 @@ def settings_of(
         axes[name] = dict(part.chosen).get(name, tuple(range(length)))
         grouping += part
     values = [[data.results[name].values.tolist()[k] for k in some] for name, some in axes.items()]
-    kept = distinct(data.pipeline, [
-        dict(zip(axes, each, strict=True)) for each in itertools.product(*values)])
-    return Settings(axes, grouping, tuple(kept))
+    every = [dict(zip(axes, each, strict=True)) for each in itertools.product(*values)]
+    kept = distinct(data.pipeline, every)
+    names = (configuration_label(used_settings(data.pipeline, every[k])) for k in kept)
+    return Settings(axes, grouping, tuple(kept), tuple(names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,15 +515,14 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
     if targets and not settings.axes:
         # Nothing else varies on the same draws: the values of an effect are what is compared.
         settings = settings_of(data, scene=data.effect_axes)
-    names, summary = by_configuration(
-        data.pipeline, data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
+    summary = settings.stacked(data.analysed(error_statistics, settings.grouping))
     axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
     flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
         [len(axis) for axis in axes])
     flags = flags[np.ix_(*(settings.axes[axis.name] for axis in axes))] if axes else flags
     lengths = [len(some) for some in settings.axes.values()]  # those of targets stand first
     wrong = np.broadcast_to(flags, lengths).reshape(-1)[list(settings.kept)]
-    names = [name + WRONG * bool(flag) for name, flag in zip(names, wrong, strict=True)]
+    names = [name + WRONG * bool(flag) for name, flag in zip(settings.names, wrong, strict=True)]
 
     def column(name: str, missing: float) -> NDArray[np.float64]:
         values = summary[name].values.astype(np.float64)

@@ -48,10 +48,9 @@ LEGEND: tuple[tuple[str, Colour], ...] = (
     ("true outline", TRUTH), ("detected corners (dot: the first)", DETECTED),
     ("other detection", OTHER), ("rejected candidate", REJECTED),
     ("estimated x", AXES[0]), ("y", AXES[1]), ("z", AXES[2]),
+    ("corners of a chessboard", CHESSBOARD),
 )
 """The meaning of the colours."""
-
-CHESSBOARD_LEGEND = ("corners of the chessboard", CHESSBOARD)
 
 MAX_SIDE = 900
 MIN_SIDE = 560
@@ -211,18 +210,11 @@ def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
 
 def _legend(scene: SceneInspection) -> list[tuple[str, Colour]]:
     """Return the entries of the legend that a scene needs."""
-    legend = [LEGEND[0]]
-    if np.isfinite(scene.markers).all(axis=(1, 2)).any():
-        legend.append(LEGEND[1])
-    if np.isfinite(scene.chessboard).any():
-        legend.append(CHESSBOARD_LEGEND)
-    if other_quadrilaterals(scene):
-        legend.append(LEGEND[2])
-    if scene.rejected:
-        legend.append((f"rejected candidates: {len(scene.rejected)}", REJECTED))
-    if np.isfinite(scene.axes_px).all():
-        legend += LEGEND[-3:]
-    return legend
+    present = (
+        True, np.isfinite(scene.markers).all(axis=(1, 2)).any(), other_quadrilaterals(scene),
+        scene.rejected, *[np.isfinite(scene.axes_px).all()] * 3,
+        np.isfinite(scene.chessboard).any())
+    return [entry for entry, shown in zip(LEGEND, present, strict=True) if shown]
 
 
 def _caption(
@@ -410,12 +402,8 @@ class Scene:
         The picture in words.
     picture
         A PNG; None if ``problem`` says why there is none.
-    size
-        Width and height of the picture, px.
     problem
         Why there is no picture, or how it differs from the stored values; empty otherwise.
-    chessboard
-        Whether corners of a chessboard are drawn.
     """
 
     titles: tuple[str, ...]
@@ -424,9 +412,7 @@ class Scene:
     result: str
     alt: str
     picture: bytes | None
-    size: tuple[int, int] = (0, 0)
     problem: str = ""
-    chessboard: bool = False
 
 
 def scenes_of(data: ReportData) -> Iterator[Scene]:
@@ -469,10 +455,8 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
     return dataclasses.replace(
         scene, result=result, picture=encoded.tobytes(),
         problem=f"Differs from the store: {difference}." if difference else "",
-        size=(picture.shape[1], picture.shape[0]),
         alt=f"Rendered {data.pipeline.target_word} with its true outline and the detections: "
             f"{result}",
-        chessboard=bool(np.isfinite(inspected.chessboard).any()),
     )
 
 

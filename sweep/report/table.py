@@ -252,9 +252,7 @@ class Table:
         stub: int = 1, words: bool = False,
     ) -> Table:
         """Return a table of rows."""
-        frame = pd.DataFrame(index=range(len(rows)), columns=list(headings), dtype=object)
-        for column, cells in enumerate(zip(*rows, strict=True)):
-            frame.isetitem(column, pd.Series(_boxed(cells), dtype=object))
+        frame = pd.DataFrame(list(map(list, rows)), columns=list(headings), dtype=object)
         return cls(caption, frame, stub, words)
 
     @property
@@ -335,14 +333,6 @@ class Table:
         return {"caption": self.caption, "rows": [
             dict(zip(headings, map(json_cell, row), strict=True))
             for row in self.frame.to_numpy().tolist()]}
-
-
-def _boxed(cells: Sequence[Any]) -> np.ndarray[Any, Any]:
-    """Return cells (n,) as objects, tuples too."""
-    boxed = np.empty(len(cells), dtype=object)
-    for k, cell in enumerate(cells):
-        boxed[k] = cell
-    return boxed
 
 
 UNDECIDED = 3

@@ -10,19 +10,16 @@ import re
 import shlex
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.axes import Axis
-from sweep.measure.flags import DetectionStatus
-from sweep.messages import label
+from sweep.messages import label, quoted
 from sweep.report.answer import Answer, answer
 from sweep.report.figure import Figure, Panel, panels_file
 from sweep.report.figures import figures_of
@@ -31,9 +28,8 @@ from sweep.report.output_file import (
     write_errors_explained,
     write_output_file,
 )
-from sweep.report.report_data import AREA, ReportData, store_errors
+from sweep.report.report_data import ReportData
 from sweep.report.scenes import (
-    CHESSBOARD_LEGEND,
     LEGEND,
     Scene,
     css_colour,
@@ -47,34 +43,16 @@ from sweep.store.locations import enclosing_store, is_remote
 # --------------------------------------------------------------------------------------------------
 # Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """Origin of a report's numbers.
+def provenance(data: ReportData, output: str) -> dict[str, Any]:
+    """Return the origin of a store's numbers; ``output`` is the report's own file.
 
-    Attributes
-    ----------
-    facts
-        Name -> fact, as text.
-    commands
-        Command lines that reproduce the store and the report.
-    axes
-        Table of the grid's axes; None for a single pose.
-    drawn
-        The distributions of drawn parameters, as text.
-    pipeline, file
-        Text of the pipeline, and the name of its file.
+    Returns
+    -------
+    dict
+        ``facts``: name -> text. ``commands`` that reproduce the store and the report. ``axes``: a
+        table, or None for a single pose. ``drawn``: the distributions of drawn parameters.
+        ``pipeline`` and ``file``: the pipeline's text, and the name of its file.
     """
-
-    facts: Mapping[str, str]
-    commands: tuple[str, ...]
-    axes: Table | None
-    drawn: str
-    pipeline: str
-    file: str
-
-
-def provenance(data: ReportData, output: str) -> Provenance:
-    """Return the origin of a store's numbers; ``output`` is the report's own file."""
     fingerprint: dict[str, Any] = dict(data.run_metadata.get("fingerprint", {}))
     environment: dict[str, Any] = dict(data.run_metadata.get("environment", {}))
     versions = ", ".join(
@@ -100,17 +78,20 @@ def provenance(data: ReportData, output: str) -> Provenance:
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
     store = shlex.quote(data.store)
-    trade = [f"sweep tradeoff {store}{_per(data)}"] if data.trade is not None else []
-    return Provenance(
-        facts,
-        (f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
-         data.command or f"sweep report {store} -o {shlex.quote(output)}"),
-        _axes(data),
-        "; ".join(f"{name} {distribution}"
-                  for name, distribution in data.pipeline.distributions.items()),
-        data.pipeline.text,
-        f"{data.pipeline.name}.toml",
-    )
+    trade = [] if data.trade is None else [quoted("sweep", "tradeoff", data.store, *(
+        word for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
+        for word in ("--per", name)))]
+    return {
+        "facts": facts,
+        "commands": (
+            f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
+            data.command or f"sweep report {store} -o {shlex.quote(output)}"),
+        "axes": _axes(data),
+        "drawn": "; ".join(f"{name} {distribution}"
+                           for name, distribution in data.pipeline.distributions.items()),
+        "pipeline": data.pipeline.text,
+        "file": f"{data.pipeline.name}.toml",
+    }
 
 
 def _dates(run_metadata: Mapping[str, Any]) -> str:
@@ -119,15 +100,6 @@ def _dates(run_metadata: Mapping[str, Any]) -> str:
         for name, default in (("created", "unknown"), ("finished_at", ""))
     )
     return f"begun {created}" + (f", finished {finished}" if finished else "")
-
-
-def _per(data: ReportData) -> str:
-    """Return the options of `sweep tradeoff` that give the trade its conditions."""
-    if data.trade is None:
-        return ""
-    return "".join(
-        f" --per {name}" for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
-    )
 
 
 def _axes(data: ReportData) -> Table | None:
@@ -164,14 +136,13 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def page(
-    title: str, answer: Answer, provenance: Provenance, figures: Sequence[Figure],
+    title: str, answer: Answer, provenance: Mapping[str, Any], figures: Sequence[Figure],
     scenes: Sequence[Scene], require: Sequence[str] = (), folder: str = "",
 ) -> str:
     """Return the report as HTML; all text is escaped.
 
     With ``folder``, the name of the folder of figures and scenes, it is Markdown.
     """
-    legend = (*LEGEND, *([CHESSBOARD_LEGEND] if any(scene.chessboard for scene in scenes) else []))
     html = not folder
     environment = Environment(
         loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
@@ -183,7 +154,7 @@ def page(
     text = environment.get_template("page.html" if html else "page.jinja").render(
         policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
         scenes=scenes, require=require, base=quote(folder),
-        legend=[(text, css_colour(colour)) for text, colour in legend])
+        legend=[(text, css_colour(colour)) for text, colour in LEGEND])
     return text.rstrip("\n") + "\n"
 
 
@@ -210,11 +181,6 @@ def _code(text: str, language: str) -> str:
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
-COMPUTED_FLAGS = ("detection", "estimate", "flipped")
-"""Flags that are not ``not_run`` in any cell of a finished store."""
-
-REPAIR = "`sweep verify --repair` repairs it"
-
 
 def check_output(output: Path, folders: Sequence[Path], store: str) -> None:
     """Check that a report can be written, before it is computed.
@@ -280,7 +246,6 @@ def write_report(
     check_output(output, folders, data.store)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
-    _check_complete(data)
     title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))
     rendered = figures_of(data)
@@ -308,17 +273,3 @@ def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
         folder.mkdir(exist_ok=True)
         for name, content in pictures.items():
             write_whole(folder / name, content)
-
-
-def _check_complete(data: ReportData) -> None:
-    """Check that every pose of the finished store was computed: a lost chunk reads as not run."""
-    lost = xr.zeros_like(data.results[AREA], dtype=bool)
-    for name in COMPUTED_FLAGS:
-        flag = data.results[name]
-        missing = flag == DetectionStatus.not_run
-        lost |= missing.any([dim for dim in flag.dims if dim not in lost.dims])
-    with store_errors(data.store):
-        count = int(lost.sum())
-    if count:
-        poses = "1 pose is" if count == 1 else f"{count:,} poses are"
-        raise StoreError(f"{data.store}: {poses} missing; {REPAIR}")

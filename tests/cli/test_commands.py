@@ -17,7 +17,8 @@ import pytest
 import sweep
 from support.here import calls_here
 from sweep import cli, installation
-from sweep.cli.command import SESSION, print_error
+from sweep.cli.command import SESSION, findings, print_error
+from sweep.cli.command import answer as printed
 from sweep.cli.parser import COMMANDS, GUIDES, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
 from sweep.execution.progress import Progress
@@ -194,6 +195,16 @@ def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
     err = capsys.readouterr().err
     assert err.count("\n") == len(getattr(error, "faults", ["one"]))
     assert "\x1b" not in err  # it would reach the terminal
+
+
+@pytest.mark.parametrize("form", ["text", "markdown", "json"])
+def test_names_and_texts_of_a_store_steer_no_terminal(form, capsys, monkeypatch):
+    monkeypatch.setattr(SESSION, "form", form)
+    clear = "name\x1b[2J\x07\x9b"
+    assert printed(findings([clear], {"name": clear}, 0, f"sweep report {clear}")) == 0
+    said = capsys.readouterr().out
+    assert "name" in said
+    assert all(line.isprintable() for line in said.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from sweep.report.figure import Panel, Series, value_scale
 from sweep.report.figures import interval_note
 from sweep.report.scenes import FAILURES, Scene
 from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
-from sweep.report.write_report import Provenance, page
+from sweep.report.write_report import page
 
 HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
 
@@ -31,8 +31,8 @@ def hostile_page():
         [Column("n", "n")])
     scenes = [Scene((HOSTILE,), HOSTILE, HOSTILE, HOSTILE, HOSTILE, picture, problem=HOSTILE)
               for picture in (b"png", None)]
-    origin = Provenance({"Store": HOSTILE, "Report": HOSTILE}, (HOSTILE,), hostile_table(),
-                        HOSTILE, HOSTILE, HOSTILE)
+    origin = {"facts": {"Store": HOSTILE, "Report": HOSTILE}, "commands": [HOSTILE],
+              "axes": hostile_table(), "drawn": HOSTILE, "pipeline": HOSTILE, "file": HOSTILE}
     numbers = Answer(HOSTILE, HOSTILE, HOSTILE, (Tile(HOSTILE, HOSTILE, HOSTILE),),
                      (hostile_table(),), (hostile_table(),))
     return page(HOSTILE, numbers, origin, [figure], scenes, [HOSTILE])

@@ -40,8 +40,8 @@ from sweep.typing import Floats, Integers
 #
 # The markers of the held-out photographs are simulated at their poses with the scene that the
 # others gave, and with each of its effects left out in turn. An effect is worth having if it
-# narrows the gap between the errors of photographs and simulation by more than other random
-# numbers do.
+# narrows the gap between the errors of photographs and simulation. Those that are not are left out
+# if the gap is not wider without all of them.
 
 MIN_HELD_OUT = 5
 """Held-out photographs from which errors have intervals."""
@@ -49,15 +49,10 @@ MIN_HELD_OUT = 5
 MAX_MARKERS = 12
 """Markers of a photograph whose errors are compared."""
 
-REPEATS = 8
+REPEATS = 4
 """Simulations of each photograph. With one, the simulation's own random errors decide whether an
-effect narrows the gap: of five photographs with shifts of 0.15 px, leaving the shifts out changed
-it by -0.04 to 0.27 half-widths, and with eight by 0.03 to 0.28."""
-
-MIN_GAIN = 0.05
-"""Half-widths of the intervals by which an effect narrows the mean gap, to be worth having. Effects
-that move no error (light, the noise's correlation) changed it there by ± 0.02 (standard deviation),
-0.05 at most; by ± 0.03 with one simulation of each photograph."""
+effect narrows the gap. Effects that move no error (light, the noise's correlation) changed it by
+± 0.02 half-widths of the intervals (standard deviation) with eight."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +95,7 @@ class HeldOut:
         """
         size = gap_size(full, full)
         return {
-            switch: gap_size(self.gap(scene, f"all but {switch}"), full) - size > MIN_GAIN
+            switch: gap_size(self.gap(scene, f"all but {switch}"), full) > size
             for switch, scene in rest.items()
         }
 
@@ -374,7 +369,9 @@ def _checked(
     })
     refused = {switch: NOT_NEEDED for switch, needed in worth.items() if not needed}
     if refused:
-        found = fit_scene(views, taken, board, refused, known)
-        half = fit_scene(others, taken, board, refused, known)
-        gap = photographs.gap(half.scene, "what is kept")
+        rest = photographs.gap(
+            fit_scene(others, taken, board, refused, known).scene, "what is kept"
+        )
+        if gap_size(rest, gap) <= gap_size(gap, gap):
+            found, gap = fit_scene(views, taken, board, refused, known), rest
     return found, gap

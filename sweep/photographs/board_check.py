@@ -169,42 +169,37 @@ def _on_board(board: Board, ids: Integers) -> tuple[Masks, Floats]:
     return known, board.corners_m[[index[each] for each in ids[known].tolist()], :, :2]
 
 
+COUNTS = {
+    "charuco": ("squares_x", "squares_y"), "grid": ("columns", "rows"),
+    "aprilgrid": ("tagCols", "tagRows"),
+}
+"""Kind of a board -> keys of how many squares or markers it has across and down."""
+
+
 def _others(path: Path) -> Iterator[tuple[str, Board]]:
     """Yield boards that differ from a file's in what is often mistaken, each in words."""
     document = tomllib.loads(path.read_text())
-    legacy = bool(document.get("legacy_pattern", False))
-    changes: list[dict[str, Any]] = []
-    if document.get("kind") == "charuco":
-        pattern = {"legacy_pattern": not legacy}
-        swapped = {"squares_x": document["squares_y"], "squares_y": document["squares_x"]}
-        changes = [pattern, swapped, {**pattern, **swapped}]
+    kind = document.get("kind")
+    if kind not in COUNTS:
+        return
+    across, down = COUNTS[kind]
+    width, height = document[across], document[down]
+    sizes: list[dict[str, Any]] = [{}, {across: height, down: width}, *(
+        {across: width + x, down: height + y}
+        for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
+    )]
+    pattern = {"legacy_pattern": not document.get("legacy_pattern", False)}
+    changes = [
+        {**size, **also} for size in sizes for also in ({}, pattern if kind == "charuco" else {})
+    ]
+    ids = list(document.get("ids", range(width * height)))
+    if kind == "grid" and len(ids) == width * height:
+        lines = np.array(ids).reshape(height, width)
         changes += [
-            {"squares_x": document["squares_x"] + x, "squares_y": document["squares_y"] + y, **also}
-            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
-            for also in ({}, pattern)
+            {"ids": each.ravel().tolist(), "first_id": None}
+            for each in (lines[::-1, ::-1], lines[::-1])
         ]
-    elif document.get("kind") == "grid":
-        rows, columns = document["rows"], document["columns"]
-        changes = [{"rows": columns, "columns": rows}]
-        changes += [
-            {"rows": rows + y, "columns": columns + x}
-            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
-        ]
-        count = rows * columns
-        ids = list(document.get("ids", range(count)))
-        changes.append({"ids": ids[::-1], "first_id": None})
-        if len(ids) == count:
-            by_rows = [ids[k * columns : (k + 1) * columns] for k in range(rows)]
-            changes.append({"ids": [each for row in by_rows[::-1] for each in row],
-                            "first_id": None})
-    elif document.get("kind") == "aprilgrid":
-        rows, columns = document["tagRows"], document["tagCols"]
-        changes = [{"tagRows": columns, "tagCols": rows}]
-        changes += [
-            {"tagRows": rows + y, "tagCols": columns + x}
-            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
-        ]
-    for change in changes:
+    for change in filter(None, changes):
         changed = {key: value for key, value in {**document, **change}.items() if value is not None}
         try:
             other = board_of(changed, "board")

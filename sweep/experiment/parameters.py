@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache, lru_cache
@@ -195,35 +195,25 @@ def section_of_settings(kind: str) -> str:
 
 
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield kind, name and key of each plug-in that a document names, in its order."""
+    """Yield kind, name and key of each plug-in that a document names, or means to, in its order."""
     installed = cache(installed_names)
     for kind, parameter in NAMED_BY.items():
+        # Where there are several choices, another word is more likely one of them, misspelt.
+        few = len(parameter.declaration.choices) == 1
         for key, value in places(document, parameter).items():
             listed = value.get("values") if isinstance(value, dict) else value
             for name in listed if isinstance(listed, list) else [listed]:
-                if isinstance(name, str) and _is_plugin(parameter, name, installed):
-                    yield kind, name, key
+                if not isinstance(name, str):
+                    continue
+                try:
+                    parameter.check(name)
+                except ValueError:
+                    if few or ":" in name or name in installed(kind):
+                        yield kind, name, key
     effects = document.get(EFFECTS_KEY)
     for name in effects if isinstance(effects, list) else ():
         if isinstance(name, str):
             yield "effect", name, EFFECTS_KEY
-
-
-def _is_plugin(
-    parameter: Parameter, name: str, installed: Callable[[str], Sequence[str]]
-) -> bool:
-    """Return whether a value names a plug-in, or is meant to: it is none of the choices.
-
-    ``installed`` returns the names of the installed plug-ins of a kind.
-    """
-    try:
-        parameter.check(name)
-    except ValueError:
-        kind = parameter.declaration.plugin
-        # Where there are several choices, a misspelt one is more likely.
-        few = len(parameter.declaration.choices) == 1
-        return few or ":" in name or name in installed(kind)
-    return False
 
 
 def read_plugins(

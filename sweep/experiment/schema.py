@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.draws import CALIBRATED
+from sweep.experiment.grid import Grid
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
 from sweep.measure.flags import (
     BoundStatus,
@@ -29,8 +30,6 @@ from sweep.model.calibration import VIEW
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from sweep.experiment.grid import Grid
 
 
 # --------------------------------------------------------------------------------------------------
@@ -112,48 +111,21 @@ FIXED = "fixed"
 """Attribute of the coordinates of fixed parameters; tables of analyses leave them out."""
 
 
-@dataclass(frozen=True, slots=True)
-class FixedValue:
-    """A parameter with one value on the whole grid: a coordinate without dimensions.
-
-    Attributes
-    ----------
-    name
-        The parameter's.
-    value
-        A number, a truth value, or a text (a list of numbers as "0.1, 0").
-    attributes
-        Meaning as ``long_name``, :data:`FIXED`, and ``units`` if it has a unit.
-    """
-
-    name: str
-    value: float | bool | str
-    attributes: Mapping[str, str]
-
-
-def fixed_values(pipeline: Grid) -> list[FixedValue]:
-    """Return the fixed parameters that are coordinates, in the order of their declaration.
+def fixed_values(pipeline: Grid) -> dict[str, tuple[float | bool | str, dict[str, str]]]:
+    """Return value and attributes of the fixed parameters that are coordinates without dimensions.
 
     They are those of marker and pose that have a value (unless the pose is given otherwise), and
-    all that the pipeline gives.
+    all that the pipeline gives, in the order of their declaration; a list of numbers as a text.
     """
     without = superseded(pipeline.given)
-    return [
-        FixedValue(parameter.name, value, _attributes(parameter))
-        for parameter in pipeline.parameters.values()
-        if parameter.section in ALWAYS_GIVEN or parameter.name in pipeline.given
-        if parameter.name not in without
-        if (value := _scalar(pipeline.fixed.get(parameter.name))) is not None
-    ]
-
-
-def _scalar(value: Any) -> float | bool | str | None:
-    return label(value) if isinstance(value, tuple) else value
-
-
-def _attributes(parameter: Parameter) -> dict[str, str]:
-    unit = {"units": parameter.unit} if parameter.unit else {}
-    return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
+    return {
+        each.name: (label(value) if isinstance(value, tuple) else value, {
+            "long_name": each.declaration.meaning, FIXED: "on the whole grid",
+            **({"units": each.unit} if each.unit else {})})
+        for each in pipeline.parameters.values()
+        if each.section in ALWAYS_GIVEN or each.name in pipeline.given
+        if each.name not in without and (value := pipeline.fixed.get(each.name)) is not None
+    }
 
 
 # --------------------------------------------------------------------------------------------------

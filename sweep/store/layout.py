@@ -144,8 +144,8 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
     planned += _distance(pipeline)
     planned += _photographs(pipeline)
     planned += [
-        _coordinate(fixed.name, (), fixed.value, fixed.attributes)
-        for fixed in fixed_values(pipeline) if fixed.name not in VARIABLES
+        _coordinate(name, (), value, attributes)
+        for name, (value, attributes) in fixed_values(pipeline).items() if name not in VARIABLES
     ]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))

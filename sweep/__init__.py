@@ -721,20 +721,10 @@ def measure_tradeoff(
     >>> found.data.detection_ms.item() > 0  # milliseconds a frame
     True
     """
-    library.questions.check_trade(criterion, limit_s, budget_ms)
-    figure = None if output is None else os.fspath(output)
-    library.output_file.figure_file(figure)
-    source = os.fspath(store)
-    if source.lower().endswith(".toml"):
-        with library.progress.progress_report(progress) as report:
-            summary = library.runner.execute(_pipeline(source), None, progress=report)
-        for line in summary.warnings:
-            notice(line)
-        source = summary.store
     with library.progress.stage_display() if progress else contextlib.nullcontext() as stage:
         return library.questions.tradeoff(
-            source, per=per, criterion=criterion, limit_s=limit_s, budget_ms=budget_ms,
-            output=figure, progress=stage)
+            os.fspath(store), per=per, criterion=criterion, limit_s=limit_s, budget_ms=budget_ms,
+            output=None if output is None else os.fspath(output), progress=stage)
 
 
 def compare(

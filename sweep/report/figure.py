@@ -60,8 +60,8 @@ MATPLOTLIB_STYLE: Any = {
 }
 """Settings of matplotlib in which every panel is drawn."""
 
-WIDTH, HEIGHT = 4.4, 3.2
-"""Inches of a panel; a wide panel has twice the width."""
+WIDTH, HEIGHT, LINE_HEIGHT = 4.4, 3.2, 0.15
+"""Inches of a panel, and of a line of its legend; a wide panel has twice the width."""
 
 COLUMNS = 2
 DOTS_PER_INCH = 150
@@ -283,8 +283,17 @@ class Panel:
 
     @property
     def height(self) -> float:
-        """Its height in inches."""
-        return max(1.6, 0.9 + 0.19 * len(self.names)) if self.names else HEIGHT
+        """Its height in inches; the legend takes none of the room of few lines."""
+        if self.names:
+            return max(1.6, 0.9 + 0.19 * len(self.names))
+        lines = math.ceil(len(self.series) / self.legend_columns)
+        return HEIGHT + LINE_HEIGHT * max(0, lines - 2)
+
+    @property
+    def legend_columns(self) -> int:
+        """Entries of the legend that stand side by side."""
+        longest = max((len(line.label) for line in self.series), default=0)
+        return max(1, min(len(self.series), LEGEND_CHARS // (longest + 6)))
 
     @property
     def alt(self) -> str:
@@ -320,12 +329,12 @@ class Panel:
         if len(labels) < 2:
             axes.set_title(self.title)
             return
-        columns = max(1, min(len(labels), LEGEND_CHARS // (max(map(len, labels)) + 6)))
         axes.legend(
             title=self.title, alignment="left",
             title_fontproperties={"weight": "bold", "size": 9.5}, loc="lower left",
-            bbox_to_anchor=(-0.02, 1.0), ncols=columns, borderaxespad=0, handlelength=2.2,
-            columnspacing=1.1, handletextpad=0.5, labelspacing=0.25, borderpad=0.2)
+            bbox_to_anchor=(-0.02, 1.0), ncols=self.legend_columns, borderaxespad=0,
+            handlelength=2.2, columnspacing=1.1, handletextpad=0.5, labelspacing=0.25,
+            borderpad=0.2)
 
     def _rows(self, axes: Axes) -> None:
         axes.set_ylim(len(self.names) - 0.4, -0.6)

@@ -6,6 +6,7 @@ and behind the commands.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -27,9 +28,10 @@ from sweep.analysis.requirements import (
 )
 from sweep.analysis.simulation_gaps import is_measured
 from sweep.errors import ArgumentError
-from sweep.execution.progress import StageReport
+from sweep.execution.progress import StageReport, progress_display
+from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
-from sweep.messages import byte_count, nearest, quoted
+from sweep.messages import byte_count, nearest, notice, quoted
 from sweep.report import decisions
 from sweep.report.comparison import trade_lines
 from sweep.report.comparison_tables import (
@@ -106,28 +108,26 @@ def _selected(url: str, at: Sequence[str]) -> tuple[xr.Dataset, Pipeline]:
 # --------------------------------------------------------------------------------------------------
 # What each configuration costs.
 
-def check_trade(criterion: str, limit_s: float, budget_ms: float | None) -> None:
-    """Check what is asked of a tradeoff; ArgumentError for what cannot be."""
-    if criterion not in CRITERIA:
-        raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
-                            + nearest(criterion, CRITERIA))
-    check_positive("budget_ms", 1.0 if budget_ms is None else budget_ms)
-    check_positive("limit_s", limit_s)
-
-
-def check_positive(name: str, value: float) -> None:
-    """Check the value of an argument; ArgumentError if it is no finite number above 0."""
-    if not 0 < value < math.inf:
-        raise ArgumentError(name, value, "expected a finite number above 0")
-
-
 def tradeoff(
     store: str, *, per: Sequence[str], criterion: str, limit_s: float,
     budget_ms: float | None = None, output: str | None = None, progress: StageReport | None = None,
 ) -> Findings:
     """Measure cost and accuracy of a store's configurations; as `sweep.measure_tradeoff`."""
-    check_trade(criterion, limit_s, budget_ms)
+    if criterion not in CRITERIA:
+        raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
+                            + nearest(criterion, CRITERIA))
+    for name, value in (("budget_ms", budget_ms), ("limit_s", limit_s)):
+        if value is not None and not 0 < value < math.inf:
+            raise ArgumentError(name, value, "expected a finite number above 0")
     figure = figure_file(output)
+    if store.lower().endswith(".toml"):
+        pipeline = read_pipeline(store)
+        check_required(pipeline.requirements, store)
+        with progress_display() if progress else contextlib.nullcontext() as display:
+            summary = execute(pipeline, None, progress=display)
+        for line in summary.warnings:
+            notice(line)
+        store = summary.store
     question: dict[str, str | float] = {"criterion": criterion}
     if budget_ms is not None:
         question["budget_ms"] = budget_ms

@@ -314,10 +314,6 @@ def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(
     assert not measured
 
 
-# Nothing to be seen.
-
-# A pose that failed in the run.
-
 # Ctrl-C.
 
 @pytest.mark.long
@@ -466,6 +462,3 @@ def test_budget_is_told_by_the_command_and_checked(store):
     assert content["advice"][0].startswith("within 1e+09 ms a frame: ")
     code, out, err = command(store, "--budget-ms", "0")
     assert (code, out, err) == (2, "", "--budget-ms 0.0: expected a finite number above 0\n")
-
-
-# Agreement.

@@ -358,12 +358,26 @@ def _box(ends: Floats) -> Floats:
     return np.concatenate([points.min(axis=0), points.max(axis=0)])
 
 
-def box_corners(boxes: Floats) -> Floats:
-    """Return the corners (n, 4, 3) of boxes (n, 4): TL, TR, BR, BL; x right, y up."""
+def along_sides(corners: Floats, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, D) along the sides of quadrilaterals (n, 4, D)."""
+    t = np.arange(per_side)[:, None] / per_side
+    sides = (np.roll(corners, -1, axis=1) - corners)[:, :, None]
+    return (corners[:, :, None] + t * sides).reshape(len(corners), 4 * per_side, corners.shape[2])
+
+
+def rectangles(boxes: Floats, per_side: int = 1) -> Floats:
+    """Return points (n, 4 · per_side, 2) along boxes (n, 4), from the top left: right and down."""
     left, top, right, bottom = boxes.T
     across = np.stack([left, right, right, left], axis=1)
-    up = -np.stack([top, top, bottom, bottom], axis=1)
-    return np.stack([across, up, np.zeros_like(up)], axis=2)
+    return along_sides(
+        np.stack([across, np.stack([top, top, bottom, bottom], axis=1)], axis=2), per_side
+    )
+
+
+def box_corners(boxes: Floats) -> Floats:
+    """Return the corners (n, 4, 3) of boxes (n, 4): TL, TR, BR, BL; x right, y up."""
+    corners = rectangles(boxes) * [1.0, -1.0]
+    return np.concatenate([corners, np.zeros((len(boxes), 4, 1))], axis=2)
 
 
 def unit_m(target: Board) -> float:
@@ -531,11 +545,8 @@ def sheet_boxes(board: Board) -> Floats:
 @lru_cache(maxsize=64)
 def _corners(board: Board) -> Floats:
     """Return the corners (P, 4, 3) of each of a board's sheets as (column, row, 1)."""
-    left, top, right, bottom = sheet_boxes(board).T
-    return np.stack([
-        np.stack([left, right, right, left], axis=1), np.stack([top, top, bottom, bottom], axis=1),
-        np.ones((len(left), 4)),
-    ], axis=2)
+    flat = rectangles(sheet_boxes(board))
+    return np.concatenate([flat, np.ones((len(flat), 4, 1))], axis=2)
 
 
 @lru_cache(maxsize=64)

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model import coverage
 from sweep.model.board import (
+    along_sides,
     beside_edges,
     edges_of,
     extent_of,
     facing,
     occluded_edges,
     own_sheets,
+    rectangles,
     sheet_boxes,
     sheet_planes,
     sheets_m,
@@ -258,19 +260,6 @@ class SeenSheet(NamedTuple):
         return np.asarray(corners @ self.plane[2, :2] + self.plane[2, 2])
 
 
-def rectangles(boxes: Floats, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 2) along boxes (n, 4): left, top, right, bottom."""
-    t = np.arange(per_side) / per_side
-    left, top, right, bottom = (np.repeat(side[:, None], per_side, 1) for side in boxes.T)
-    columns = np.concatenate(
-        [left + t * (right - left), right, right - t * (right - left), left], axis=1
-    )
-    lines = np.concatenate(
-        [top, top + t * (bottom - top), bottom, bottom - t * (bottom - top)], axis=1
-    )
-    return np.stack([columns, lines], axis=2)
-
-
 def solid_planes(scenes: Scenes, row: int) -> Floats:
     """Return the planes (P, 3, 3) of the sheets of one scene's board."""
     return sheet_planes(
@@ -354,9 +343,8 @@ def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
         (points,) = rectangles(extent_of(target).sheet[None], per_side)
         outline = np.array([bent_point(column, line, bend) for column, line in points.tolist()])
     else:
-        corners = (sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0])[:, :, None]
-        t = np.arange(per_side)[:, None] / per_side
-        outline = (corners + t * (np.roll(corners, -1, axis=1) - corners)).reshape(-1, 3)
+        corners = sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0]
+        outline = along_sides(corners, per_side).reshape(-1, 3)
     return MovingMarker(
         scenes.projection(row), Motion(scenes.translation[row], velocity), outline, target.is_flat
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
-from sweep.model.board import extent_of, own_sheets, sheets_m, sheets_of
+from sweep.model.board import along_sides, extent_of, own_sheets, rectangles, sheets_m, sheets_of
 from sweep.model.coverage import REACH
 from sweep.model.exposure import (
     BEHIND,
@@ -19,7 +19,6 @@ from sweep.model.exposure import (
     is_curved,
     largest_spread_px,
     moving_marker,
-    rectangles,
     row_times,
     scene_sheet,
     seen_sheets,
@@ -125,12 +124,10 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
             each.reach_px for each in scenes.effects.plugins.all_effects
         )
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
-    corners = sheets_m(target)[:, :, None] * effect["marker_scale"]
-    t = np.arange(per_side)[:, None] / per_side
-    sides = (corners + t * (np.roll(corners, -1, axis=1) - corners)).reshape(1, -1, 3)
+    sides = along_sides(sheets_m(target) * effect["marker_scale"], per_side)
     points = scenes.cameras.take(np.array([row])).project(
-        sides @ scenes.rotation[row].T + scenes.translation[row]
-    ).reshape(len(corners), -1, 2)
+        sides.reshape(1, -1, 3) @ scenes.rotation[row].T + scenes.translation[row]
+    ).reshape(len(sides), -1, 2)
     least, most = points.min(axis=1) - 2, points.max(axis=1) + 2
     seen = ((most + reach > 0) & (least - reach < scenes.frame[row])).all(axis=1)
     if not seen.any():
@@ -292,13 +289,11 @@ def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Fl
     if not scenes.cameras.distorted[row]:
         outside = (low.all(axis=1) | high.all(axis=1)).any(axis=1)
         cut &= ~outside
-    t = np.arange(CHORDS_PER_SIDE)[:, None, None] / CHORDS_PER_SIDE
     camera = scenes.cameras.take(np.array([row]))
     for i in np.flatnonzero(cut):
         polygon = corners_px[i]
         if scenes.cameras.distorted[row]:
-            sides = corners_m[i] + t * (np.roll(corners_m[i], -1, axis=0) - corners_m[i])
-            points = np.ascontiguousarray(np.swapaxes(sides, 0, 1)).reshape(1, -1, 3)
+            points = along_sides(corners_m[i : i + 1], CHORDS_PER_SIDE)
             pose = scenes.rotation[row : row + 1], scenes.translation[row : row + 1]
             polygon = camera.project(transform_points(points, *pose))[0]
         outside[i] = not _meets_frame(polygon, limit)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model import coverage, lens
 from sweep.model.board import Board, edge_table, edges_of, edges_on_sheet, extent_of, unit_m
-from sweep.model.effects import POINTWISE, SWITCHES, MarkerView, Patch, apply_pointwise, is_coded
+from sweep.model.effects import POINTWISE, MarkerView, Patch, apply_pointwise
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey, photograph_image
@@ -35,7 +35,6 @@ from sweep.model.sensor import (
     digitise,
     illuminate,
     normal_field,
-    read_out,
 )
 from sweep.typing import Floats, Grey, Masks
 
@@ -44,15 +43,6 @@ from sweep.typing import Floats, Grey, Masks
 
 GREY_NOISE_DRAW = 2
 """The draw of a pixel that plain grey noise is made from, correlated or not."""
-
-
-PROCESSING = {
-    name: 0 if is_coded(SWITCHES[name]) else SWITCHES[name]
-    for name in (
-        "noise_correlation", "bayer", "tone_gamma", "tone_toe", "tone_knee", "noise_table",
-    )
-}
-"""Switches of effects between the noise and quantisation -> the numbers at which they are off."""
 
 
 def sensed_window(scenes: Scenes, row: int, window: Box) -> Box:
@@ -111,15 +101,9 @@ def sensed(
         scenes.effects.noise_key[row], effect["full_well_e"], effect["read_noise_e"],
         effect["gain"], effect["noise_grey"], int(effect["bit_depth"]),
     )
+    levels = apply_pointwise(plugged, "signal", _signal(levels, patch, readout), patch)
     image = np.empty(levels.shape, dtype=np.uint8)
-    processed = any(effect[name] != off for name, off in PROCESSING.items())
-    if not processed and overshoot is None and all(each.step != "signal" for each in plugged):
-        read_out(levels, left, top, readout, image)
-    else:
-        levels = _signal(levels, patch, readout)
-        levels = apply_pointwise(plugged, "signal", levels, patch)
-        levels = _rendition(scenes, levels, overshoot, patch)
-        digitise(levels, readout.bits, image)
+    digitise(_rendition(scenes, levels, overshoot, patch), readout.bits, image)
     quality = int(effect["jpeg_quality"])
     if quality:
         blocks = _aligned(scenes, row, window, BLOCK_PX)

@@ -163,31 +163,6 @@ def _signal(level: float, pixel: np.uint64, readout: Readout) -> float:
     return level
 
 
-@compiled_inline
-def _digitised(level: float, bits: int, most: float) -> np.uint8:
-    """Return a level quantised to ``bits`` (``most`` is the largest value), clipped, in 8 bits."""
-    counts = float(math.floor(level * (most / 255.0) + (0.5 + ROUNDING_SNAP)))
-    counts = min(max(counts, 0.0), most)
-    if bits != 8:
-        counts = math.floor(counts * (255.0 / most) + 0.5)
-    return np.uint8(counts)
-
-
-@compiled
-def read_out(
-    levels: Floats, left: int, top: int, readout: Readout, image: NDArray[np.uint8]
-) -> None:
-    """Turn levels (h, w), whose top left pixel is (left, top), into the image (h, w).
-
-    In one pass: :func:`add_noise` and :func:`digitise`.
-    """
-    most = 2.0**readout.bits - 1.0
-    for i in range(levels.shape[0]):
-        for j in range(levels.shape[1]):
-            pixel = _pixel_key(readout.key, left + j, top + i)
-            image[i, j] = _digitised(_signal(levels[i, j], pixel, readout), readout.bits, most)
-
-
 @compiled
 def add_noise(levels: Floats, left: int, top: int, readout: Readout) -> None:
     """Replace levels (h, w) by the signal with noise and gain, in grey levels, not quantised."""
@@ -203,7 +178,11 @@ def digitise(levels: Floats, bits: int, image: NDArray[np.uint8]) -> None:
     most = 2.0**bits - 1.0
     for i in range(levels.shape[0]):
         for j in range(levels.shape[1]):
-            image[i, j] = _digitised(levels[i, j], bits, most)
+            counts = float(math.floor(levels[i, j] * (most / 255.0) + (0.5 + ROUNDING_SNAP)))
+            counts = min(max(counts, 0.0), most)
+            if bits != 8:
+                counts = math.floor(counts * (255.0 / most) + 0.5)
+            image[i, j] = np.uint8(counts)
 
 
 @compiled

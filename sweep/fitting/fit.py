@@ -32,7 +32,7 @@ from sweep.fitting.views import FittedPhotograph, PhotographScenes, is_saturated
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.model.board import Board
-from sweep.model.derivatives import POSE
+from sweep.model.coverage import POSE
 from sweep.photographs.pose_fit import fit_pose
 from sweep.photographs.truth import marker_frames
 from sweep.typing import Floats, Integers, Masks

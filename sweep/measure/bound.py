@@ -36,7 +36,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.model import coverage
 from sweep.model.board import side_m
-from sweep.model.derivatives import POSE, work_space
+from sweep.model.coverage import POSE, work_space
 from sweep.model.effects import IN_BOUND
 from sweep.model.polygon import Projection
 from sweep.model.renderers import beside_pixels
@@ -200,7 +200,7 @@ def bounds(
     with the same covariance, and there is no mirrored minimum.
     Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
-    section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
+    section 3.9, with analytic derivatives (:mod:`sweep.model.coverage`).
     """
     count = len(scenes)
     status = np.where(asked == "none", BoundStatus.not_run, BoundStatus.not_visible)

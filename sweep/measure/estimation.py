@@ -17,7 +17,7 @@ from sweep.measure.likelihood import pose_covariance, solve_positive
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
-from sweep.model.derivatives import POSE, velocity
+from sweep.model.coverage import POSE, velocity
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import Optics, side_lengths
 from sweep.model.pose import angle_between, mirrored, transform_points, vector_of_rotation

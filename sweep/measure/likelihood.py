@@ -22,10 +22,10 @@ from sweep.model.board import (
     unit_m,
     visible_prints,
 )
-from sweep.model.coverage import MarkerEdges
-from sweep.model.derivatives import (
+from sweep.model.coverage import (
     LEVELS,
     POSE,
+    MarkerEdges,
     Work,
     differentiate,
     normal_equations,

@@ -27,8 +27,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
 from sweep.model.board import Board
-from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
-from sweep.model.derivatives import POSE
+from sweep.model.coverage import NODES, POSE, WEIGHTS, MarkerEdges
 from sweep.model.lens import jacobian, undistort
 from sweep.model.marker import module_count, overhang
 from sweep.model.polygon import (
@@ -48,7 +47,7 @@ from sweep.typing import Floats, Grey, Integers
 # :mod:`sweep.model.coverage`. Its slopes along x and along y, and by the point spread's variance,
 # are integrals along the same edges. All edges lie in one plane, so that the image's slope by a
 # parameter of the pose is the slope along x and y times the velocity of the plane's point at the
-# pixel: three numbers a pixel in place of seven, where :mod:`sweep.model.derivatives` is exact.
+# pixel: three numbers a pixel in place of seven, where :mod:`sweep.model.coverage` is exact.
 # The point spread mixes velocities of neighbouring points, which are the same up to its width
 # over the marker's side; that changes the direction of a step, not the pose at which the fit
 # ends.

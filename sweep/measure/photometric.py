@@ -67,7 +67,7 @@ from sweep.measure.solver import (
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.board import Board, box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.camera import Cameras
-from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
+from sweep.model.coverage import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
 from sweep.typing import Floats, Grey, Integers, Masks

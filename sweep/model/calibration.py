@@ -150,31 +150,23 @@ def _has_matrix(node: dict[str, Any]) -> bool:
     return not _by_name(node).keys().isdisjoint(MATRIX_NAMES)
 
 
-def _first(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> tuple[str, Any] | None:
-    return next((named[name] for name in names if name in named), None)
-
-
-def _demand_one(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> None:
-    """Refuse a camera that has other numbers under another of its names."""
+def _one(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> tuple[str, Any] | None:
+    """Return the first of some names and its value; ValueError if others have other numbers."""
     written = [named[name] for name in names if name in named]
     for name, value in written[1:]:
         if _numbers(name, value)[0] != _numbers(*written[0])[0]:
             raise ValueError(
                 f"{plain(written[0][0])} and {plain(name)} differ: delete one of them from the file"
             )
+    return written[0] if written else None
 
 
 def _calibration(node: dict[str, Any]) -> Calibration:
     named = _by_name(node)
     counts = _check_model(named)
     _check_region(named)
-    found = _first(named, MATRIX_NAMES)
-    if found is None:
-        raise AssertionError(sorted(named))
-    _demand_one(named, MATRIX_NAMES)
-    fx, fy, cx, cy = _matrix(*found)
-    lens = _first(named, DISTORTION_NAMES)
-    _demand_one(named, DISTORTION_NAMES)
+    fx, fy, cx, cy = _matrix(*_one(named, MATRIX_NAMES) or ("", None))
+    lens = _one(named, DISTORTION_NAMES)
     if lens is None and counts != (0,):
         raise ValueError(
             "no distortion coefficients (distortion_coefficients, distCoeffs, D; an empty list "
@@ -183,8 +175,7 @@ def _calibration(node: dict[str, Any]) -> Calibration:
     distortion = () if lens is None else _distortion(*lens, counts)
     width, height = _size(named)
     count = 4 + len(distortion)
-    sd = _first(named, SD_NAMES)
-    covariance = _first(named, COVARIANCE_NAMES)
+    sd, covariance = _one(named, SD_NAMES), _one(named, COVARIANCE_NAMES)
     return Calibration(
         width, height, fx, fy, cx, cy, distortion,
         () if sd is None else _deviations(*sd, count),
@@ -320,10 +311,9 @@ def _size(named: dict[str, tuple[str, Any]]) -> tuple[int | None, int | None]:
     for width, height in (("imagewidth", "imageheight"), ("width", "height")):
         if width in named and height in named:
             return _whole(*named[width]), _whole(*named[height])
-    found = _first(named, SIZE_NAMES)
-    if found is None:
+    name, value = next((named[name] for name in SIZE_NAMES if name in named), ("", None))
+    if not name:
         return None, None
-    name, value = found
     if isinstance(value, dict):
         return _size(_by_name(value))
     if isinstance(value, str):

@@ -14,7 +14,6 @@ from numpy.typing import DTypeLike, NDArray
 from sweep.compilation import compiled
 from sweep.declaration import parameter
 from sweep.model import lens
-from sweep.model import lens as lens_model
 from sweep.model.polygon import Optics
 from sweep.typing import Floats, Masks
 
@@ -478,7 +477,7 @@ class Framing:
         if len(curved):
             corners = points[curved, :: max(points.shape[1] // 4, 1)]
             flat = np.ascontiguousarray(corners[..., :2] / corners[..., 2:])
-            fits[curved] = ~lens_model.folds(flat, cameras.lenses[curved])
+            fits[curved] = ~lens.folds(flat, cameras.lenses[curved])
         return fits
 
     def _nearest(self, rows: NDArray[np.intp], wanted: Floats) -> Floats:

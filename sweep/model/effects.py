@@ -411,34 +411,20 @@ EFFECTS: tuple[Effect, ...] = (
 """Every effect, in physical order."""
 
 
-def _declared() -> dict[str, Any]:
-    """Return every parameter of the effects."""
-    declared: dict[str, Any] = {}
-    for effect in EFFECTS:
-        for name, declaration in effect.parameters.items():
-            if name in declared:
-                raise TypeError(f"parameter {name} is declared by two effects")
-            declared[name] = declaration
-        if effect.apply is not None and effect.step not in ("light", "signal"):
-            raise TypeError(f"effect {effect.label}: pointwise effects act on light or signal")
-    return declared
-
+_DECLARED = {name: each for effect in EFFECTS for name, each in effect.parameters.items()}
 
 Effects: type = dataclasses.make_dataclass(
     "Effects",
     [
         (name, float | None if each.default is None else type(each.default), each)
-        for name, each in _declared().items()
+        for name, each in _DECLARED.items()
     ],
     frozen=True,
 )
 """The parameters of all effects as a dataclass, as those of camera, marker and pose are."""
 
-NEUTRAL: dict[str, Any] = {name: each.default for name, each in _declared().items()}
+NEUTRAL: dict[str, Any] = {name: each.default for name, each in _DECLARED.items()}
 """Every parameter of the effects at its default: no effect is active."""
-
-SWITCHES: dict[str, Any] = {effect.switch: effect.off for effect in EFFECTS}
-"""Parameters that switch an effect on -> the value at which it is absent."""
 
 CODED = tuple(name for name, default in NEUTRAL.items() if is_coded(default))
 """Parameters that are text or lists: scenes hold the numbers of their values."""

@@ -35,7 +35,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.photometric import Photometric, explains, found_targets, window_of
 from sweep.model.board import single_marker
-from sweep.model.derivatives import LEVELS, POSE, work_space
+from sweep.model.coverage import LEVELS, POSE, work_space
 
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""

@@ -488,7 +488,7 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
         elif key in reading.given:
             other = next((other for other in places(reading.document, reading.parameters[key])
                           if other != path), "it")
-            raise ValueError(f"it once: {other} is given too; delete one of them")
+            reading.fault(path, value, f"it once: {other} is given too; delete one of them")
         elif key in reading.parameters:
             reading.given.add(key)
             return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))

@@ -442,7 +442,7 @@ def fit(
     markers: int = 12,
     check: bool = True,
 ) -> FittedScene:
-    """Estimate a camera's scene, its blur, sharpening, tone, light, noise and geometry.
+    """Estimate a camera's scene: blur, sharpening, tone, noise, geometry, and the print's size.
 
     Parameters
     ----------
@@ -454,8 +454,8 @@ def fit(
     markers
         The most markers of a photograph that are fitted, well spread over the frame.
     check
-        Whether half of the photographs are held out: effects that move none of their errors are
-        left out, and the gap that is left is in ``gap``.
+        Whether half of the photographs are held out: effects that bring simulated errors no nearer
+        to theirs are left out, and the gap that is left is in ``gap``.
 
     Returns
     -------

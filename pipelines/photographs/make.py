@@ -42,7 +42,7 @@ REFINEMENTS = ("none", "subpix", "contour", "apriltag")
 SETTINGS = [f"cornerRefinementMethod={list(REFINEMENTS)}".replace("'", '"')]
 
 NEW = ("sharpening", "sharpening_px", "bloom", "noise_table", "noise_correlation", "geometry_px",
-       "geometry_length_px")
+       "geometry_length_px", "edge_px", "edge_length_px", "marker_scale")
 """Effects that simulations had not before photographs were measured."""
 
 REPEATS = 4
@@ -60,7 +60,7 @@ QUIET = 0.12
 MIN_SIDE_PX = 20.0
 """Side of the markers that are averaged."""
 
-NOTHING_RANDOM = {"noise_grey": 0.0, "noise_table": [], "geometry_px": 0.0}
+NOTHING_RANDOM = {"noise_grey": 0.0, "noise_table": [], "geometry_px": 0.0, "edge_px": 0.0}
 
 
 def central(scene: Mapping[str, Any]) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def photos(
 
 @command("pipelines/photographs/README.md", {
     "sweep fit shots --camera camera.yaml --board BOARD.toml":
-        "writes scene.toml: blur, sharpening, tone, noise, geometry",
+        "writes scene.toml: blur, sharpening, tone, noise, geometry, print",
     "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml":
         "calibrates the camera from the same photographs"})
 def fit(
@@ -124,7 +124,7 @@ def fit(
     markers : --markers N
         The most markers of a photograph that are fitted, well spread over the frame (default: 12).
     check
-        Do not hold half of the photographs out, to see which effects move their errors.
+        Do not hold half of the photographs out, to see which effects bring errors nearer to theirs.
     output : -o --output FILE
         Pipeline file to write (default: scene.toml).
     """

@@ -601,8 +601,8 @@ def error_statistics(
     95 % intervals over the random draws, conditional on the grid; NaN if no cell has two draws
     that count. Those of rates are Wilson's, a little wide if the cells' rates differ. That of a
     mean is Student's, that of an RMSE or a standard deviation Student's of the logarithm of the
-    mean square (`sweep.analysis.estimator`, `sweep.analysis.estimator`): they need some 50 draws
-    and tails not much heavier than normal, for no sample tells of what it has not seen; if a few
+    mean square (`sweep.analysis.estimator`): they need some 50 draws and tails not much heavier
+    than normal, for no sample tells of what it has not seen; if a few
     cells have nearly all of the error, only their draws count. That of ``rotation_rmse_deg``
     counts the flips that the sample may have missed, with 180 degrees each
     (`sweep.analysis.estimator`): it holds if flips are rare, and is wide (0.5 of 0.4 to 48

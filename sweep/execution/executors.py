@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 
 from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
-from sweep.evaluation.machine_faults import machine_faults_raised
+from sweep.evaluation.machine_faults import exception_line, machine_faults_raised
 from sweep.execution import BLOCK_TASK
 from sweep.execution.block_task import compute_blocks
 from sweep.execution.waves import Waiting, Work
@@ -198,12 +198,20 @@ class Children(Executor):
         for child in self._children:
             child.close()
         self._pool.shutdown(cancel_futures=True)
+        for child in self._children:  # one may have been begun again meanwhile
+            child.close()
 
     def _grow(self) -> None:
-        with machine_faults_raised():
-            while len(self._children) < self._count:
+        """Start the other processes; with a line, go on with fewer if the system allows no more."""
+        while len(self._children) < self._count:
+            try:
                 self._children.append(Child(BLOCK_TASK))
-                self._idle.put(self._children[-1])
+            except OSError as error:
+                notice(f"{len(self._children)} of {self._count} processes could be started: "
+                       f"{exception_line(error)}")
+                self._count = len(self._children)
+                return
+            self._idle.put(self._children[-1])
 
     def room(self) -> int:
         """Return the number of processes."""

@@ -86,6 +86,14 @@ def test_what_takes_longer_than_it_was_measured_gets_more_processes(
     assert same(url, undisturbed)
 
 
+def test_processes_that_cannot_be_started_are_told_in_a_line(monkeypatch, capsys):
+    monkeypatch.setattr(executors, "Child", mock.Mock(side_effect=OSError(11, "no more")))
+    with Children(Here(), 3, at_once=True) as executor:
+        assert executor.room() == 1
+    told = "1 of 3 processes could be started: BlockingIOError: [Errno 11] no more\n"
+    assert capsys.readouterr().err == told
+
+
 def suicide(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 

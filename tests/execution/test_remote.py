@@ -20,7 +20,7 @@ import trustme
 
 from support.blocks import run_block
 from support.clusters import Cluster
-from support.commands import complaints
+from support.commands import command, complaints
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.on_cluster import connected
@@ -88,17 +88,6 @@ def wait_until(true, what):
         time.sleep(0.05)
 
 
-def python(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, *map(str, arguments)], capture_output=True, text=True, check=False,
-        timeout=TIMEOUT_S, **options,
-    )
-
-
-def sweep_command(*arguments, **options):
-    return python("-m", "sweep", *arguments, **options)
-
-
 def expected(text):
     """What a store must hold, computed here as one block, without a store."""
     pipeline = Pipeline.from_text(text)
@@ -109,7 +98,8 @@ def expected(text):
 
 def digests(url, text=SMALL):
     """Return the digests of the variables and draws that a store of a pipeline must hold."""
-    ran = python("-c", DIGESTS, url)
+    ran = subprocess.run(
+        [sys.executable, "-c", DIGESTS, url], capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
     return {name: found.get(name) for name in expected(text)}
@@ -298,7 +288,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
     told = ""
     with Cluster(tmp_path / "cluster", **tls(certificates["ours"])) as cluster:
         cluster.worker()
-        ran = sweep_command(
+        ran = command(
             "run", small, "--store", url, "--scheduler", cluster.address, "--json",
             env={**os.environ, **client_environment(certificates["ours"])},
         )
@@ -307,7 +297,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
         assert json.loads(ran.stdout)["computed_scenes"] == 48
         told += ran.stdout + ran.stderr
         assert digests(url) == expected(SMALL)
-        state = sweep_command("status", url, "--json")
+        state = command("status", url, "--json")
         assert json.loads(state.stdout)["finished"], state.stderr
         told += state.stdout + state.stderr + cluster.log()
     assert "tls://127.0.0.1" in told
@@ -328,7 +318,7 @@ def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
         ("--store", url, "--overwrite"),
         ("--store", "s3://bucket/grown.zarr", "--reuse", url, "--set", "tilt_deg=[0, 50, 60]"),
     ):
-        ran = sweep_command(*run, *options)
+        ran = command(*run, *options)
         assert (ran.returncode, complaints(ran)) == (0, [])
         assert not bucket.told_in(ran.stdout)
         outcomes.append(json.loads(ran.stdout)["computed_scenes"])
@@ -337,7 +327,7 @@ def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
     assert outcomes == [48, 0, 48, 24]
     grown = SMALL.replace("tilt_deg = [0, 50]", "tilt_deg = [0, 50, 60]")
     assert digests("s3://bucket/grown.zarr") == expected(grown)
-    other = sweep_command("run", small, "--store", url, "--set", "seed=6")
+    other = command("run", small, "--store", url, "--set", "seed=6")
     assert other.returncode == 2
     assert "seed: the store has 5, this run 6" in other.stderr
 
@@ -349,7 +339,7 @@ def test_remote_run_in_waves_is_tightened_to_what_a_local_one_holds(tmp_path):
     path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [8, 13, 30]\n")
     local, remote = str(tmp_path / "local.zarr"), "s3://bucket/waves.zarr"
     for store, width in ((remote, 0.2), (remote, 0.1), (local, 0.1)):
-        ran = sweep_command("run", path, "--store", store, "--max-trials", "150",
+        ran = command("run", path, "--store", store, "--max-trials", "150",
                             "--precision", f"detection_rate = {width}", "--json")
         assert ran.returncode == 0, ran.stderr
         assert json.loads(ran.stdout)["needed"] < 450
@@ -367,9 +357,9 @@ def test_killed_remote_run_is_told_and_continues(bucket, many, tmp_path):
         assert running.poll() is None, (tmp_path / "run.log").read_text()
         os.killpg(running.pid, signal.SIGKILL)
         running.wait(TIMEOUT_S)
-    state = json.loads(sweep_command("status", url, "--json").stdout)
+    state = json.loads(command("status", url, "--json").stdout)
     assert 0 < state["blocks_done"] < state["blocks"]
-    ran = sweep_command("run", many, "--store", url, "--workers", "2", "--json")
+    ran = command("run", many, "--store", url, "--workers", "2", "--json")
     assert ran.returncode == 0, ran.stderr
     summary = json.loads(ran.stdout)
     assert summary["computed_blocks"] == state["blocks"] - state["blocks_done"]
@@ -399,7 +389,7 @@ REFUSED = {
 def test_server_that_refuses_is_told_in_a_line(case, bucket, small):
     settings, url = REFUSED[case]
     environment = {**os.environ, **settings}
-    ran = sweep_command(
+    ran = command(
         "run", small, "--store", url, "--workers", "1",
         env={name: value for name, value in environment.items() if value},
     )

@@ -16,6 +16,7 @@ import zarr
 
 import sweep
 from support.blocks import run_block
+from support.commands import command
 from support.store_files import edit_root
 from support.stores import by_hand, same
 from sweep.cli import main
@@ -58,14 +59,6 @@ def undisturbed(pipeline, tmp_path_factory):
     url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
     by_hand(url, pipeline)
     return url
-
-
-def sweep_command(*arguments, **options):
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "sweep", *map(str, arguments)],
-        capture_output=True, text=True, check=False, timeout=300, **options,
-    )
 
 
 @pytest.mark.parametrize("extents", [
@@ -290,7 +283,7 @@ def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
 def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path, monkeypatch, capsys):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
-    ran = sweep_command("run", path, "--json", cwd=tmp_path)
+    ran = command("run", path, "--json", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
     told = json.loads(ran.stdout)
@@ -317,9 +310,9 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys
     (tmp_path / "runs").mkdir()
     if workers:
         create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(path), (500, 1))
-    command = [sys.executable, "-m", "sweep", "run", str(path), *workers]
+    run = [sys.executable, "-m", "sweep", "run", str(path), *workers]
     with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        run, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     ) as running:
         receipts = tmp_path / "runs" / "long.zarr" / "commits" / "receipt" / "c"
@@ -416,7 +409,7 @@ def test_damaged_receipts_are_told(pipeline, tmp_path):
     by_hand(str(url), pipeline, (2, 4, 2, 3))
     for path in (url / "commits" / "receipt" / "c").iterdir():
         path.write_bytes(b"garbage")
-    ran = sweep_command("status", url)
+    ran = command("status", url)
     assert ran.returncode == 2
     assert "the receipt of block 0 is damaged" in ran.stderr
     assert "Traceback" not in ran.stderr

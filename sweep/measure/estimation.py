@@ -79,19 +79,6 @@ class Detections:
     recorded_translation: Floats | None = None
     on_board: Sequence[BoardMarker | None] | None = None
 
-    @staticmethod
-    def of_markers(
-        corners: Floats, cameras: Cameras, size_m: Floats, noise_grey: Floats, blur_px: Floats,
-        markers: Sequence[Board], images: Sequence[Grey], origins: Integers,
-    ) -> Detections:
-        """Return the detections of N markers whose corners (N, 4, 2) were all found."""
-        count = len(corners)
-        return Detections(
-            corners, cameras, size_m, noise_grey, blur_px, markers, images, origins,
-            np.arange(count), np.zeros(count, dtype=np.int64), np.ones(count),
-            np.empty((count, 0, 2)),
-        )
-
     def __len__(self) -> int:
         return len(self.origins)
 

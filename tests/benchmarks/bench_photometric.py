@@ -20,12 +20,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from support.board_scenes import board_scene
 from support.photographs import drawn_pose, photograph
+from support.solving import of_markers
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bound_of_scene
-from sweep.measure.estimation import Detections
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
 from sweep.measure.photometric import Photometric, PhotometricReal
@@ -121,11 +121,10 @@ def detections(side, effects):
             images.append(taken.image)
     count, markers = len(corners), len(BOARD)
     cameras = board_scene(BOARD, camera, pose).cameras.take(np.zeros(count, dtype=int))
-    found = Detections.of_markers(
-        np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0), np.zeros(count),
+    found = of_markers(
+        np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0),
         [single_marker(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0)
          for k in range(count)], images,
-        np.zeros((count, 2), dtype=np.int64),
     )
     return dataclasses.replace(
         found, on_board=[BoardMarker(BOARD, k % markers) for k in range(count)])

@@ -227,20 +227,10 @@ def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
         np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
-@lengths(200, 1000)
-def test_deglitching_is_refused_or_does_not_depend_on_the_order_of_scenes(count):
+def test_deglitching_is_refused():
     """OpenCV's aprilTagDeglitch reads memory that it never wrote, at the image's border."""
-    try:
+    with pytest.raises(PipelineError, match="aprilTagDeglitch = 1"):
         Pipeline.from_text(PAIRED, ["cornerRefinementMethod=apriltag", "aprilTagDeglitch=1"])
-    except PipelineError:
-        return
-    setting = DetectorSetting(cornerRefinementMethod="apriltag", aprilTagDeglitch=1)
-    scenes = visible_scenes(count)
-    forth = searched(scenes, setting).flags
-    back = np.empty_like(forth)
-    for row in reversed(range(count)):
-        back[row] = searched(scenes, setting, wanted=np.arange(count) == row).flags[row]
-    np.testing.assert_array_equal(back, forth)
 
 
 def test_settings_of_the_grid_are_told_apart_by_their_margins():

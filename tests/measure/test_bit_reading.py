@@ -1,12 +1,11 @@
 """Which cells of a small upright marker the detector misreads, and where markers are lost for it.
 
-Against OpenCV: its threshold, contours, polygons and warp of rendered squares, its detector, and
-sweeps that the model was not made from (``pytest -m long -s tests/measure/test_bit_reading.py``:
+Against OpenCV: its warp of rendered squares, its detector, and sweeps that the model was not made
+from (``pytest -m long -s tests/measure/test_bit_reading.py``:
 576,000 poses). Draws are functions of the pipeline's seed: no test here is up to chance.
 """
 
 import importlib
-import math
 import sys
 from pathlib import Path
 
@@ -15,10 +14,7 @@ import numpy as np
 import pytest
 
 import sweep
-from support.blocks import run_cells
-from sweep.experiment.grid import Block, block_indices
 from sweep.measure.detectors import DetectorSetting
-from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import modules
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
@@ -35,8 +31,6 @@ DICTIONARY = "DICT_5X5_50"
 WITH_THE_DIP = {0, 2, 4, 7}
 """Of IDs 0-9 of DICT_5X5_50."""
 UNIT = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
-WINDOWS = (3, 13, 23)
-DEFAULT = shapes.Thresholds(WINDOWS, 7.0, 0.21)
 
 
 def reading(dictionary=DICTIONARY, **settings):
@@ -51,13 +45,6 @@ def warped(bits, corners, size=64, background=255):
     padded = np.pad(bitmap, 10, constant_values=255)
     return cv2.warpPerspective(
         padded, onto, (size, size), flags=cv2.INTER_LINEAR, borderValue=(background,))
-
-
-def flags_of(pipeline):
-    """Return the detection flags of a pipeline over its scene axes, computed here."""
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    cells = run_cells(pipeline, block_indices(Block((0,) * len(shape), shape)))
-    return cells.columns["detection"][0].reshape(shape)
 
 
 def test_rule_and_model_name_the_ids_that_have_the_second_dip():
@@ -128,74 +115,6 @@ def opencv_cells(image, quad, n, samples):
     canonical = cv2.warpPerspective(image.astype(np.uint8), onto, (size, size),
                                     flags=cv2.INTER_NEAREST)
     return canonical.reshape(n, samples, n, samples).mean(axis=(1, 3))
-
-
-def opencv_quadrilateral(image, window, size):
-    """Return the largest quadrilateral (4, 2) of about the square's size (2,) that OpenCV finds."""
-    dark = cv2.adaptiveThreshold(
-        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, 7)
-    found = []
-    for contour in cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
-        polygon = cv2.approxPolyDP(contour, 0.03 * len(contour), closed=True)
-        if len(polygon) == 4 and cv2.isContourConvex(polygon):
-            found.append(polygon[:, 0].astype(float))
-    centre = np.array(image.shape[::-1]) / 2
-    near = [quad for quad in found if np.abs(quad.mean(axis=0) - centre).max() < 3]
-    # Not the outline of the quiet zone, which is about two modules larger.
-    sized = [quad for quad in near if np.abs(np.ptp(quad, axis=0) - size + 1).max() < 2.5]
-    return max(sized, key=lambda quad: np.ptp(quad, axis=0).sum(), default=None)
-
-
-@pytest.mark.parametrize(("background", "least"), [(0, 0.93), (255, 0.93)])
-@pytest.mark.parametrize("tilt", [0.0, 45.0])
-def test_quadrilaterals_are_those_that_opencv_finds_at_each_threshold(background, least, tilt):
-    rng = np.random.default_rng(14)
-    outline = shapes.upright_corners(16.0, tilt, 0.0, 533.0)
-    corners = 31.5 + rng.uniform(-0.5, 0.5, (100, 1, 2)) + outline
-    width, height = np.ptp(outline, axis=0)
-    surround = shapes.Surround(background=float(background))
-    found = shapes.outlines(corners, 7, DEFAULT, surround)
-    levels = [shapes.threshold_level(w, DEFAULT, surround, height, width, 7) for w in WINDOWS]
-    equal = []
-    for k in range(100):
-        image = warped(modules(DICTIONARY, k % 50), corners[k], background=background)
-        for quads, which in zip(found, np.argsort(levels)[::-1], strict=True):
-            quad = opencv_quadrilateral(image, WINDOWS[which], (width, height))
-            if quad is not None:
-                key = (quads[k][:, None] == quad).all(axis=2).any(axis=1).all()
-                equal.append(bool(key))
-    assert len(equal) > 250
-    print(f"background {background}, tilt {tilt}: {np.mean(equal):.3f} of {len(equal)} equal")
-    assert np.mean(equal) >= least
-
-
-@pytest.mark.parametrize(("dictionary", "tilt", "azimuth", "areas"), [
-    (DICTIONARY, 0, 0, (121, 159, 169, 196)),
-    pytest.param("DICT_4X4_100", 45, 0, (87, 130, 174), marks=pytest.mark.long),
-    pytest.param("DICT_7X7_100", 60, 90, (284, 397, 480), marks=pytest.mark.long),
-])
-def test_rates_below_two_pixels_a_module_are_predicted_within_a_tenth(
-    dictionary, tilt, azimuth, areas
-):
-    sides = [round(math.sqrt(area / math.cos(math.radians(tilt))), 3) for area in areas]
-    flags = flags_of(sweep.Pipeline.from_toml(PIPELINES / "second_dip.toml", [
-        f"dictionary={dictionary}", "marker_id={range=[30,46]}", f"side_px={sides}", "trial=30",
-        f"tilt_deg={tilt}", f"azimuth_deg={azimuth}"]))
-    measured = (flags == DetectionStatus.detected).mean(axis=(0, 2))
-    bits = np.array([modules(dictionary, i) for i in range(30, 46)])
-    focal = 4.0 * 640 / 4.8
-    predicted = [
-        model.predicted_rates(bits, shapes.upright_corners(side, tilt, azimuth, focal),
-                        reading(dictionary)).mean()
-        for side in sides
-    ]
-    print(np.round(measured, 3), np.round(predicted, 3))
-    assert np.abs(measured - predicted).max() <= 0.1
-    if tilt == 0:
-        # The claim that was refuted: a dip below 2.1 px a module, deeper than those above it.
-        assert measured[1] > 0.85
-        assert measured[2] < 0.5
-        assert measured[3] > 0.9
 
 
 @pytest.mark.long

@@ -11,12 +11,21 @@ from sweep.model.board import single_marker
 BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.any_points)
 
 
+def of_markers(corners, cameras, size_m, noise_grey, markers, images=()):
+    """The detections of N markers whose corners (N, 4, 2) were all found, in whole frames."""
+    count = len(corners)
+    return Detections(
+        corners, cameras, size_m, noise_grey, np.zeros(count), markers, images,
+        np.zeros((count, 2), dtype=np.int64), np.arange(count), np.zeros(count, dtype=np.int64),
+        np.ones(count), np.empty((count, 0, 2)),
+    )
+
+
 def estimate(corners, cameras, size_m, solver, guarded, limit):
     """The estimates of N markers from corners (N, 4, 2)."""
     count = len(corners)
-    return PointSolver(solver, guarded, limit)(Detections.of_markers(
-        corners, cameras, size_m, np.zeros(count), np.zeros(count),
-        [single_marker("DICT_4X4_50", 0, 1.0)] * count, [], np.zeros((count, 2), dtype=np.int64),
+    return PointSolver(solver, guarded, limit)(of_markers(
+        corners, cameras, size_m, np.zeros(count), [single_marker("DICT_4X4_50", 0, 1.0)] * count,
     ))
 
 

@@ -20,14 +20,12 @@ LINK = re.compile(r"\]\(([^)\s]*)\)|src=\"([^\"]*)\"")
 description = runpy.run_path(str(TOP / "setup.py"))["description"]
 
 
-def has_long_tests(folder):
-    return any("mark.long" in text or "support.lengths" in text
-               for text in (path.read_text() for path in folder.glob("test_*.py")))
-
-
-def test_every_room_with_long_tests_is_in_the_workflow_and_no_other():
-    rooms = {folder.name for folder in (TOP / "tests").iterdir() if has_long_tests(folder)}
-    assert set(JOBS["long"]["strategy"]["matrix"]["room"]) == rooms
+def test_every_shard_of_the_long_tests_is_in_the_workflow():
+    runs = [step.get("run", "") for step in JOBS["evidence"]["steps"]]
+    run, = (each for each in runs if "--shard" in each)
+    shards = JOBS["evidence"]["strategy"]["matrix"]["shard"]
+    assert shards == list(range(1, len(shards) + 1))
+    assert run.endswith(f"/{len(shards)}")
 
 
 def test_workflow_names_files_and_extras_that_exist():

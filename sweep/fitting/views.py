@@ -19,6 +19,7 @@ from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.model.scene import Scenes, build_scenes
 from sweep.photographs.pose_fit import Lens
+from sweep.photographs.truth import cameras_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -259,10 +260,8 @@ def marker_view(
         return None
     width, height = (high - low).tolist()
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-    rays = cv2.undistortPoints(
-        np.stack([columns, rows], axis=2).reshape(-1, 1, 2).astype(np.float64), lens.matrix,
-        lens.distortion,
-    )
+    rays = cameras_of(lens, 1).normalise(
+        np.stack([columns, rows], axis=2).reshape(1, -1, 2).astype(np.float64))
     to_modules = np.linalg.inv(scenes.plane[row])
     at = cv2.perspectiveTransform(rays, to_modules).reshape(height, width, 2)
     used = np.asarray(((at > -ring) & (at < modules + ring)).all(axis=2))

@@ -254,9 +254,3 @@ def test_names_and_contradictions_are_told_when_the_rule_is_made(texts, words):
 def test_waves_end_at_the_most_trials():
     assert wave_ends(100, 40) == (40, 80, 100)
     assert math.isclose(looks_factor(1), 1.0)
-
-
-@pytest.mark.parametrize("section", ["limit", "choose", "precision"])
-def test_sections_of_earlier_versions_name_the_one_in_their_place(section):
-    with pytest.raises(PipelineError, match=rf"{section}: unknown.*write \[search\]"):
-        Pipeline.from_dict({section: {"max_trials": 80}})

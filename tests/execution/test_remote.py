@@ -363,7 +363,7 @@ def test_killed_remote_run_is_told_and_continues(bucket, many, tmp_path):
     assert ran.returncode == 0, ran.stderr
     summary = json.loads(ran.stdout)
     assert summary["computed_blocks"] == state["blocks"] - state["blocks_done"]
-    assert digests(url) == expected(MANY)
+    assert digests(url, MANY) == expected(MANY)
 
 
 REFUSED = {
@@ -481,7 +481,7 @@ def test_workers_join_and_leave_during_a_run(number, many, tmp_path):
             first.wait(TIMEOUT_S)
             after(5)
             cluster.worker()
-    assert digests(url) == expected(MANY)
+    assert digests(url, MANY) == expected(MANY)
 
 
 @pytest.mark.long
@@ -506,4 +506,4 @@ def test_run_ends_with_its_scheduler_and_continues_on_another(many, tmp_path):
         cluster.worker()
         with being_run(cluster, many, url, tmp_path):
             pass
-    assert digests(url) == expected(MANY)
+    assert digests(url, MANY) == expected(MANY)

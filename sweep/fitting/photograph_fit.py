@@ -97,17 +97,24 @@ class MarkerState:
         return float(np.sqrt((self.residuals**2).sum() / freedom))
 
 
-def _of_corners(at: Floats) -> Floats:
-    """Return the shares (..., 4) of the corners TL, TR, BR, BL in a shift at (..., 2)."""
+def _of_corners(at: Floats, reach: float) -> Floats:
+    """Return the shares (..., 4) of the corners TL, TR, BR, BL in a shift at (..., 2).
+
+    What is farther than ``reach`` from the square is other print: it moves with the marker as a
+    whole, and has no share in its size.
+    """
     x, y = at[..., 0], at[..., 1]
-    return np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=-1)
+    shares = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=-1)
+    beyond = np.abs(at - 0.5).max(axis=-1, keepdims=True) > 0.5 + reach
+    return np.where(beyond, 0.25, shares)
 
 
 def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     """Return a marker's residuals and derivatives at its and the photograph's parameters."""
     black, contrast, variance, amount, bloom = parameters[CORNERS:]
     used = marker.used
-    ends = marker.ends + _of_corners(marker.ends_at) @ parameters[:CORNERS].reshape(4, 2)
+    shifts = parameters[:CORNERS].reshape(4, 2)
+    ends = marker.ends + _of_corners(marker.ends_at, marker.reach) @ shifts
     sharp, wide = (
         np.stack(drawn(ends, marker.sides, used.shape, float(np.sqrt(variance + radius**2)))[:4])[
             :, used]
@@ -123,7 +130,7 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     scale = contrast * inside
     along = scale * (gain * sharp[1:] - amount * wide[1:])
     slope = -along[:2]
-    corners = slope[:, :, None] * _of_corners(marker.at[:, used].T)
+    corners = slope[:, :, None] * _of_corners(marker.at[:, used].T, marker.reach)
     return MarkerState(
         marker, parameters, marker.levels[used] - np.clip(level, 0.0, 255.0), share,
         np.column_stack([

@@ -156,6 +156,9 @@ class FittedMarker:
         (4, 2) the true corners of the black square in the box: TL, TR, BR, BL.
     modules, module_px
         Along the side of the black square, and the mean length of one in the image.
+    reach
+        How far the marker's own print reaches beyond the square, and half a module, as a share of
+        its side.
     frame_px
         (2,) first pixel of the box in the frame.
     row
@@ -173,6 +176,7 @@ class FittedMarker:
     corners_px: Floats
     modules: int
     module_px: float
+    reach: float
     frame_px: Integers
     row: int
     ground: float
@@ -273,8 +277,8 @@ def marker_view(
         return None
     return FittedMarker(
         image[low[1] : high[1], low[0] : high[0]].astype(np.float64), used, ends, sides,
-        pieces / modules, np.moveaxis(at, 2, 0) / modules, corners - low, modules, module_px, low,
-        row, _along(image, beyond),
+        pieces / modules, np.moveaxis(at, 2, 0) / modules, corners - low, modules, module_px,
+        (overhang(dictionary) + 0.5) / modules, low, row, _along(image, beyond),
     )
 
 

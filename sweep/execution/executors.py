@@ -162,6 +162,9 @@ class Executor(ABC):
 SMALL_RUN_S = 3.0
 """Work up to which a run needs one process: another takes a second to import its packages."""
 
+SMALL_RUN_LIMIT_S = 10.0
+"""Seconds after which the other processes are started if such a run still goes on."""
+
 
 class Children(Executor):
     """Computes blocks in child processes.
@@ -173,8 +176,7 @@ class Children(Executor):
     count
         How many there are to be.
     at_once
-        Whether the others are started now; else they are when the first one has computed for
-        :data:`SMALL_RUN_S`.
+        Whether the others are started now; else they are after :data:`SMALL_RUN_LIMIT_S`.
     """
 
     def __init__(self, child: Child, count: int, *, at_once: bool) -> None:
@@ -217,7 +219,7 @@ class Children(Executor):
         """Return the number of processes."""
         now = time.monotonic()
         self._began = now if self._began is None else self._began
-        if now > self._began + SMALL_RUN_S:
+        if now > self._began + SMALL_RUN_LIMIT_S:
             self._grow()
         return len(self._children)
 

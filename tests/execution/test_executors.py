@@ -50,6 +50,7 @@ def test_small_run_and_small_repair_take_one_process_and_leave_nothing(
     undisturbed, tmp_path, monkeypatch
 ):
     begun = []
+    monkeypatch.setattr(executors, "SMALL_RUN_LIMIT_S", 300.0)
     start = Child._start
     monkeypatch.setattr(Child, "_start", lambda child: (begun.append(child), start(child)))
     me, threads = psutil.Process(), set(threading.enumerate())
@@ -74,7 +75,7 @@ def test_small_run_and_small_repair_take_one_process_and_leave_nothing(
 def test_what_takes_longer_than_it_was_measured_gets_more_processes(
     workers, undisturbed, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(executors, "SMALL_RUN_S", 0.0)
+    monkeypatch.setattr(executors, "SMALL_RUN_LIMIT_S", 0.0)
     count = []
     room = Children.room
     monkeypatch.setattr(Children, "room", lambda one: count.append(room(one)) or count[-1])

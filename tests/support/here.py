@@ -38,6 +38,6 @@ def calls_here():
         mock.patch("sweep.execution.runner.Child", Here),
         mock.patch("sweep.execution.runner.SMALL_RUN_S", 300.0),
         mock.patch("sweep.execution.forecast.SMALL_RUN_S", 300.0),
-        mock.patch("sweep.execution.executors.SMALL_RUN_S", 300.0),
+        mock.patch("sweep.execution.executors.SMALL_RUN_LIMIT_S", 300.0),
     ):
         yield

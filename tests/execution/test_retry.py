@@ -140,7 +140,7 @@ def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied
         instants += 1
         if not stopped:
             break
-    assert instants > 4
+    assert instants >= 4  # a mark, two blocks, and the end
     with calls_here():
         execute(pipeline, copied, retry_failed=True)
     assert same(copied, clean)

@@ -129,7 +129,8 @@ def run(
         to run on instead. It stays open. Its workers must be processes that have the same versions
         as this one and reach the store under the same path.
     scheduler
-        Address of a Dask scheduler to run on instead, such as ``tcp://host:8786``.
+        Address of a Dask scheduler to run on instead, such as ``tcp://host:8786``; ``local`` starts
+        a Dask cluster of ``workers`` processes on this machine.
     reuse
         Stores whose finished cells are copied where all their parameters agree.
     overwrite

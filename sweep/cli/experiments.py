@@ -78,7 +78,7 @@ def run(
     yes
         Run also what would take more than a day, or more than is free on the disk.
     scheduler : --scheduler ADDRESS
-        Address of a Dask scheduler.
+        Address of a Dask scheduler, or `local`: a Dask cluster on this machine.
     time_limit_s : --time-limit S
         Block timeout in seconds (default: 600, or ten times a block's work).
     retry_failed

@@ -1,4 +1,4 @@
-"""Blocks on a Dask cluster: a scheduler's address, or the caller's own client or cluster."""
+"""Blocks on a Dask cluster: one on this machine, a scheduler's, or the caller's own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
-from distributed import Client, KilledWorker, Security, get_worker
+import dask
+from distributed import Client, KilledWorker, LocalCluster, Security, get_worker
 from distributed.core import rpc
 
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
@@ -22,7 +23,7 @@ from sweep.evaluation.machine_faults import exception_line, machine_fault
 from sweep.execution.block_task import compute_blocks, other_here
 from sweep.execution.executors import MAX_ATTEMPTS, Executor, Failed
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import ADVICE
+from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
 from sweep.messages import notice
 from sweep.processor import differing_processors, processor
 from sweep.store.provenance import fingerprint
@@ -32,6 +33,9 @@ from sweep.store.receipt import Receipt
 # The client of a cluster whose workers make the same numbers as this process.
 #
 # The caller's client or cluster is only used; no client here becomes Dask's default.
+
+LOCAL = "local"
+"""In place of a scheduler's address: a cluster of processes on this machine, for this run alone."""
 
 ANSWER_S = 10.0
 """How long a scheduler may take to answer."""
@@ -52,7 +56,8 @@ class Cluster(Protocol):
 
 @contextlib.contextmanager
 def connected(
-    pipeline: Pipeline, scheduler: str | None, client: Client | Cluster | None
+    pipeline: Pipeline, scheduler: str | None, client: Client | Cluster | None,
+    workers: int | None = None,
 ) -> Iterator[OnCluster]:
     """Return what computes on a cluster.
 
@@ -61,9 +66,11 @@ def connected(
     pipeline
         What is to be computed.
     scheduler
-        Address of a running scheduler.
+        Address of a running scheduler, or :data:`LOCAL`.
     client
         Without one, the caller's client, which stays open, or cluster object.
+    workers
+        Processes of a local cluster (default: the available processors).
 
     Raises
     ------
@@ -75,12 +82,31 @@ def connected(
         if scheduler is not None:
             argument, name = "scheduler", scheduler
             stack.enter_context(silenced_dask_loggers())
-            connection = stack.enter_context(_client_of(scheduler))
+            connection = stack.enter_context(
+                Client(stack.enter_context(_local_cluster(workers or default_workers())),
+                       set_as_default=False)
+                if scheduler == LOCAL else _client_of(scheduler))
         else:
             argument, name = "client", _name(client)
             connection = _borrowed(client, name, stack)
         check_workers(connection, pipeline, argument, name)
         yield OnCluster(connection)
+
+
+def _local_cluster(workers: int) -> LocalCluster:
+    """Return a cluster of single-threaded processes on this machine.
+
+    Dask's limit of memory is off: results lie in the store, and a worker that it pauses waits for
+    ever.
+    """
+    environment = dask.config.get("distributed.nanny.pre-spawn-environ") | SINGLE_THREADED
+    try:
+        with dask.config.set({"distributed.nanny.pre-spawn-environ": environment}):
+            return LocalCluster(
+                n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+                dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
+    except (RuntimeError, OSError) as error:
+        raise RunError(f"{workers} workers cannot be started: {exception_line(error)}") from None
 
 
 def _client_of(address: str) -> Client:
@@ -94,7 +120,8 @@ def _client_of(address: str) -> Client:
             raise ValueError(address)
     except ValueError:
         raise ArgumentError(
-            "scheduler", address, "expected an address such as tcp://host:8786") from None
+            "scheduler", address,
+            f"expected an address such as tcp://host:8786, or {LOCAL}") from None
     try:
         # Dask's client waits without end for a handshake, so that comes first, and alone; in a
         # thread, since the caller may be in an event loop, as notebooks are.

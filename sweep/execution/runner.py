@@ -156,8 +156,8 @@ def execute(
         Processes on this machine (default: the available processors, or a single one where less
         than :data:`SMALL_RUN_S` seconds of work are left).
     scheduler
-        Address of a running Dask scheduler, whose workers compute instead. They must reach the
-        store under the same path.
+        Address of a running Dask scheduler, whose workers compute instead: they must reach the
+        store under the same path. Or ``local``: a Dask cluster on this machine, for this run.
     client
         A ``distributed.Client`` or cluster object, whose workers compute instead; a client stays
         open.
@@ -228,7 +228,7 @@ def execute(
         if remote:
             from sweep.execution.on_cluster import connected  # noqa: PLC0415  (slow to import)
 
-            executor = stack.enter_context(connected(pipeline, scheduler, client))
+            executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
             count = workers or default_workers()
             executor = stack.enter_context(Children(child, count, at_once=large))

@@ -43,6 +43,24 @@ def undisturbed(tmp_path_factory):
     return url
 
 
+# A Dask cluster that a run starts for itself.
+
+def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tmp_path):
+    me, threads = psutil.Process(), set(threading.enumerate())
+    before = me.children(recursive=True)
+    url = str(tmp_path / "local.zarr")
+    summary = execute(PIPELINE, url, workers=2, scheduler="local", block_s=0.01)
+    assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
+    assert same(url, undisturbed)
+    left = [child for child in me.children(recursive=True) if child not in before
+            and "resource_tracker" not in " ".join(child.cmdline())]  # Python's own
+    psutil.wait_procs(left, timeout=10)
+    assert not [child for child in left if child.is_running()]
+    left = {thread.name.partition("_")[0] for thread in set(threading.enumerate()) - threads}
+    libraries = {"zarr", "asyncio", "Dask-Offload", "Dask-Callback-Thread", "ThreadPoolExecutor-2"}
+    assert left <= libraries  # idle threads of Zarr, Dask and Tornado
+
+
 # Children.
 
 @pytest.mark.long

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from support.blocks import run_cells
+from support.solving import of_markers
 from sweep.evaluation.inspection import scene_image
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.estimation import Detections
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import modules
@@ -113,10 +113,8 @@ def test_the_solver_finds_the_pose_of_perfect_corners():
     text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
     pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
     scenes = build_scenes(pipeline.experiment.scene_values([np.arange(3)]), 3)
-    found = build(pipeline.experiment.estimators[0])(Detections.of_markers(
-        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
-        [scenes.target(0)] * 3, [], np.zeros((3, 2), dtype=np.int64),
-    ))
+    found = build(pipeline.experiment.estimators[0])(of_markers(
+        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), [scenes.target(0)] * 3))
     np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
     np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)
     assert found.reprojection_px.max() < 1e-4

@@ -455,8 +455,8 @@ def fit(
     markers
         The most markers of a photograph that are fitted, well spread over the frame.
     check
-        Whether half of the photographs are held out: effects that bring simulated errors no nearer
-        to theirs are left out, and the gap that is left is in ``gap``.
+        Whether half of the photographs are held out: effects without which simulated errors come
+        clearly nearer to theirs are left out, and the gap that is left is in ``gap``.
 
     Returns
     -------

@@ -54,9 +54,9 @@ if not TYPE_CHECKING:  # so that mypy knows the names above alone
     def __getattr__(name: str) -> ModuleType:
         """Import a module when it is first used."""
         top = Path(__file__).parent
-        if (top / f"{name}.py").is_file():
-            return importlib.import_module(f"sweep.{name}")
-        for room in ROOMS:
+        for room in ("", *ROOMS):
             if (top / room / f"{name}.py").is_file():
-                return importlib.import_module(f"sweep.{room}.{name}")
+                where = f"sweep.{room}.{name}" if room else f"sweep.{name}"
+                module = globals()[name] = importlib.import_module(where)  # it is found once
+                return module
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

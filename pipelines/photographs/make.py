@@ -134,7 +134,7 @@ def older_scene(
     The blur is the mean over the photographs, as in a fitted scene without a spread.
     """
     printed = read_board(board)
-    views = photograph_views(photograph_scenes(photographs, printed), printed, MARKERS)
+    views = photograph_views(photograph_scenes(photographs), printed, MARKERS)
     moved = np.zeros(len(START), dtype=bool)
     moved[VARIANCE] = True
     fits = [

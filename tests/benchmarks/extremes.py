@@ -87,7 +87,7 @@ def measured(pipeline, count=None):
     with all_that_is_printed() as printed, warnings.catch_warnings():
         warnings.simplefilter("error")
         cells = run_cells(pipeline.experiment, indices)
-        columns = {v.name: np.stack(cells.columns[v.name]).astype(v.dtype) for v in SCHEMA}
+        columns = {v.name: cells.columns[v.name].astype(v.dtype) for v in SCHEMA}
     settings = pipeline.size(Stage.detection)
     leading = {
         Stage.scene: (),

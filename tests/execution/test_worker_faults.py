@@ -100,7 +100,7 @@ def test_blocks_of_a_worker_whose_machine_is_at_fault_are_computed_by_others(
         run_on(two_workers, tmp_path / "none.zarr")
     (line,) = str(raised.value).splitlines()
     assert "machine fault on " in line
-    assert "MemoryError" in line
+    assert "MemoryError" in line or "No space left on device" in line  # whichever tried it last
 
 
 @pytest.mark.long

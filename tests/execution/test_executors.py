@@ -56,9 +56,11 @@ def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tm
             and "resource_tracker" not in " ".join(child.cmdline())]  # Python's own
     psutil.wait_procs(left, timeout=10)
     assert not [child for child in left if child.is_running()]
+    # Idle threads of Zarr and Dask, and of one pool without a name, whose number is the process's.
     left = {thread.name.partition("_")[0] for thread in set(threading.enumerate()) - threads}
-    libraries = {"zarr", "asyncio", "Dask-Offload", "Dask-Callback-Thread", "ThreadPoolExecutor-2"}
-    assert left <= libraries  # idle threads of Zarr, Dask and Tornado
+    unnamed = {name for name in left if name.startswith("ThreadPoolExecutor-")}
+    assert len(unnamed) <= 1
+    assert left - unnamed <= {"zarr", "asyncio", "Dask-Offload", "Dask-Callback-Thread"}
 
 
 # Children.

@@ -374,6 +374,13 @@ def rectangles(boxes: Floats, per_side: int = 1) -> Floats:
     )
 
 
+def in_space(boxes: Floats, planes: Floats, per_side: int = 1) -> Floats:
+    """Return points (n, 4 · per_side, 3) along boxes (n, 4) of sheets in ``planes`` (n, 3, 3)."""
+    flat = rectangles(boxes, per_side)
+    points = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=2)
+    return np.ascontiguousarray(points @ np.swapaxes(planes, 1, 2))
+
+
 def box_corners(boxes: Floats) -> Floats:
     """Return the corners (n, 4, 3) of boxes (n, 4): TL, TR, BR, BL; x right, y up."""
     corners = rectangles(boxes) * [1.0, -1.0]
@@ -543,26 +550,14 @@ def sheet_boxes(board: Board) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _corners(board: Board) -> Floats:
-    """Return the corners (P, 4, 3) of each of a board's sheets as (column, row, 1)."""
-    flat = rectangles(sheet_boxes(board))
-    return np.concatenate([flat, np.ones((len(flat), 4, 1))], axis=2)
-
-
-@lru_cache(maxsize=64)
 def sheets_m(board: Board) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the board's frame."""
-    return np.array([
-        corners @ each.plane(np.eye(3), np.zeros(3)).T
-        for corners, each in zip(_corners(board), sheets_of(board), strict=True)
-    ])
+    return outlines(board, sheet_planes(board, np.eye(3), np.zeros(3), 1.0))
 
 
 def outlines(board: Board, planes: Floats) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the camera frame."""
-    return np.array([
-        corners @ plane.T for corners, plane in zip(_corners(board), planes, strict=True)
-    ])
+    return in_space(sheet_boxes(board), planes)
 
 
 def own_sheets(board: Board) -> int:

@@ -23,6 +23,7 @@ from sweep.model.polygon import (
     distorted_point,
     flat_sheet,
     homogeneous_pixel,
+    is_curved,
     piece_count,
     sheet_pixel,
 )
@@ -416,9 +417,19 @@ def accumulate(
 
 
 @compiled
-def sum_levels(
-    cover: Floats, outside: float, levels: Floats
+def accumulate_sheet(
+    cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
+    sigma: float, sheet: Sheet,
 ) -> None:
+    """As :func:`accumulate`, of a sheet that may be bent or shifted."""
+    if is_curved(sheet):
+        accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
+    else:
+        accumulate(cover, edges, levels, projection, left, top, sigma)
+
+
+@compiled
+def sum_levels(cover: Floats, outside: float, levels: Floats) -> None:
     """Write the running sums of ``cover``, from the level ``outside``, to ``levels``.
 
     ``cover`` is all zero afterwards, ready for the next scene.

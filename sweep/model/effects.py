@@ -90,6 +90,10 @@ class Effect:
     worsens
         What it makes worse for the search of windows, where another effect brings it: coarse noise
         needs twice the margin of noise, steep uneven light the whole frame.
+    outline
+        What it makes of the straight outline of a print at rest: "curved": bent, or shifted from
+        point to point, as :func:`sweep.model.exposure.scene_sheet` says; "moving": it is where
+        :meth:`sweep.model.scene.Scenes.motion` says; "covered": something covers the sheet.
     spread_px
         Standard deviation of the point spread that it adds, in px, by its parameters, the focal
         length in px and inverse depths (...) in 1/m; those of several add in quadrature. Printed
@@ -112,6 +116,7 @@ class Effect:
     in_bound: bool = False
     widens: Literal["nothing", "noise", "uneven light"] = "nothing"
     worsens: tuple[Literal["noise", "uneven light"], ...] = ()
+    outline: Literal["kept", "curved", "moving", "covered"] = "kept"
     spread_px: Callable[[Mapping[str, float], float, Floats], Floats] | None = None
     reach_px: int = 0
     block_px: int = 1
@@ -213,7 +218,7 @@ EFFECTS: tuple[Effect, ...] = (
             0.0, "direction in which the sheet curves, in the marker's plane: 0 right, 90 up",
             -360, 360,
         ),
-    }, needs=dict.fromkeys(("bend", "bend_deg"), ("curvature_per_m",))),
+    }, needs=dict.fromkeys(("bend", "bend_deg"), ("curvature_per_m",)), outline="curved"),
     Effect("occlusion", "edges", {
         "occlusion": drawn(
             0.0, "share of the black square's extent that a sheet with a straight edge hides; "
@@ -224,7 +229,7 @@ EFFECTS: tuple[Effect, ...] = (
             "top", -360, 360,
         ),
         "occluder": drawn(128.0, "level of the sheet", 0, 255, unit="grey level"),
-    }),
+    }, outline="covered"),
     Effect("uneven light", "light", {
         "illumination_gradient": drawn(
             0.0, "change of the light across the frame's width, relative to its centre", -2, 2
@@ -238,7 +243,7 @@ EFFECTS: tuple[Effect, ...] = (
             0.0, "exposure time: the image is the mean over it; the true pose is that in its "
             "middle", 0, 1e6,
         ),
-    }, needs={"exposure_s": VELOCITIES}),
+    }, needs={"exposure_s": VELOCITIES}, outline="moving"),
     Effect("rolling shutter", "edges", {
         "row_time_s": drawn(
             0.0, "rolling shutter: time from one row's exposure to the next's; the true pose "
@@ -266,6 +271,7 @@ EFFECTS: tuple[Effect, ...] = (
             "row_time_s": VELOCITIES,
             **dict.fromkeys(VELOCITIES, ("exposure_s", "row_time_s")),
         },
+        outline="moving",
     ),
     Effect("optical blur", "edges", {
         "blur_px": drawn(0.0, "standard deviation of the lens' Gaussian point spread", 0, 1000),
@@ -293,7 +299,7 @@ EFFECTS: tuple[Effect, ...] = (
             100.0, "distance at which the correlation of these shifts has fallen to 0.61", 1,
             1e6,
         ),
-    }, needs={"geometry_length_px": ("geometry_px",)}, random=True),
+    }, needs={"geometry_length_px": ("geometry_px",)}, random=True, outline="curved"),
     Effect("ragged edges", "edges", {
         "edge_px": drawn(
             0.0, "standard deviation, right and down, of shifts of the image that vary from "
@@ -303,7 +309,7 @@ EFFECTS: tuple[Effect, ...] = (
         "edge_length_px": drawn(
             4.0, "distance at which the correlation of these shifts has fallen to 0.61", 1, 1e6
         ),
-    }, needs={"edge_length_px": ("edge_px",)}, random=True),
+    }, needs={"edge_length_px": ("edge_px",)}, random=True, outline="curved"),
     Effect("sharpening", "edges", {
         "sharpening": drawn(
             0.0, "amount of unsharp masking in the camera: the exact image plus so many times "

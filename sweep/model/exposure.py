@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from hashlib import sha256
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from sweep.model.board import (
     edges_of,
     extent_of,
     facing,
+    in_space,
     occluded_edges,
     own_sheets,
     rectangles,
@@ -31,57 +31,23 @@ from sweep.model.coverage import NODES, REACH, WEIGHTS, MarkerEdges
 from sweep.model.lens import distort, jacobian
 from sweep.model.polygon import (
     PIECE_LENGTHS,
+    Optics,
     Projection,
     Sheet,
     bent_point,
     flat_sheet,
     fold_cells,
     folds_over,
+    is_curved,
     plane_normal,
     sheet_pixels,
 )
-from sweep.model.scene import Box, Scenes
+from sweep.model.scene import Box, Motion, Scenes
 from sweep.model.sensor import standard_normals
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # A target that moves at constant linear and angular velocity while its image is taken.
-
-class Motion(NamedTuple):
-    """A marker's motion in the camera frame.
-
-    Attributes
-    ----------
-    translation
-        (3,) position of its centre at time 0, in metres.
-    velocity
-        (6,) linear in m/s and angular in rad/s.
-    """
-
-    translation: Floats
-    velocity: Floats
-
-
-class MovingMarker(NamedTuple):
-    """A moving marker seen by a camera.
-
-    Attributes
-    ----------
-    projection
-        The camera, and the marker's plane at time 0.
-    motion
-        How the marker moves.
-    outline
-        (M, 3) points of its outline: column, row, and height over the plane in modules.
-    flat
-        Whether it has a back, which has no image.
-    """
-
-    projection: Projection
-    motion: Motion
-    outline: Floats
-    flat: bool
-
 
 @compiled
 def moved_plane(plane: Floats, motion: Motion, time_s: float) -> Floats:
@@ -90,7 +56,7 @@ def moved_plane(plane: Floats, motion: Motion, time_s: float) -> Floats:
     ``plane`` takes module coordinates to the camera frame. The rotation about the centre is
     Rodrigues' formula for the vector angular velocity · time.
     """
-    translation, velocity = motion
+    translation, velocity = motion.translation, motion.velocity
     x, y, z = velocity[3] * time_s, velocity[4] * time_s, velocity[5] * time_s
     angle = math.sqrt(x * x + y * y + z * z)
     sine, versine = 1.0, 0.5
@@ -153,16 +119,18 @@ def outline_extent(
 
 
 @compiled
-def track(marker: MovingMarker, times_s: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the extents (T, 4) left, top, right, bottom in px of a marker, and its states (T,)."""
-    projection, motion = marker.projection, marker.motion
+def track(
+    projection: Projection, outline: Floats, flat: bool, motion: Motion, times_s: Floats
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the extents (T, 4) left, top, right, bottom in px of a target, and its states (T,).
+
+    ``projection`` has its plane at time 0. ``flat``: it has a back, which has no image.
+    """
     extents = np.empty((len(times_s), 4))
     states = np.zeros(len(times_s), dtype=np.int64)
     for k in range(len(times_s)):
         p = moved_plane(projection.plane, motion, times_s[k])
-        behind, folds = outline_extent(
-            Projection(p, projection.optics), marker.outline, extents[k]
-        )
+        behind, folds = outline_extent(Projection(p, projection.optics), outline, extents[k])
         if folds:
             states[k] = MEANINGLESS
         # The sign of the line of sight along the normal, which is the columns' cross product.
@@ -171,29 +139,15 @@ def track(marker: MovingMarker, times_s: Floats) -> tuple[Floats, NDArray[np.int
             a, b = (i + 1) % 3, (i + 2) % 3
             normal = p[a, 0] * p[b, 1] - p[b, 0] * p[a, 1]
             towards += normal * (motion.translation[i] + motion.velocity[i] * times_s[k])
-        if behind == len(marker.outline):
+        if behind == len(outline):
             states[k] = BEHIND
-        elif behind > 0 or (marker.flat and not towards > 0.0):
+        elif behind > 0 or (flat and not towards > 0.0):
             states[k] = MEANINGLESS
     return extents, states
 
 
 MIN_INSTANTS = 65
 """Least number of instants at which a moving target's extent is computed."""
-
-
-def row_times(
-    top: int, bottom: int, height: int, exposure_s: float, row_time_s: float
-) -> tuple[float, float]:
-    """Return when the exposure of rows [top, bottom) begins and ends.
-
-    Time 0 is the middle of the middle row's exposure.
-    """
-    middle = (height - 1) / 2
-    return (
-        row_time_s * (top - middle) - exposure_s / 2,
-        row_time_s * (bottom - 1 - middle) + exposure_s / 2,
-    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -254,10 +208,9 @@ class SeenSheet(NamedTuple):
     plane: Floats
 
     @property
-    def depths(self) -> Floats:
-        """The depths (4,) in metres of its corners."""
-        (corners,) = rectangles(self.box[None], 1)
-        return np.asarray(corners @ self.plane[2, :2] + self.plane[2, 2])
+    def corners(self) -> Floats:
+        """Its corners (4, 3) in the camera frame, in metres."""
+        return np.asarray(in_space(self.box[None], self.plane[None])[0])
 
 
 def solid_planes(scenes: Scenes, row: int) -> Floats:
@@ -302,11 +255,6 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     )
 
 
-def is_curved(sheet: Sheet) -> bool:
-    """Return whether a sheet is bent or its image shifted."""
-    return sheet.curvature != 0 or sheet.waves.shape[1] > 0
-
-
 def sheet_outline_px(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 2) along the images of the sheets; NaN if not before the camera."""
     optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
@@ -332,22 +280,18 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
     return False
 
 
-def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
-    """Return the target of one scene with a velocity (6,) as compiled functions take it.
+def target_outline(scenes: Scenes, row: int) -> Floats:
+    """Return points (M, 3) around the target of one scene: column, row, height over its plane.
 
-    Its outline are its sheets' corners, or more points under a lens or on a bent sheet.
+    In modules: its sheets' corners, or more points under a lens or on a bent sheet.
     """
     target, bend = scenes.target(row), scene_sheet(scenes, row)
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or is_curved(bend) else 1
     if target.is_flat:
         (points,) = rectangles(extent_of(target).sheet[None], per_side)
-        outline = np.array([bent_point(column, line, bend) for column, line in points.tolist()])
-    else:
-        corners = sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0]
-        outline = along_sides(corners, per_side).reshape(-1, 3)
-    return MovingMarker(
-        scenes.projection(row), Motion(scenes.translation[row], velocity), outline, target.is_flat
-    )
+        return np.array([bent_point(column, line, bend) for column, line in points.tolist()])
+    corners = sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0]
+    return along_sides(corners, per_side).reshape(-1, 3)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -370,40 +314,49 @@ def spread_px(
 
 def largest_spread_px(scenes: Scenes, row: int) -> float:
     """Return the largest point spread on the target, at a corner of a sheet, with sharpening's."""
-    depths = np.concatenate([[], *(each.depths for each in seen_sheets(scenes, row))])
+    depths = np.concatenate([[], *(each.corners[:, 2] for each in seen_sheets(scenes, row))])
     return float(spread_px(scenes, row, 1 / depths, blurred=True).max(initial=0.0))
+
+
+def is_defocused(scenes: Scenes, row: int) -> bool:
+    """Return whether the point spread of one scene depends on depth."""
+    return not math.isnan(scenes.effects["aperture_mm"][row])
 
 
 def defocus_px(
     scenes: Scenes, row: int, sheet: SeenSheet, box: Box, blurred: bool = False
 ) -> Floats:
-    """Return the point spread's standard deviation (height, width) at a sheet's depth.
+    """Return the point spread's standard deviation in px of the pixels (height, width) of a box.
 
     The depth is that of the sheet's plane (of a bent one, the tangent plane at its centre) in each
     pixel's direction; its inverse is linear in the image.
     """
+    if not is_defocused(scenes, row):
+        even = spread_px(scenes, row, np.zeros(1), blurred)[0]
+        return np.full((box[3] - box[1], box[2] - box[0]), even)
     fx, fy, cx, cy = scenes.cameras.view[row]
     normal = np.cross(sheet.plane[:, 0], sheet.plane[:, 1])
     x = (np.arange(box[0], box[2]) - cx) / fx
     y = (np.arange(box[1], box[3]) - cy) / fy
     inverse = (normal[0] * x + normal[1] * y[:, None] + normal[2]) / (normal @ sheet.plane[:, 2])
     # Beyond the sheet its plane may come near the camera, or end; nothing is blurred there.
-    depth = sheet.depths
+    depth = sheet.corners[:, 2]
     return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()), blurred)
 
 
-def _path_px(
-    scenes: Scenes, row: int, velocity: Floats, begin: float, end: float
-) -> float:
+def _path_px(scenes: Scenes, row: int, motion: Motion, begin: float, end: float) -> float:
     """Return the longest path of a corner, in px, from a time to another."""
-    marker = moving_marker(scenes, row, velocity * np.array([1.0, 1, 1, 0, 0, 0]))
-    extents, states = track(marker, np.linspace(begin, end, MIN_INSTANTS))
+    linear = motion._replace(velocity=motion.velocity * np.array([1.0, 1, 1, 0, 0, 0]))
+    extents, states = track(
+        scenes.projection(row), target_outline(scenes, row), scenes.target(row).is_flat, linear,
+        np.linspace(begin, end, MIN_INSTANTS),
+    )
     extents = extents[states != BEHIND]
     if not len(extents):
         return 0.0
     along = np.hypot(*np.abs(np.diff(extents, axis=0)).reshape(-1, 2, 2).max(axis=1).T).sum()
     around = np.hypot(*(extents[:, 2:] - extents[:, :2]).max(axis=0)) * (end - begin)
-    return float(along + np.linalg.norm(velocity[3:]) * around)
+    return float(along + np.linalg.norm(motion.velocity[3:]) * around)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -419,7 +372,7 @@ class Layer(NamedTuple):
     edges
         Those of what is seen of its print.
     outline
-        (M, 3) points around it, as :class:`MovingMarker` has them.
+        (M, 3) points around it: column, row, and height over its plane.
     begin_s, end_s
         The part of the time.
     """
@@ -440,9 +393,9 @@ MAX_SHADOWS = 512
 
 
 def _layers(
-    scenes: Scenes, row: int, velocity: Floats, begin_s: float, end_s: float, beside: bool
+    scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool
 ) -> list[Layer]:
-    """Return what is seen of one scene from a time to another; ``beside``: of distractors alone."""
+    """Return what is seen of one scene in the rows of a box; ``beside``: of distractors alone."""
     target, effect = scenes.target(row), scenes.effects.of(row)
     if target.is_flat:
         (sheet,) = seen_sheets(scenes, row)
@@ -451,30 +404,25 @@ def _layers(
             else occluded_edges(target, effect["occlusion"], effect["occlusion_deg"])
             if effect["occlusion"] > 0 else edges_of(target)
         )
-        outline = moving_marker(scenes, row, velocity).outline
-        return [Layer(sheet, edges, outline, -math.inf, math.inf)]
+        return [Layer(sheet, edges, target_outline(scenes, row), -math.inf, math.inf)]
     planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
-    motion = Motion(scenes.translation[row], velocity)
-    count = 1
-    if velocity.any():
-        path = _path_px(scenes, row, velocity, begin_s, end_s)
-        count = min(max(math.ceil(path / OCCLUSION_PX), 1), MAX_SHADOWS)
+    begin_s, end_s = motion.exposed(box[1], box[3])
+    path = _path_px(scenes, row, motion, begin_s, end_s) if motion.moves else 0.0
+    count = min(max(math.ceil(path / OCCLUSION_PX), 1), MAX_SHADOWS)
     times = np.linspace(begin_s, end_s, count + 1)
     times[0], times[-1] = -math.inf, math.inf
-    middles = begin_s + (np.arange(count) + 0.5) / count * (end_s - begin_s)
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
     layers = []
-    for (start, stop), middle in zip(itertools.pairwise(times), middles, strict=True):
+    for k in range(count):
+        middle = begin_s + (k + 0.5) / count * (end_s - begin_s)
         moved = planes
-        if velocity.any():
+        if motion.moves:
             moved = np.array([moved_plane(each, motion, middle) for each in planes])
         for seen in visible_prints(target, moved, own_sheets(target) if beside else 0):
-            box, plane = boxes[seen.number], planes[seen.number]
-            (points,) = rectangles(box[None], per_side)
-            layers.append(Layer(
-                SeenSheet(seen.number, box, plane), seen.edges,
-                np.column_stack([points, np.zeros(len(points))]), start, stop,
-            ))
+            sheet = SeenSheet(seen.number, boxes[seen.number], planes[seen.number])
+            (points,) = rectangles(sheet.box[None], per_side)
+            around = np.column_stack([points, np.zeros(len(points))])
+            layers.append(Layer(sheet, seen.edges, around, times[k], times[k + 1]))
     return layers
 
 
@@ -499,24 +447,6 @@ SPREAD_RATIO = 1.4
 logarithm is then at most 0.1 grey levels."""
 
 
-class Shutter(NamedTuple):
-    """When the rows of a frame are exposed.
-
-    Attributes
-    ----------
-    exposure_s, row_time_s
-        Duration of each row's exposure, and time from one row's to the next's.
-    middle_row
-        The row whose exposure has its middle at time 0.
-    panels
-        Parts into which the exposure is divided for integration; 0 if nothing moves during it.
-    """
-
-    exposure_s: float
-    row_time_s: float
-    middle_row: float
-    panels: int
-
 def marker_exposure(
     scenes: Scenes, row: int, box: Box, levels: Floats, blurred: bool = False, beside: bool = False
 ) -> Floats:
@@ -531,107 +461,73 @@ def marker_exposure(
     if 0 in shape:
         return np.empty(shape)
     optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
-    curved = is_curved(bend)
-    exposure_s, row_time_s, velocity = scenes.motion(row) or (0.0, 0.0, np.zeros(6))
-    moves, height = bool(velocity.any()), int(scenes.frame[row, 1])
-    motion = Motion(scenes.translation[row], velocity)
-    layers = _layers(
-        scenes, row, velocity, *row_times(box[1], box[3], height, exposure_s, row_time_s), beside
-    )
-    path = 0.0
-    if exposure_s > 0:
+    motion = scenes.motion(row)
+    path, most = 0.0, MAX_PANELS if motion.row_time_s == 0 else MAX_ROW_PANELS
+    if motion.exposure_s > 0:
         path = max(
-            _path_px(scenes, row, velocity,
-                     *row_times(line, line + 1, height, exposure_s, row_time_s))
+            _path_px(scenes, row, motion, *motion.exposed(line, line + 1))
             for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1)
         )
     cover = np.zeros((shape[0], shape[1] + 2))
 
     def draw(some: list[Layer], sigma: float, outside: float) -> Floats:
         """Return the image of layers with one point spread, over the level outside."""
-        most = MAX_PANELS if row_time_s == 0 else MAX_ROW_PANELS
         panels = math.ceil(min(path / max(SHARP_PANEL_PX, 1.5 * sigma), most))
-        shutter = Shutter(exposure_s, row_time_s, (height - 1) / 2, panels)
         for layer in some:
-            projection = Projection(layer.sheet.plane, optics)
-            if moves:
-                _expose(
-                    cover, MovingMarker(projection, motion, layer.outline, flat=True), layer.edges,
-                    levels, shutter, (layer.begin_s, layer.end_s), box[0], box[1], sigma, bend,
-                    curved,
-                )
-            elif curved:
-                coverage.accumulate_curved(
-                    cover, layer.edges, levels, projection, box[0], box[1], sigma, bend
-                )
-            else:
-                coverage.accumulate(
-                    cover, layer.edges, levels, projection, box[0], box[1], sigma
-                )
+            _expose(cover, layer, optics, motion, panels, levels, box[0], box[1], sigma, bend)
         image = np.empty(shape)
         coverage.sum_levels(cover, outside, image)
         return image
 
-    def focused(some: list[Layer], wanted: Floats, outside: float) -> Floats:
-        """Return the image of layers whose point spreads (height, width) are ``wanted``."""
-        spreads, varies = _spreads(wanted)
-        images = np.array([draw(some, sigma, outside) for sigma in spreads])
-        return _focused(images, np.array(spreads), wanted) if varies else images[0]
-
-    if math.isnan(scenes.effects["aperture_mm"][row]):
-        even = np.full(shape, spread_px(scenes, row, np.zeros(1), blurred)[0])
-        return focused(layers, even, float(levels[0]))
-    sheets = {layer.sheet.number: layer.sheet for layer in layers}
+    # Layers with the same point spread in each pixel are drawn together.
+    groups: dict[int, list[Layer]] = {}
+    for layer in _layers(scenes, row, motion, box, beside):
+        number = layer.sheet.number if is_defocused(scenes, row) else 0
+        groups.setdefault(number, []).append(layer)
     parts: list[Floats] = []
-    for number, sheet in sheets.items():
-        some = [layer for layer in layers if layer.sheet.number == number]
-        wanted = defocus_px(scenes, row, sheet, box, blurred)
-        parts.append(focused(some, wanted, 0.0 if parts else float(levels[0])))
+    for some in groups.values():
+        wanted = defocus_px(scenes, row, some[0].sheet, box, blurred)
+        spreads, varies = _spreads(wanted)
+        outside = 0.0 if parts else float(levels[0])
+        images = np.array([draw(some, sigma, outside) for sigma in spreads])
+        parts.append(_focused(images, np.array(spreads), wanted) if varies else images[0])
     return np.sum(parts, axis=0) if parts else np.full(shape, levels[0])
 
 
 @compiled
 def _expose(
-    cover: Floats, marker: MovingMarker, edges: coverage.MarkerEdges, levels: Floats,
-    shutter: Shutter, during: tuple[float, float], left: int, top: int, sigma: float,
-    sheet: Sheet, curved: bool,
+    cover: Floats, layer: Layer, optics: Optics, motion: Motion, panels: int, levels: Floats,
+    left: int, top: int, sigma: float, sheet: Sheet,
 ) -> None:
-    """Add a marker's edges to ``cover``, averaged over each row's exposure, as far as ``during``.
+    """Add a layer's edges to ``cover``, averaged over each row's exposure.
 
-    By three Gauss-Legendre nodes on each part of the exposure. Instants at which the exposed rows
-    see no part of the marker cost next to nothing.
+    By three Gauss-Legendre nodes on each of ``panels`` parts of the exposure; without a part, at
+    its middle alone. Instants at which the exposed rows see no part of the layer cost next to
+    nothing.
     """
-    projection, panels = marker.projection, shutter.panels
-    groups = cover.shape[0] if shutter.row_time_s > 0.0 else 1
+    at_rest = layer.sheet.plane
+    groups = cover.shape[0] if motion.row_time_s > 0.0 else 1
     for group in range(groups):
-        rows = cover[group : group + 1] if shutter.row_time_s > 0.0 else cover
-        begin = shutter.row_time_s * (top + group - shutter.middle_row)
+        rows = cover[group : group + 1] if motion.row_time_s > 0.0 else cover
+        begin = motion.row_time_s * (top + group - motion.middle_row)
         for panel in range(max(panels, 1)):
             for node in range(3 if panels > 0 else 1):
                 offset, weight = NODES[node], WEIGHTS[node]
                 if panels == 0:
                     offset, weight = 0.5, 1.0
-                instant = begin + shutter.exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
-                if not during[0] <= instant < during[1]:
+                instant = begin + motion.exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
+                if not layer.begin_s <= instant < layer.end_s:
                     continue
-                plane = (
-                    moved_plane(projection.plane, marker.motion, instant) if instant != 0.0
-                    else projection.plane
-                )
-                at_instant = Projection(plane, projection.optics)
+                plane = moved_plane(at_rest, motion, instant) if instant != 0.0 else at_rest
+                projection = Projection(plane, optics)
                 if _is_seen(
-                    at_instant, marker.outline, left, top + group, rows.shape[0],
+                    projection, layer.outline, left, top + group, rows.shape[0],
                     rows.shape[1] - 2, REACH * sigma + 2.0 + sheet.largest_px,
                 ):
-                    weighted = levels * (weight / max(panels, 1))
-                    if curved:
-                        coverage.accumulate_curved(
-                            rows, edges, weighted, at_instant, left, top + group, sigma, sheet
-                        )
-                    else:
-                        coverage.accumulate(
-                            rows, edges, weighted, at_instant, left, top + group, sigma
-                        )
+                    coverage.accumulate_sheet(
+                        rows, layer.edges, levels * (weight / max(panels, 1)), projection, left,
+                        top + group, sigma, sheet,
+                    )
 
 
 @compiled

@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
-from sweep.model.board import along_sides, extent_of, own_sheets, rectangles, sheets_m, sheets_of
+from sweep.model.board import (
+    along_sides,
+    extent_of,
+    in_space,
+    own_sheets,
+    rectangles,
+    sheets_m,
+    sheets_of,
+)
 from sweep.model.coverage import REACH
 from sweep.model.exposure import (
     BEHIND,
     CHORDS_PER_SIDE,
     MEANINGLESS,
     MIN_INSTANTS,
-    is_curved,
     largest_spread_px,
-    moving_marker,
-    row_times,
     scene_sheet,
     seen_sheets,
     sheet_folds,
     sheet_outline_px,
+    target_outline,
     track,
 )
-from sweep.model.polygon import half_plane, signed_areas
+from sweep.model.polygon import half_plane, is_curved, signed_areas
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
 from sweep.typing import Floats, Masks
@@ -38,36 +45,22 @@ WARP_PX_PER_MODULE = 10
 """Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
 
 
-def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square.
+def _outlines(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 3) along all that is printed, in the camera frame."""
+    boxes = scenes.targets.each(lambda board: extent_of(board).sheet)[rows]
+    return in_space(boxes, scenes.plane[rows], per_side)
 
-    The outline is that of all that is printed, the black square that of ``size_m``.
+
+def _squares_px(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along the images of what is black.
+
+    It is as large as ``size_m`` says, not as it is printed.
     """
-    boxes = (
-        scenes.targets.each(lambda board: extent_of(board).sheet)[rows] if quiet
-        else _unscaled(scenes, rows)
-    )
-    rectangle = rectangles(boxes, per_side)
-    flat = np.concatenate([rectangle, np.ones_like(rectangle[..., :1])], axis=2)
-    return scenes.cameras.take(rows).project(
-        np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
-    )
-
-
-def _unscaled(scenes: Scenes, rows: NDArray[np.intp]) -> Floats:
-    """Return what is black (n, 4) as large as ``size_m`` says, in modules of the printed one."""
     ink = scenes.targets.each(lambda board: extent_of(board).ink)[rows]
     origin = scenes.targets.each(lambda board: extent_of(board).origin)[rows]
     larger = 1 / scenes.effects["marker_scale"][rows] - 1
-    return np.asarray(ink + (ink - np.tile(origin, 2)) * larger[:, None])
-
-
-def curved_rows(scenes: Scenes) -> NDArray[np.intp]:
-    """Return the scenes (n,) whose sheets are bent or whose image is shifted."""
-    return np.flatnonzero(np.any(
-        [scenes.effects[name] != 0 for name in ("curvature_per_m", "geometry_px", "edge_px")],
-        axis=0,
-    ))
+    boxes = ink + (ink - np.tile(origin, 2)) * larger[:, None]
+    return scenes.cameras.take(rows).project(in_space(boxes, scenes.plane[rows], per_side))
 
 
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
@@ -81,9 +74,9 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     bulging = scenes.cameras.distorted & np.isfinite(low).all(axis=1)
     lenses = np.flatnonzero(bulging & ~solid)
     if len(lenses):
-        points = _outline(scenes, lenses, quiet=True, per_side=CHORDS_PER_SIDE)
+        points = scenes.cameras.take(lenses).project(_outlines(scenes, lenses, CHORDS_PER_SIDE))
         low[lenses], high[lenses] = points.min(axis=1) - 2, points.max(axis=1) + 2
-    for row in {*np.flatnonzero(bulging & solid).tolist(), *curved_rows(scenes).tolist()}:
+    for row in np.flatnonzero((bulging & solid) | scenes.effects.outlines("curved")).tolist():
         points = sheet_outline_px(scenes, row)
         if not len(points):
             continue
@@ -111,11 +104,10 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
 
 def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return the extent, from ``low`` to ``high`` (2,), of the sheets that the frame can see."""
-    target, effect = scenes.target(row), scenes.effects.of(row)
+    target = scenes.target(row)
     if (
         len(sheets_of(target)) == 1 or scenes.renderer[row] == "warp"
-        or scenes.motion(row) is not None or effect["occlusion"] > 0
-        or is_curved(scene_sheet(scenes, row))
+        or any(each.outline != "kept" for each in scenes.effects.active_in(row))
     ):
         return low, high
     reach = 0.0
@@ -124,7 +116,7 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
             each.reach_px for each in scenes.effects.plugins.all_effects
         )
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
-    sides = along_sides(sheets_m(target) * effect["marker_scale"], per_side)
+    sides = along_sides(sheets_m(target) * scenes.effects["marker_scale"][row], per_side)
     points = scenes.cameras.take(np.array([row])).project(
         sides.reshape(1, -1, 3) @ scenes.rotation[row].T + scenes.translation[row]
     ).reshape(len(sides), -1, 2)
@@ -147,11 +139,11 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         corners = scenes.corners_px[row]
         if not np.isfinite(corners).all():
             continue
-        square = rectangles(extent_of(scenes.target(row)).ink[None], 1)[0].astype(np.float32)
+        extent = extent_of(scenes.target(row))
+        square = rectangles(extent.ink[None])[0].astype(np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
         half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
-        outline = rectangles(extent_of(scenes.target(row)).sheet[None] + half_px, 1)
-        points = np.column_stack([outline[0], np.ones(4)]) @ np.asarray(transform).T
+        (points,) = in_space(extent.sheet[None] + half_px, np.array([transform], dtype=np.float64))
         if (points[:, 2] > 0).all():
             flat = points[:, :2] / points[:, 2:]
             low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
@@ -175,22 +167,23 @@ def _exposed_extent(
     NaN if the image has no meaning while rows that see the marker are exposed. At an instant a
     marker is seen by those rows that it covers and that are exposed then.
     """
-    motion = scenes.motion(row)
+    motion, sheet = scenes.motion(row), scene_sheet(scenes, row)
     reach = largest_spread_px(scenes, row) * REACH
     reach = reach + 1 if reach > 0 else 0.0
-    if motion is None:
+    if not motion.moves:
         return low - reach, high + reach
-    sheet = scene_sheet(scenes, row)
     if is_curved(sheet):
         reach += sheet.largest_px + 2
-    exposure_s, row_time_s, velocity = motion
-    height = int(scenes.frame[row, 1])
-    begin, end = row_times(0, height, height, exposure_s, row_time_s)
-    turn = float(np.linalg.norm(velocity[3:])) * (end - begin)
+    row_time_s = motion.row_time_s
+    begin, end = motion.exposed(0, int(scenes.frame[row, 1]))
+    turn = float(np.linalg.norm(motion.velocity[3:])) * (end - begin)
     wanted = max(MIN_INSTANTS, (end - begin) / row_time_s if row_time_s > 0 else 0.0)
     count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MAX_INSTANTS))
     times = np.linspace(begin, end, count)
-    extents, states = track(moving_marker(scenes, row, velocity), times)
+    extents, states = track(
+        scenes.projection(row), target_outline(scenes, row), scenes.target(row).is_flat, motion,
+        times,
+    )
     front = states != BEHIND
     with np.errstate(invalid="ignore"):
         step = np.abs(np.diff(extents, axis=0))
@@ -202,9 +195,10 @@ def _exposed_extent(
     margin += 1 + reach
     top, bottom = extents[:, 1] - margin, extents[:, 3] + margin
     if row_time_s > 0:
-        spare = exposure_s / 2 + times[1] - times[0]
-        middle = (height - 1) / 2
-        first, last = (times - spare) / row_time_s + middle, (times + spare) / row_time_s + middle
+        spare = motion.exposure_s / 2 + times[1] - times[0]
+        first, last = (
+            (times + shift) / row_time_s + motion.middle_row for shift in (-spare, spare)
+        )
         seen = front & (first <= bottom) & (last >= top)
         top, bottom = np.maximum(top, first - 1), np.minimum(bottom, last + 1)
     else:
@@ -228,7 +222,7 @@ def areas_px(scenes: Scenes) -> Floats:
     area = signed_areas(points)
     curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
     if len(curved):
-        area[curved] = signed_areas(_outline(scenes, curved, quiet=False, per_side=256))
+        area[curved] = signed_areas(_squares_px(scenes, curved, 256))
     return np.abs(area)
 
 
@@ -250,31 +244,21 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
         )
     behind: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
     for row in np.flatnonzero(behind).tolist():
-        if scenes.target(row).distractors:
-            behind[row] = _own_sheet_behind(scenes, row)
+        target = scenes.target(row)
+        if target.distractors and scenes.solid[row]:
+            behind[row] = not np.isfinite(scenes.corners_px[row]).all()
+        elif target.distractors:
+            own = in_space(extent_of(target).target[None], scenes.plane[[row]])
+            behind[row] = (own[..., 2] <= 0).any()
     return np.asarray(~facing | behind)
-
-
-def _own_sheet_behind(scenes: Scenes, row: int) -> bool:
-    """Return whether a board has a corner at z <= 0, whatever stands beside it."""
-    if scenes.solid[row]:
-        return not np.isfinite(scenes.corners_px[row]).all()
-    target = extent_of(scenes.target(row)).target
-    (corners,), depth = rectangles(target[None], 1), scenes.plane[row][2]
-    return bool((corners @ depth[:2] + depth[2] <= 0).any())
 
 
 def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return (n,) whether the black square of scenes ``rows`` lies wholly outside the frame."""
-    corners, limit = scenes.corners_px[rows], scenes.frame[rows] - 0.5
-    outside = np.zeros(len(rows), dtype=bool)
-    cut = ((corners < -0.5) | (corners > limit[:, None])).any(axis=(1, 2))
-    for i in np.flatnonzero(cut):
-        polygon = corners[i]
-        if scenes.cameras.distorted[rows[i]]:
-            polygon = _outline(scenes, rows[i : i + 1], False, CHORDS_PER_SIDE)[0]
-        outside[i] = not _meets_frame(polygon, limit[i])
-    return outside
+    def curved(i: int) -> Floats:
+        return np.asarray(_squares_px(scenes, rows[i : i + 1], CHORDS_PER_SIDE)[0])
+
+    return _outside(scenes, rows, scenes.corners_px[rows], curved)
 
 
 def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floats) -> Masks:
@@ -282,21 +266,30 @@ def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Fl
 
     ``corners_m`` (M, 4, 3) are their corners on the board, ``corners_px`` (M, 4, 2) the images.
     """
-    limit = scenes.frame[row] - 0.5
-    low, high = corners_px < -0.5, corners_px > limit
-    cut = (low | high).any(axis=(1, 2))
-    outside = np.zeros(len(corners_m), dtype=bool)
-    if not scenes.cameras.distorted[row]:
-        outside = (low.all(axis=1) | high.all(axis=1)).any(axis=1)
-        cut &= ~outside
-    camera = scenes.cameras.take(np.array([row]))
-    for i in np.flatnonzero(cut):
-        polygon = corners_px[i]
-        if scenes.cameras.distorted[row]:
-            points = along_sides(corners_m[i : i + 1], CHORDS_PER_SIDE)
-            pose = scenes.rotation[row : row + 1], scenes.translation[row : row + 1]
-            polygon = camera.project(transform_points(points, *pose))[0]
-        outside[i] = not _meets_frame(polygon, limit)
+    rows = np.full(len(corners_m), row)
+
+    def curved(i: int) -> Floats:
+        points = along_sides(corners_m[i : i + 1], CHORDS_PER_SIDE)
+        moved = transform_points(points, scenes.rotation[[row]], scenes.translation[[row]])
+        return np.asarray(scenes.cameras.take(rows[:1]).project(moved)[0])
+
+    return _outside(scenes, rows, corners_px, curved)
+
+
+def _outside(
+    scenes: Scenes, rows: NDArray[np.intp], corners: Floats, curved: Callable[[int], Floats]
+) -> Masks:
+    """Return (n,) which squares with ``corners`` (n, 4, 2) lie wholly outside the frames of rows.
+
+    ``curved(i)`` returns points along the image of a square's sides, for those under a lens.
+    """
+    limit, distorted = scenes.frame[rows] - 0.5, scenes.cameras.distorted[rows]
+    before: Masks = np.asarray(corners < -0.5)
+    beyond: Masks = np.asarray(corners > limit[:, None])
+    aside: Masks = np.asarray(before.all(axis=1) | beyond.all(axis=1))
+    outside, cut = np.asarray(~distorted & aside.any(axis=1)), np.asarray(before | beyond)
+    for i in np.flatnonzero(cut.any(axis=(1, 2)) & ~outside).tolist():
+        outside[i] = not _meets_frame(curved(i) if distorted[i] else corners[i], limit[i])
     return outside
 
 
@@ -318,25 +311,21 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     or shifts fold its image, in the middle of the exposure. What is beside a board counts, too.
     """
     folded: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
-    for row in curved_rows(scenes).tolist():
+    bulging = scenes.cameras.distorted & ~folded
+    for row in np.flatnonzero(scenes.effects.outlines("curved")).tolist():
         folded[row] = folded[row] or sheet_folds(scenes, row)
-    for row in np.flatnonzero(scenes.effects.active).tolist():
+    for row in np.flatnonzero(scenes.effects.outlines("moving")).tolist():
         low, high = scenes.outline_px[row].min(axis=0), scenes.outline_px[row].max(axis=0)
-        if np.isfinite(low).all() and scenes.motion(row) is not None:
+        if np.isfinite(low).all() and scenes.motion(row).moves:
             folded[row] |= not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
-    bulging = scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2))
     for row in np.flatnonzero(bulging & scenes.solid).tolist():
-        quads = np.array([
-            np.column_stack([rectangles(each.box[None], 1)[0], np.ones(4)]) @ each.plane.T
-            for each in seen_sheets(scenes, row)
-        ]).reshape(-1, 4, 3)
+        quads = np.array([each.corners for each in seen_sheets(scenes, row)]).reshape(-1, 4, 3)
         lenses = np.repeat(scenes.cameras.lenses[row : row + 1], len(quads), axis=0)
         folded[row] |= lens_model.folds(quads[..., :2] / quads[..., 2:], lenses).any()
     rows = np.flatnonzero(bulging & ~scenes.solid)
     if len(rows):
-        points = scenes.outline_m[rows]
+        points = _outlines(scenes, rows, 1)
         folded[rows] |= lens_model.folds(
-            np.ascontiguousarray(points[..., :2] / points[..., 2:]),
-            scenes.cameras.lenses[rows],
+            points[..., :2] / points[..., 2:], scenes.cameras.lenses[rows]
         )
     return folded

@@ -236,6 +236,12 @@ def flat_sheet() -> Sheet:
 
 
 @compiled_inline
+def is_curved(sheet: Sheet) -> bool:
+    """Return whether a sheet is bent or its image shifted."""
+    return sheet.curvature != 0.0 or sheet.waves.shape[1] > 0
+
+
+@compiled_inline
 def bent_point(column: float, row: float, sheet: Sheet) -> tuple[float, float, float]:
     """Return where a point of the flat sheet is: column, row, and height towards the viewer."""
     across, down = column - sheet.centre_column, row - sheet.centre_row

@@ -6,7 +6,7 @@ import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +133,10 @@ class SceneEffects:
     def __getitem__(self, name: str) -> Floats:
         return self.values[name]
 
+    def outlines(self, change: str) -> NDArray[np.bool_]:
+        """Return whether an effect is active whose record has ``outline = change``, (N,)."""
+        return self._any_active(lambda effect: effect.outline == change)
+
     def of(self, row: int) -> dict[str, float]:
         """Return the parameters of one scene."""
         return {name: float(column[row]) for name, column in self.values.items()}
@@ -177,6 +181,42 @@ class SceneEffects:
         return active
 
 
+class Motion(NamedTuple):
+    """A target's motion in the camera frame, and when the rows of the frame are exposed.
+
+    At rest the velocity is 0, and all rows are exposed at time 0.
+
+    Attributes
+    ----------
+    translation
+        (3,) position of its origin at time 0, in metres.
+    velocity
+        (6,) linear in m/s and angular in rad/s.
+    exposure_s, row_time_s
+        Duration of each row's exposure, and time from one row's to the next's.
+    middle_row
+        The row whose exposure has its middle at time 0.
+    """
+
+    translation: Floats
+    velocity: Floats
+    exposure_s: float
+    row_time_s: float
+    middle_row: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether the target moves while its image is taken."""
+        return bool(self.velocity.any())
+
+    def exposed(self, top: int, bottom: int) -> tuple[float, float]:
+        """Return when the exposure of rows [top, bottom) begins and ends."""
+        return (
+            self.row_time_s * (top - self.middle_row) - self.exposure_s / 2,
+            self.row_time_s * (bottom - 1 - self.middle_row) + self.exposure_s / 2,
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class Scenes:
     """N scenes as arrays: cameras, targets and their poses, surroundings and effects.
@@ -198,8 +238,6 @@ class Scenes:
         (N, 4, 2) images of the corners of the black square of ``size_m`` (of a board, of what is
         black) and of all that is printed, beside a board too, both flat; NaN at z <= 0. Of targets
         in several planes the corners are of a rectangle about the image.
-    outline_m
-        (N, 4, 3) the latter's corners in the camera frame.
     levels
         (N, 3) grey levels of the background (0 if it is an image), black and white.
     renderer, background
@@ -217,7 +255,6 @@ class Scenes:
     plane: Floats
     corners_px: Floats
     outline_px: Floats
-    outline_m: Floats
     levels: Floats
     renderer: Sequence[str]
     background: Sequence[float | str]
@@ -258,14 +295,17 @@ class Scenes:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
         return Projection(self.plane[row], self.cameras.optics(row))
 
-    def motion(self, row: int) -> tuple[float, float, Floats] | None:
-        """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""
+    def motion(self, row: int) -> Motion:
+        """Return how the target of one scene moves while its image is taken."""
         effect = self.effects.of(row)
         velocity = np.array([effect[name] for name in VELOCITIES])
         velocity[3:] = np.radians(velocity[3:])
-        if not velocity.any() or effect["exposure_s"] == effect["row_time_s"] == 0.0:
-            return None
-        return effect["exposure_s"], effect["row_time_s"], velocity
+        exposure_s, row_time_s = effect["exposure_s"], effect["row_time_s"]
+        if not velocity.any() or exposure_s == row_time_s == 0.0:
+            velocity, exposure_s, row_time_s = np.zeros(6), 0.0, 0.0
+        return Motion(
+            self.translation[row], velocity, exposure_s, row_time_s, (self.frame[row, 1] - 1) / 2
+        )
 
 
 _NEUTRAL_COLUMNS = {name: Column.of(value) for name, value in NEUTRAL.items()}
@@ -362,9 +402,10 @@ def build_scenes(
     ink = targets.each(lambda board: extent_of(board).ink)[on_board]
     square_m[on_board] = box_corners(ink) * (side / modules)[on_board, None, None]
     around_m[on_board] = box_corners(sheet[on_board]) * module[on_board, None, None]
-    outline_m = transform_points(around_m, rotation, translation)
-    corners_px = cameras.project(transform_points(square_m, rotation, translation))
-    outline_px = cameras.project(outline_m)
+    corners_px, outline_px = (
+        cameras.project(transform_points(points, rotation, translation))
+        for points in (square_m, around_m)
+    )
     solid = ~targets.each(lambda board: board.is_flat)
     for row in np.flatnonzero(solid).tolist():
         camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
@@ -399,7 +440,6 @@ def build_scenes(
         plane=plane,
         corners_px=corners_px,
         outline_px=outline_px,
-        outline_m=outline_m,
         levels=levels,
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),

@@ -444,9 +444,7 @@ def edge_table(targets: tuple[Board, ...]) -> tuple[MarkerEdges, NDArray[np.int6
 def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> MarkerEdges:
     """Return the edges of a target under a sheet that hides everything beyond a straight line.
 
-    Parts of edges under the sheet are projected onto its edge at a right angle: they then enclose
-    the visible part of their area, since the projection moves nothing else. The sheet ends where
-    the target does.
+    The sheet ends where the target does.
     """
     extent = extent_of(target)
     angle = math.radians(occlusion_deg)
@@ -456,40 +454,9 @@ def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> Mar
     middle = (extent.ink[:2] + extent.ink[2:]) / 2
     width = float(hideable @ np.abs(towards))
     limit = float(towards @ middle) + width * (0.5 - occlusion)
-
-    def split(edge: Sequence[float], hidden: bool) -> list[list[float]]:
-        """Return the parts of an edge beside the sheet, and those under it projected (or not)."""
-        a, b = np.array(edge[:2], dtype=np.float64), np.array(edge[2:], dtype=np.float64)
-        deep = float(towards @ a - limit), float(towards @ b - limit)
-        cuts = [a, b]
-        if min(deep) < 0 < max(deep):
-            cuts = [a, a + deep[0] / (deep[0] - deep[1]) * (b - a), b]
-        parts = []
-        for start, stop in itertools.pairwise(cuts):
-            inside = float(towards @ (start + stop) / 2 - limit) * (-1 if hidden else 1)
-            ends = [
-                point - max(sign * float(towards @ point - limit), 0.0) * sign * towards
-                if inside > 0 else point
-                for point in (start, stop) for sign in (-1.0 if hidden else 1.0,)
-            ]
-            parts.append([*ends[0], *ends[1]])
-        return parts
-
-    ends: list[list[float]] = []
-    sides: list[tuple[int, int]] = []
-    plain = edges_of(target)
-    for edge, codes in zip(plain.ends.tolist(), plain.sides.tolist(), strict=True):
-        parts = split(edge, hidden=False)
-        ends += parts
-        sides += [tuple(codes)] * len(parts)
-    left, top, right, bottom = extent.sheet.tolist()
-    # Down, right, up, left: the sheet is at greater x of the edge that goes down.
-    around = ((left, top), (left, bottom), (right, bottom), (right, top), (left, top))
-    for start, stop in itertools.pairwise(around):
-        parts = split([*start, *stop], hidden=True)
-        ends += parts
-        sides += [(OUTSIDE, OCCLUDER)] * len(parts)
-    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+    beside = np.array([*-towards, limit])
+    sheet = rectangle_edges(extent.sheet[None], OUTSIDE, OCCLUDER)
+    return joined([within(edges_of(target), beside)[0], within(sheet, -beside)[0]])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -498,9 +465,8 @@ def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> Mar
 # Each marker has a convex sheet of its own, or all of them one; what stands beside them has its
 # own. The image is the sum of the visible parts of all sheets that face the camera. What a sheet
 # in front hides of another is subtracted: of the part of an area inside a half plane the edges
-# are those inside, and those outside projected onto its line, which enclose the same area (as
-# those under an occluding sheet above). Of several sheets in front, by
-# inclusion and exclusion.
+# are those inside, and those outside projected onto its line, which enclose the same area. Of
+# several sheets in front, by inclusion and exclusion.
 
 _NEGLIGIBLE = 1e-12
 """Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
@@ -669,7 +635,8 @@ def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[Visible
                 part, mover = outline, own
                 for front in some:
                     for line in front.normals @ face.plane:
-                        part, mover = _within(part, line, mover, front.number)
+                        part, number = within(part, line)
+                        mover = np.where(number < 0, front.number, mover[number])
                 parts.append(
                     MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
                 )
@@ -694,17 +661,16 @@ def moving_edges(seen: VisiblePrint, planes: Floats) -> list[tuple[MarkerEdges, 
     return groups
 
 
-def _within(
-    outline: MarkerEdges, line: Floats, mover: Integers, front: int
-) -> tuple[MarkerEdges, Integers]:
+def within(outline: MarkerEdges, line: Floats) -> tuple[MarkerEdges, Integers]:
     """Return the edges of the part of all areas where line · (column, row, 1) is not negative.
 
-    And with which sheet each moves: those on the line with ``front``, others as ``mover`` says.
+    And the number (E,) of the edge that each of them is a part of, -1 if it lies on the line: parts
+    beyond it are projected onto it, where they enclose the same area.
     """
-    length = float(line[:2] @ line[:2])
+    length, number = float(line[:2] @ line[:2]), np.arange(len(outline.ends))
     if length == 0.0:
         kept = slice(None) if line[2] >= 0 else slice(0)
-        return MarkerEdges(outline.ends[kept], outline.sides[kept]), mover[kept]
+        return MarkerEdges(outline.ends[kept], outline.sides[kept]), number[kept]
     start, stop = outline.ends[:, :2], outline.ends[:, 2:]
     a, b = start @ line[:2] + line[2], stop @ line[:2] + line[2]
     crossing = (a < 0) != (b < 0)
@@ -718,11 +684,11 @@ def _within(
         crossing[:, None], cut, projected(stop, b)
     )])
     second = np.hstack([cut, projected(stop, b)])[crossing]
-    moved = np.where(a < 0, front, mover), np.where(b < 0, front, mover)[crossing]
+    number = np.concatenate([np.where(a < 0, -1, number), np.where(b < 0, -1, number)[crossing]])
     return MarkerEdges(
         np.concatenate([first, second]),
         np.concatenate([outline.sides, outline.sides[crossing]]),
-    ), np.concatenate(moved)
+    ), number
 
 
 def unseen_markers(board: Board, planes: Floats) -> Masks:

@@ -130,26 +130,6 @@ def id_faults(key: str, ids: list[int], dictionary: str, written: Any = None) ->
     return faults
 
 
-class _Kind:
-    """What all kinds of boards can do: a subclass says how many it has, its faults and layout."""
-
-    __slots__ = ()
-
-    def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
-        raise NotImplementedError
-
-    def _layout(self) -> Board:
-        raise NotImplementedError
-
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        lines = [f"{key} = {value}: expected {expected}" for key, value, expected in self.faults()]
-        if lines:
-            raise ValueError("\n".join(lines))
-        return self._layout()
-
-
 # --------------------------------------------------------------------------------------------------
 # A target that a table of markers declares: each has a size and a pose of its own.
 
@@ -198,7 +178,7 @@ def _read_markers(value: Any) -> tuple[BoardMarker, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Markers(_Kind):
+class Markers:
     """A table of markers, each on a sheet of its own or, in one plane, all on one."""
 
     dictionary: str = dictionary_of_all()
@@ -273,7 +253,8 @@ class Markers(_Kind):
             return None
         return 1.0 if self.quiet_zone_modules is None else self.quiet_zone_modules
 
-    def _layout(self) -> Board:
+    def board(self) -> Board:
+        """Return the board; it must have no faults."""
         prints, corners = self._placed()
         if self.margin_m is not None:
             printed = self._printed(corners)[..., :2].reshape(-1, 2) * [1.0, -1.0]
@@ -385,7 +366,7 @@ def _read_ids(value: Any) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _OnSheet(_Kind):
+class _OnSheet:
     """A board of markers of one size and roll on one white sheet."""
 
     dictionary: str = dictionary_of_all()
@@ -450,6 +431,29 @@ class _OnSheet(_Kind):
         )
 
 
+    def _in_rows(
+        self, shape: tuple[int, int], marker_m: float, gap_m: float, *, squares: bool,
+        kalibr: bool = False,
+    ) -> Board:
+        """Return rows and columns of markers, with black ``squares`` between them if wanted.
+
+        In reading order; ``kalibr``: from the bottom left upwards, each turned by 180 degrees.
+        """
+        step = marker_m + gap_m
+        row, column = np.indices(shape).reshape(2, -1)
+        middle = (np.array(shape[::-1]) * step - gap_m) / 2
+        centres = np.stack([column, row], axis=1) * step + marker_m / 2 - middle
+        others, half = [], middle
+        if squares:
+            row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
+            low = np.stack([column, row], axis=1) * step - gap_m - middle
+            others = [rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
+            half = middle + gap_m
+        if kalibr:
+            return self._on_sheet(centres, marker_m, others, half, 180.0)
+        return self._on_sheet(centres * [1.0, -1.0], marker_m, others, half)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Charuco(_OnSheet):
     """A chessboard with markers in its white squares."""
@@ -482,7 +486,8 @@ class Charuco(_OnSheet):
             faults.append(Fault("marker_m", self.marker_m, expected))
         return faults + self._id_faults("squares_x")
 
-    def _layout(self) -> Board:
+    def board(self) -> Board:
+        """Return the board; it must have no faults."""
         codes = self._codes()
         rows, columns = np.nonzero(codes == WHITE)
         middle = np.array([self.squares_x, self.squares_y]) / 2 * self.square_m
@@ -536,10 +541,10 @@ class Grid(_OnSheet):
             ))
         return faults + self._id_faults("rows")
 
-    def _layout(self) -> Board:
-        return _grid_board(
-            self, (self.rows, self.columns), self.marker_m, self.gap_m, self.corner_squares
-        )
+    def board(self) -> Board:
+        """Return the board; it must have no faults."""
+        shape = self.rows, self.columns
+        return self._in_rows(shape, self.marker_m, self.gap_m, squares=self.corner_squares)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -572,33 +577,10 @@ class AprilGrid(_OnSheet):
             )]
         return self._id_faults("tagRows", "from the bottom left")
 
-    def _layout(self) -> Board:
-        gap_m = self.tagSize * self.tagSpacing
-        return _grid_board(self, (self.tagRows, self.tagCols), self.tagSize, gap_m, True)
-
-
-def _grid_board(
-    kind: Grid | AprilGrid, shape: tuple[int, int], marker_m: float, gap_m: float, squares: bool
-) -> Board:
-    """Return rows and columns of markers, with black ``squares`` between them if wanted.
-
-    In reading order; of an AprilGrid from the bottom left upwards, each turned by 180 degrees.
-    """
-    kalibr = isinstance(kind, AprilGrid)
-    step = marker_m + gap_m
-    row, column = np.indices(shape).reshape(2, -1)
-    middle = (np.array(shape[::-1]) * step - gap_m) / 2
-    centres = np.stack([column, row], axis=1) * step + marker_m / 2 - middle
-    others, half = [], middle
-    if squares:
-        row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
-        low = np.stack([column, row], axis=1) * step - gap_m - middle
-        others = [rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
-        half = middle + gap_m
-    return kind._on_sheet(  # noqa: SLF001
-        centres if kalibr else centres * [1.0, -1.0], marker_m, others, half,
-        180.0 if kalibr else 0.0,
-    )
+    def board(self) -> Board:
+        """Return the board; it must have no faults."""
+        shape, gap_m = (self.tagRows, self.tagCols), self.tagSize * self.tagSpacing
+        return self._in_rows(shape, self.tagSize, gap_m, squares=True, kalibr=True)
 
 
 def _printed_side(dictionary: str, marker_m: float) -> tuple[float, str]:
@@ -646,21 +628,13 @@ _OWN = {
 _OWN["diamond"] = {name: each for name, each in _OWN["charuco"].items() if name not in DIAMOND}
 """Kind -> the keys of its file that [board] has, too."""
 
-
-def _own_keys(needed: bool) -> dict[str, tuple[str, ...]]:
-    """Return of each kind the keys that [board] needs, or those that it may have."""
-    return {
-        kind: tuple(name for name, each in keys.items()
-                    if (each.default is dataclasses.MISSING) == needed)
+NEEDED = {
+    SINGLE: (), **{
+        kind: tuple(name for name, each in keys.items() if each.default is dataclasses.MISSING)
         for kind, keys in _OWN.items()
-    }
-
-
-NEEDED = {SINGLE: (), **_own_keys(needed=True)}
+    },
+}
 """Kind -> the parameters that it must have."""
-
-OPTIONAL = _own_keys(needed=False)
-"""Kind -> the parameters that it may have."""
 
 
 @dataclass(frozen=True)
@@ -731,9 +705,7 @@ def arranged(values: Sequence[Any]) -> Kind:
 
 def used_by(kind: Any) -> tuple[str, ...]:
     """Return the parameters of [board] that a kind uses; () of what is no kind."""
-    if not isinstance(kind, str):
-        return ()
-    return (*NEEDED.get(kind, ()), *OPTIONAL.get(kind, ()), "distractors")
+    return (*_OWN.get(kind, ()), "distractors") if isinstance(kind, str) else ()
 
 
 def arrangement_faults(values: Sequence[Any]) -> list[Fault]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -13,7 +14,18 @@ from numpy.typing import NDArray
 
 from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
-from sweep.model.sensor import BLOCK_PX, METHODS, PATTERNS, REACH_PX, standard_normals
+from sweep.model.sensor import (
+    BLOCK_PX,
+    GREY_NOISE_DRAW,
+    METHODS,
+    PATTERNS,
+    REACH_PX,
+    apply_tone,
+    demosaiced,
+    expose,
+    normal_field,
+    standard_normals,
+)
 from sweep.plugins.loading import call, real_numbers
 from sweep.typing import Floats
 
@@ -37,6 +49,8 @@ class Patch:
         (4,) fx, fy, cx, cy in pixels.
     noise_key
         Key of the scene's random numbers.
+    coded
+        Parameter that is text or a list -> the values that the numbers in `values` stand for.
     """
 
     values: Mapping[str, float]
@@ -45,6 +59,11 @@ class Patch:
     frame: tuple[int, int]
     intrinsics: Floats
     noise_key: np.uint64
+    coded: Mapping[str, Sequence[Any]]
+
+    def meaning(self, name: str) -> Any:
+        """Return the text or list of a parameter."""
+        return self.coded[name][int(self.values[name])]
 
     def normals(self, stream: str, shape: tuple[int, ...]) -> Floats:
         """Return standard normal numbers (h, w), a function of scene, stream and pixel alone.
@@ -73,8 +92,9 @@ class Effect:
     step
         The step of the image chain on which it acts. "edges": on the marker's edges, before
         pixels (only the renderer ``exact`` has these effects); "light": on the levels of light
-        that falls on the pixels; "signal": on the pixels' signal, with its noise and gain, before
-        quantisation; "readout": on quantisation.
+        that falls on the pixels; "signal": on the pixels' signal, with its noise and gain;
+        "colour": on colour filters and their interpolation, which sharpening follows; "response":
+        on the levels that the camera makes of it, before quantisation; "readout": on quantisation.
     parameters
         Its parameters by name, as :func:`sweep.declaration.parameter` declares them. The
         first is its switch: the effect is active if that has another value than its default.
@@ -102,14 +122,14 @@ class Effect:
         How far around a pixel it mixes pixels, and the side of the blocks, counted from the frame's
         corner, of which it changes all pixels: windows are widened by them.
     apply
-        Of a pointwise effect: a function of levels (h, w) and their :class:`Patch` that returns
-        the levels after it. Applied at its ``step``, "light" or "signal", after the built-in
-        effects of that step, in the order of :data:`sweep.model.effects.EFFECTS`. None for the
-        built-in effects, which renderers and :mod:`sweep.model.renderers` apply.
+        Of an effect from "light" to "response": a function of levels (h, w), which it leaves as
+        they are, and their :class:`Patch` that returns the levels after it. Effects of a step are
+        applied in the order of :data:`sweep.model.effects.EFFECTS`, then those of plug-ins; those
+        that share a function are one.
     """
 
     label: str
-    step: Literal["edges", "light", "signal", "readout"]
+    step: Literal["edges", "light", "signal", "colour", "response", "readout"]
     parameters: Mapping[str, Any]
     needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     random: bool = False
@@ -152,7 +172,7 @@ class Effect:
         return strength != (0 if is_coded(self.off) else self.off)
 
     def applying(self, apply: Callable[[Floats, Patch], Floats]) -> Effect:
-        """Return it as a pointwise effect."""
+        """Return it with a function that applies it."""
         return dataclasses.replace(self, apply=apply)
 
 
@@ -164,14 +184,12 @@ def is_coded(default: Any) -> bool:
     return isinstance(default, (str, tuple))
 
 
-def apply_pointwise(
+def after_step(
     effects: Sequence[Effect], step: str, levels: Floats, patch: Patch
 ) -> Floats:
-    """Return levels (h, w) after the active ones of pointwise effects, those of a step."""
-    for effect in effects:
-        if effect.step == step and effect.is_active(patch.values[effect.switch]):
-            assert effect.apply is not None  # noqa: S101  (for the type checker)
-            levels = effect.apply(levels, patch)
+    """Return levels (h, w) after those of active effects that belong to a step."""
+    for apply in dict.fromkeys(each.apply for each in effects if each.step == step):
+        levels = levels if apply is None else apply(levels, patch)
     return levels
 
 
@@ -196,6 +214,70 @@ def _defocus_px(values: Mapping[str, float], focal_px: float, inverse_depth: Flo
     """
     aperture_px = focal_px * values["aperture_mm"] * 1e-3
     return np.asarray(aperture_px * (1 / values["focus_distance_m"] - inverse_depth) / 4)
+
+
+def _lit(levels: Floats, patch: Patch) -> Floats:
+    """Return levels under uneven light: a gradient, never below 0, and vignetting.
+
+    1 + slope · (pixel - middle of the frame), times a power of the cosine of the pixel's angle to
+    the optical axis (the natural cos⁴ law: Born and Wolf, "Principles of optics", section 4.8.1).
+    """
+    width, height = patch.frame
+    fx, fy, cx, cy = patch.intrinsics
+    slope = patch.values["illumination_gradient"] / width
+    turn = math.radians(patch.values["illumination_deg"])
+    x = patch.left + np.arange(levels.shape[1])
+    y = patch.top + np.arange(levels.shape[0])[:, None]
+    light = 1.0 + slope * math.sin(turn) * (y - (height - 1) / 2)
+    light = np.maximum(light + slope * math.cos(turn) * (x - (width - 1) / 2), 0.0)
+    if patch.values["vignetting"] > 0:
+        squared = 1.0 + ((x - cx) / fx) ** 2 + ((y - cy) / fy) ** 2
+        light *= squared ** (-0.5 * patch.values["vignetting"])
+    return np.asarray(levels * light)
+
+
+def _exposed(levels: Floats, patch: Patch) -> Floats:
+    """Return levels of electrons, with shot noise and read noise."""
+    electrons = levels.copy()
+    expose(
+        electrons, patch.left, patch.top, patch.noise_key, patch.values["full_well_e"],
+        patch.values["read_noise_e"],
+    )
+    return electrons
+
+
+def _noisy(levels: Floats, patch: Patch) -> Floats:
+    """Return levels with plain grey noise, which may be correlated."""
+    field = normal_field(
+        patch.noise_key, GREY_NOISE_DRAW, patch.left, patch.top, levels.shape,
+        patch.values["noise_correlation"],
+    )
+    return np.asarray(levels + patch.values["noise_grey"] * field)
+
+
+def _demosaiced(levels: Floats, patch: Patch) -> Floats:
+    """Return levels seen through colour filters."""
+    return demosaiced(
+        levels, patch.meaning("bayer"), patch.meaning("demosaic"), patch.values["bayer_red"],
+        patch.values["bayer_blue"],
+    )
+
+
+def _toned(levels: Floats, patch: Patch) -> Floats:
+    """Return the camera's response: toe, knee, then gamma."""
+    toned = levels.copy()
+    apply_tone(toned, *(patch.values[f"tone_{name}"] for name in ("gamma", "toe", "knee")))
+    return toned
+
+
+def _noisy_by_level(levels: Floats, patch: Patch) -> Floats:
+    """Return levels with noise whose standard deviation is interpolated over the level."""
+    table = patch.meaning("noise_table")
+    field = normal_field(
+        patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
+        patch.values["noise_correlation"],
+    )
+    return np.asarray(levels + np.interp(levels, table[::2], table[1::2]) * field)
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -237,7 +319,7 @@ EFFECTS: tuple[Effect, ...] = (
         "illumination_deg": drawn(
             0.0, "direction in which the light grows: 0 right, 90 down", -360, 360
         ),
-    }, widens="uneven light"),
+    }, widens="uneven light", apply=_lit),
     Effect("motion blur", "edges", {
         "exposure_s": drawn(
             0.0, "exposure time: the image is the mean over it; the true pose is that in its "
@@ -336,26 +418,26 @@ EFFECTS: tuple[Effect, ...] = (
             0.0, "power of the cosine of a pixel's angle to the optical axis by which its "
             "light falls off; 4 is the natural law", 0, 100,
         ),
-    }, widens="uneven light"),
+    }, widens="uneven light", apply=_lit),
     Effect("shot noise", "signal", {
         "full_well_e": drawn(
             None, "electrons that a pixel holds, at level 255 and gain 1; the shot noise is "
             "theirs", 1, 1e9,
         ),
         "read_noise_e": drawn(0.0, "standard deviation of the read noise", 0, 1e9),
-    }, needs={"read_noise_e": ("full_well_e",)}, random=True, widens="noise"),
+    }, needs={"read_noise_e": ("full_well_e",)}, random=True, widens="noise", apply=_exposed),
     Effect("gain", "signal", {
         "gain": drawn(
             1.0, "factor on the signal and its noise, before it is quantised", 0, 1e6,
             open_low=True,
         ),
-    }, in_bound=True),
+    }, in_bound=True, apply=lambda levels, patch: levels * patch.values["gain"]),
     Effect("grey noise", "signal", {
         "noise_grey": drawn(
             0.0, "standard deviation of plain Gaussian noise on the grey levels", 0, 1e6,
             unit="grey level",
         ),
-    }, random=True, in_bound=True, widens="noise"),
+    }, random=True, in_bound=True, widens="noise", apply=_noisy),
     Effect("correlated noise", "signal", {
         "noise_correlation": drawn(
             0.0, "correlation of the grey noise (noise_grey, noise_table) of neighbouring "
@@ -363,7 +445,7 @@ EFFECTS: tuple[Effect, ...] = (
             "standard deviation stays", 0, 0.99,
         ),
     }, needs={"noise_correlation": ("noise_grey", "noise_table")}, worsens=("noise",)),
-    Effect("demosaicing", "signal", {
+    Effect("demosaicing", "colour", {
         "bayer": parameter(
             "none", "colour filters of the frame's first two by two pixels; none: a grey "
             "camera", choices=("none", *PATTERNS),
@@ -374,33 +456,36 @@ EFFECTS: tuple[Effect, ...] = (
         ),
         "bayer_red": drawn(1.0, "gain of the red pixels relative to the green ones", 0, 100),
         "bayer_blue": drawn(1.0, "gain of the blue pixels relative to the green ones", 0, 100),
-    }, needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)), reach_px=REACH_PX),
-    Effect("gamma", "signal", {
+    },
+        needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
+        reach_px=REACH_PX, apply=_demosaiced,
+    ),
+    Effect("gamma", "response", {
         "tone_gamma": drawn(
             1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
             "below 1 dark areas are lifted", 0.1, 10,
         ),
-    }, worsens=("uneven light",)),
-    Effect("toe", "signal", {
+    }, worsens=("uneven light",), apply=_toned),
+    Effect("toe", "response", {
         "tone_toe": drawn(
             0.0, "compression of the lower half of the scale towards black: the response has "
             "the slope 1 - tone_toe at black", -1, 1,
         ),
-    }, worsens=("uneven light",)),
-    Effect("knee", "signal", {
+    }, worsens=("uneven light",), apply=_toned),
+    Effect("knee", "response", {
         "tone_knee": drawn(
             0.0, "compression of the upper half of the scale towards white: the response has "
             "the slope 1 - tone_knee at white", -1, 1,
         ),
-    }, worsens=("uneven light",)),
-    Effect("noise by level", "signal", {
+    }, worsens=("uneven light",), apply=_toned),
+    Effect("noise by level", "response", {
         "noise_table": parameter(
             (), "standard deviation of Gaussian noise over the level in the image: level, "
             "deviation, level, deviation, ..., ascending, interpolated, constant beyond",
             unit="grey level", lengths=(0, *range(2, 513, 2)),
             list_text="a list of an even number of finite numbers, at most 512",
         ),
-    }, random=True, widens="noise"),
+    }, random=True, widens="noise", apply=_noisy_by_level),
     Effect("bit depth", "readout", {
         "bit_depth": parameter(
             8, "bits to which the levels 0 to 255 are quantised, clipped; OpenCV gets them "
@@ -451,9 +536,6 @@ NEEDS: dict[str, tuple[str, ...]] = {
     name: others for effect in EFFECTS for name, others in effect.needs.items()
 }
 """Parameter -> parameters of which one must be given beside it."""
-
-POINTWISE = tuple(effect for effect in EFFECTS if effect.apply is not None)
-"""Effects that are applied by a function of their own."""
 
 
 # --------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,35 +15,18 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model import coverage, lens
 from sweep.model.board import Board, edge_table, edges_of, edges_on_sheet, extent_of, unit_m
-from sweep.model.effects import POINTWISE, MarkerView, Patch, apply_pointwise
+from sweep.model.effects import MarkerView, after_step
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
 from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import RENDERERS, SUPERSAMPLE, Box, Scenes
-from sweep.model.sensor import (
-    BLOCK_PX,
-    Light,
-    Readout,
-    add_noise,
-    apply_tone,
-    bloomed,
-    compressed,
-    demosaiced,
-    deviations,
-    digitise,
-    illuminate,
-    normal_field,
-)
+from sweep.model.sensor import BLOCK_PX, bloomed, compressed, digitise
 from sweep.typing import Floats, Grey, Masks
 
 # --------------------------------------------------------------------------------------------------
 # From the light on the pixels to the image: the sensor, then the camera's own processing.
-
-GREY_NOISE_DRAW = 2
-"""The draw of a pixel that plain grey noise is made from, correlated or not."""
-
 
 def sensed_window(scenes: Scenes, row: int, window: Box) -> Box:
     """Return the pixels that must be computed for those of ``window`` to be the frame's own.
@@ -81,30 +64,22 @@ def sensed(
     level; quantisation; JPEG. Sharpening is linear: it commutes with gain and, for even light, with
     all before it but the noise, which it leaves as it is.
 
-    ``computed`` is :func:`sensed_window` of ``window``. Both arrays are overwritten.
+    ``computed`` is :func:`sensed_window` of ``window``.
     """
-    effect = scenes.effects.of(row)
-    left, top = computed[:2]
-    _fall_off(levels, scenes, row, effect, left, top)
-    plugged = (*POINTWISE, *scenes.effects.plugins.effects)
-    patch = Patch(
-        effect, left, top, (int(scenes.frame[row, 0]), int(scenes.frame[row, 1])),
-        scenes.cameras.view[row], scenes.effects.noise_key[row],
-    )
+    effects = scenes.effects.active_in(row)
+    patch = scenes.patch(row, *computed[:2])
+    light = after_step(effects, "light", levels, patch)
     if overshoot is not None:
-        _fall_off(overshoot, scenes, row, effect, left, top)
         # An effect on the light changes the contrast: sharpening, which follows it, sees that.
-        sharp = apply_pointwise(plugged, "light", levels + overshoot, patch)
-        overshoot = sharp - apply_pointwise(plugged, "light", levels, patch)
-    levels = apply_pointwise(plugged, "light", levels, patch)
-    readout = Readout(
-        scenes.effects.noise_key[row], effect["full_well_e"], effect["read_noise_e"],
-        effect["gain"], effect["noise_grey"], int(effect["bit_depth"]),
-    )
-    levels = apply_pointwise(plugged, "signal", _signal(levels, patch, readout), patch)
+        overshoot = after_step(effects, "light", levels + overshoot, patch) - light
+    levels = after_step(effects, "signal", light, patch)
+    levels = after_step(effects, "colour", levels, patch)
+    if overshoot is not None:
+        levels = levels + patch.values["gain"] * overshoot
+    levels = after_step(effects, "response", levels, patch)
     image = np.empty(levels.shape, dtype=np.uint8)
-    digitise(_rendition(scenes, levels, overshoot, patch), readout.bits, image)
-    quality = int(effect["jpeg_quality"])
+    digitise(levels, int(patch.values["bit_depth"]), image)
+    quality = int(patch.values["jpeg_quality"])
     if quality:
         blocks = _aligned(scenes, row, window, BLOCK_PX)
         image, computed = compressed(_cut(image, computed, blocks), quality), blocks
@@ -119,60 +94,6 @@ def _cut(image: Grey, computed: Box, window: Box) -> Grey:
     return np.ascontiguousarray(
         image[window[1] - top : window[3] - top, window[0] - left : window[2] - left]
     )
-
-
-def _fall_off(
-    levels: Floats, scenes: Scenes, row: int, effect: Mapping[str, float], left: int, top: int
-) -> None:
-    """Multiply levels (h, w), whose first pixel is (left, top), by the light on each pixel."""
-    width, height = scenes.frame[row].tolist()
-    slope = effect["illumination_gradient"] / width
-    if slope != 0 or effect["vignetting"] > 0:
-        turn = math.radians(effect["illumination_deg"])
-        light = Light(
-            slope * math.cos(turn), slope * math.sin(turn), (width - 1) / 2, (height - 1) / 2,
-            effect["vignetting"],
-        )
-        illuminate(levels, left, top, light, scenes.cameras.view[row])
-
-
-def _signal(levels: Floats, patch: Patch, readout: Readout) -> Floats:
-    """Return the signal (h, w) with its noise and gain, from levels of light."""
-    correlation = patch.values["noise_correlation"]
-    if correlation == 0 or readout.noise_grey == 0:
-        add_noise(levels, patch.left, patch.top, readout)
-        return levels
-    add_noise(levels, patch.left, patch.top, readout._replace(noise_grey=0.0))
-    field = normal_field(
-        readout.key, GREY_NOISE_DRAW, patch.left, patch.top, levels.shape, correlation
-    )
-    return np.asarray(levels + readout.noise_grey * field)
-
-
-def _rendition(
-    scenes: Scenes, levels: Floats, overshoot: Floats | None, patch: Patch
-) -> Floats:
-    """Return the levels (h, w) that the camera makes of the signal, not quantised."""
-    effect = patch.values
-    if effect["bayer"] > 0:
-        levels = demosaiced(
-            levels, scenes.effects.meaning("bayer", effect),
-            scenes.effects.meaning("demosaic", effect),
-            effect["bayer_red"], effect["bayer_blue"],
-        )
-    if overshoot is not None:
-        levels = levels + effect["gain"] * overshoot
-    tone = effect["tone_gamma"], effect["tone_toe"], effect["tone_knee"]
-    if tone != (1.0, 0.0, 0.0):
-        apply_tone(levels, *tone)
-    if effect["noise_table"] > 0:
-        spread = deviations(levels, scenes.effects.meaning("noise_table", effect))
-        field = normal_field(
-            patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
-            effect["noise_correlation"],
-        )
-        levels = levels + spread * field
-    return levels
 
 
 # --------------------------------------------------------------------------------------------------

@@ -23,7 +23,16 @@ from sweep.model.board import (
     single_marker,
 )
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
-from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, Effect, ScenePlugins
+from sweep.model.effects import (
+    CODED,
+    NEUTRAL,
+    NO_PLUGINS,
+    PLAIN,
+    VELOCITIES,
+    Effect,
+    Patch,
+    ScenePlugins,
+)
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
@@ -294,6 +303,14 @@ class Scenes:
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
         return Projection(self.plane[row], self.cameras.optics(row))
+
+    def patch(self, row: int, left: int, top: int) -> Patch:
+        """Return what effects on levels know of one scene; (left, top) is their first pixel."""
+        effects, (width, height) = self.effects, self.frame[row].tolist()
+        return Patch(
+            effects.of(row), left, top, (width, height), self.cameras.view[row],
+            effects.noise_key[row], effects.coded,
+        )
 
     def motion(self, row: int) -> Motion:
         """Return how the target of one scene moves while its image is taken."""

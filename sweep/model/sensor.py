@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,75 +16,11 @@ from sweep.model.coverage import ROUNDING_SNAP, mixed
 from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------
-# The sensor, pixel by pixel after the optics: light, noise, gain, quantisation.
+# The sensor, pixel by pixel after the optics: electrons and their noise, quantisation.
 
 _PIXEL_STEP = np.uint64(0x9E3779B97F4A7C15)
 _DRAW_STEP = np.uint64(0xD1342543DE82EF95)
 _ONE = np.uint64(1)
-
-
-class Light(NamedTuple):
-    """How the light varies over the frame.
-
-    Attributes
-    ----------
-    slope_x, slope_y
-        Change of the light per pixel, relative to that at the middle.
-    middle_x, middle_y
-        Middle of the frame in pixels.
-    vignetting
-        Power of the cosine of the angle to the optical axis.
-    """
-
-    slope_x: float
-    slope_y: float
-    middle_x: float
-    middle_y: float
-    vignetting: float
-
-
-class Readout(NamedTuple):
-    """The sensor's noise and quantisation.
-
-    Attributes
-    ----------
-    key
-        Key of the scene's noise: all of a pixel's noise is a function of it and of the pixel.
-    full_well_e, read_noise_e
-        Electrons at level 255 and gain 1, and standard deviation of the read noise in electrons;
-        NaN for no electrons.
-    gain, noise_grey, bits
-        As :class:`sweep.model.effects.Effects` has them.
-    """
-
-    key: np.uint64
-    full_well_e: float
-    read_noise_e: float
-    gain: float
-    noise_grey: float
-    bits: int
-
-
-@compiled
-def illuminate(
-    levels: Floats, left: int, top: int, light: Light, intrinsics: Floats
-) -> None:
-    """Multiply levels (h, w), whose top left pixel is (left, top), by the light on each pixel.
-
-    1 + slope · (pixel - middle of the frame), never below 0, times the ``vignetting``-th power of
-    the cosine of the pixel's angle to the optical axis (the natural cos⁴ law: Born and Wolf,
-    "Principles of optics", section 4.8.1). ``intrinsics`` (4,) is fx, fy, cx, cy.
-    """
-    slope_x, slope_y, middle_x, middle_y, vignetting = light
-    for i in range(levels.shape[0]):
-        y = (top + i - intrinsics[3]) / intrinsics[1]
-        along_y = 1.0 + slope_y * (top + i - middle_y)
-        for j in range(levels.shape[1]):
-            factor = max(along_y + slope_x * (left + j - middle_x), 0.0)
-            if vignetting > 0.0:
-                x = (left + j - intrinsics[2]) / intrinsics[0]
-                factor *= (1.0 + x * x + y * y) ** (-0.5 * vignetting)
-            levels[i, j] *= factor
 
 
 @compiled
@@ -144,32 +80,24 @@ def _pixel_key(key: np.uint64, column: int, row: int) -> Any:
     return mixed(key + _PIXEL_STEP * (position + _ONE))
 
 
-@compiled_inline
-def _signal(level: float, pixel: np.uint64, readout: Readout) -> float:
-    """Return a pixel's signal in grey levels: electrons and their noise, gain, plain noise.
-
-    In this order: electrons with shot noise, at most ``full_well_e``, and read noise; gain; plain
-    Gaussian noise in grey levels (EMVA standard 1288, section 2).
-    """
-    if not math.isnan(readout.full_well_e):
-        electrons = _poisson(level * readout.full_well_e / 255.0, pixel, 4)
-        electrons = min(electrons, readout.full_well_e)
-        if readout.read_noise_e > 0.0:
-            electrons += readout.read_noise_e * _normal(pixel, 0)
-        level = electrons * 255.0 / readout.full_well_e
-    level *= readout.gain
-    if readout.noise_grey > 0.0:
-        level += readout.noise_grey * _normal(pixel, 2)
-    return level
-
-
 @compiled
-def add_noise(levels: Floats, left: int, top: int, readout: Readout) -> None:
-    """Replace levels (h, w) by the signal with noise and gain, in grey levels, not quantised."""
+def expose(
+    levels: Floats, left: int, top: int, key: np.uint64, full_well_e: float, read_noise_e: float
+) -> None:
+    """Replace levels (h, w) of light by those of electrons with their noise.
+
+    With shot noise, at most ``full_well_e``, which are at level 255, and with read noise of that
+    many electrons (EMVA standard 1288, section 2). A pixel's noise is a function of ``key`` and of
+    its place in the frame, the first of which is (left, top).
+    """
     for i in range(levels.shape[0]):
         for j in range(levels.shape[1]):
-            pixel = _pixel_key(readout.key, left + j, top + i)
-            levels[i, j] = _signal(levels[i, j], pixel, readout)
+            pixel = _pixel_key(key, left + j, top + i)
+            electrons = _poisson(levels[i, j] * full_well_e / 255.0, pixel, 4)
+            electrons = min(electrons, full_well_e)
+            if read_noise_e > 0.0:
+                electrons += read_noise_e * _normal(pixel, 0)
+            levels[i, j] = electrons * 255.0 / full_well_e
 
 
 @compiled
@@ -185,6 +113,10 @@ def digitise(levels: Floats, bits: int, image: NDArray[np.uint8]) -> None:
             image[i, j] = np.uint8(counts)
 
 
+GREY_NOISE_DRAW = 2
+"""The draw of a pixel that plain grey noise is made from, correlated or not."""
+
+
 @compiled
 def standard_normals(key: np.uint64, draw: int, left: int, top: int, normals: Floats) -> None:
     """Fill ``normals`` (h, w) with standard normal numbers, a function of key and pixel alone.
@@ -197,7 +129,7 @@ def standard_normals(key: np.uint64, draw: int, left: int, top: int, normals: Fl
 
 
 # --------------------------------------------------------------------------------------------------
-# Noise that is correlated from pixel to pixel, and noise that is a table over the level.
+# Noise that is correlated from pixel to pixel.
 
 REACH = 5.0
 """Standard deviations at which the kernel's Gaussian is cut off."""
@@ -274,15 +206,6 @@ def normal_field(
     field = np.empty(shape)
     filter_field(white, kernel, field)
     return field
-
-
-def deviations(levels: Floats, table: Sequence[float]) -> Floats:
-    """Return the noise's standard deviation at levels (h, w).
-
-    ``table`` is level, standard deviation, level, standard deviation, ..., ascending in level: it
-    is interpolated linearly and goes on, constant, beyond its ends.
-    """
-    return np.interp(levels, table[::2], table[1::2])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,7 +13,15 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import coverage, lens
-from sweep.model.board import Board, edge_table, edges_of, edges_on_sheet, extent_of, unit_m
+from sweep.model.board import (
+    Board,
+    edge_table,
+    edges_of,
+    edges_on_sheet,
+    extent_of,
+    rectangles,
+    unit_m,
+)
 from sweep.model.effects import MarkerView, after_step
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
@@ -148,51 +155,44 @@ def render_all(
 def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]) -> Grey:
     """Return the image of a scene with any renderer and any background."""
     asked = window[0], window[1], window[2], window[3]
-    left, top, right, bottom = computed = (
-        sensed_window(scenes, row, asked) if scenes.effects.active[row] else asked
-    )
-    x0, y0, x1, y1 = box
-    inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
-    background = scenes.background[row]
+    background, active = scenes.background[row], bool(scenes.effects.active[row])
     if scenes.renderer[row] == PHOTOGRAPH:
         photograph = photograph_image(str(background))
         if window == [0, 0, photograph.shape[1], photograph.shape[0]]:
             return photograph  # the same array for all its markers: it is searched once
-        return photograph[top:bottom, left:right].copy()
+        return photograph[window[1] : window[3], window[0] : window[2]].copy()
+    left, top, right, bottom = computed = sensed_window(scenes, row, asked) if active else asked
+    x0, y0, x1, y1 = marker_box = (box[0], box[1], box[2], box[3])
+    inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
     if isinstance(background, str):
-        image = background_image(background)[top:bottom, left:right].copy()
+        behind = image = background_image(background)[top:bottom, left:right].copy()
     else:
         image = np.full((bottom - top, right - left), quantise(np.array(background)))
-    if scenes.effects.active[row]:
-        behind = image if isinstance(background, str) else float(background)
-        levels = np.empty(image.shape)
-        levels[:] = behind
-        overshoot = None
-        effect = scenes.effects.of(row)
+        behind = np.broadcast_to(float(background), image.shape)
+    if not active:
         if x1 > x0:
-            marker_box = (x0, y0, x1, y1)
-            plain = _exposed(scenes, row, marker_box, levels[inner])
-            if effect["sharpening"] != 0:
-                wide = _exposed(scenes, row, marker_box, levels[inner], blurred=True)
-                overshoot = np.zeros(image.shape)
-                overshoot[inner] = effect["sharpening"] * (plain - wide)
-            levels[inner] = plain
-        if effect["bloom"] != 0:
-            _, black, white = scenes.levels[row].tolist()
-            levels = bloomed(levels, black, white, effect["bloom"])
-        return sensed(scenes, row, levels, overshoot, computed, asked)
+            image[inner] = (
+                _warp_grey(scenes, row, marker_box)
+                if scenes.renderer[row] == "warp" and not isinstance(background, str)
+                else quantise(_exposed(scenes, row, marker_box, behind[inner]))
+            )
+        return image
+    levels, overshoot, effect = behind.astype(np.float64), None, scenes.effects.of(row)
     if x1 > x0:
-        if scenes.renderer[row] == "warp" and not isinstance(background, str):
-            _warp_grey(scenes, row, (x0, y0, x1, y1), image[inner])
-        else:
-            mean, share = marker_levels(scenes, row, (x0, y0, x1, y1))
-            behind = image[inner] if isinstance(background, str) else background
-            image[inner] = quantise(mean + (1.0 - share) * behind)
-    return image
+        plain = _exposed(scenes, row, marker_box, levels[inner])
+        if effect["sharpening"] != 0:
+            wide = _exposed(scenes, row, marker_box, levels[inner], blurred=True)
+            overshoot = np.zeros(image.shape)
+            overshoot[inner] = effect["sharpening"] * (plain - wide)
+        levels[inner] = plain
+    if effect["bloom"] != 0:
+        _, black, white = scenes.levels[row].tolist()
+        levels = bloomed(levels, black, white, effect["bloom"])
+    return sensed(scenes, row, levels, overshoot, computed, asked)
 
 
 def _exposed(
-    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64], blurred: bool = False
+    scenes: Scenes, row: int, box: Box, behind: NDArray[Any], blurred: bool = False
 ) -> NDArray[np.float64]:
     """Return the levels (h, w) of ``box`` over those ``behind`` it, with the effects on edges.
 
@@ -214,7 +214,7 @@ def _draw(
     starts = stops - size[:, 0] * size[:, 1]
     images = np.empty(stops[-1], dtype=np.uint8)
     box = boxes[:, 2:] - boxes[:, :2]
-    scratch = _scratch(int(((box[:, 0] + 2) * box[:, 1]).max()))
+    scratch = np.zeros(int(((box[:, 0] + 2) * box[:, 1]).max()))
     table, spans = edge_table(scenes.targets.boards)
     cameras = scenes.cameras
     coverage.draw_greys(
@@ -232,17 +232,6 @@ def _draw(
     ]
 
 
-_local = threading.local()
-
-
-def _scratch(size: int) -> NDArray[np.float64]:
-    """Return this thread's accumulator: zeros, at least ``size``; its users leave it zero."""
-    scratch: NDArray[np.float64] | None = getattr(_local, "scratch", None)
-    if scratch is None or len(scratch) < size:
-        scratch = _local.scratch = np.zeros(max(size, 1 << 16))
-    return scratch
-
-
 def marker_levels(
     scenes: Scenes, row: int, box: Box, blurred: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -250,21 +239,26 @@ def marker_levels(
 
     Both (height, width); the part of a pixel that the marker does not cover counts as level 0.
     """
-    renderer = scenes.renderer[row]
-    height, width = box[3] - box[1], box[2] - box[0]
+    renderer, target = scenes.renderer[row], scenes.target(row)
+    black, white = scenes.levels[row, 1:].tolist()
     if renderer in scenes.effects.plugins.renderers:
         return scenes.effects.plugins.renderers[renderer](_marker_view(scenes, row, box))
-    mean, share = np.empty((height, width)), np.empty((height, width))
     if renderer == "exact":
-        areas = np.array([0.0, *scenes.levels[row, 1:], scenes.effects["occluder"][row]])
-        mean = marker_exposure(scenes, row, box, areas, blurred)
-        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]), blurred)
+        areas = np.array([0.0, black, white, scenes.effects["occluder"][row]])
+        ones = np.array([0.0, 1.0, 1.0, 1.0])
+        mean, share = (
+            marker_exposure(scenes, row, box, levels, blurred) for levels in (areas, ones)
+        )
     elif renderer == "warp":
-        _warp_levels(scenes, row, box, mean, share)
+        mean, share = (
+            _warped(scenes, row, box, _bitmap(target, *levels)).astype(np.float64)
+            for levels in ((black, white), (1.0, 1.0))
+        )
     else:
         match = SUPERSAMPLE.fullmatch(renderer)
         if match is None:
             raise ValueError(f"renderer = {renderer!r}: expected {RENDERERS}")
+        mean, share = np.empty((2, box[3] - box[1], box[2] - box[0]))
         supersample(
             mean, share, _sampled_marker(scenes, row), int(match[1]), match[2] is not None,
             box[0], box[1],
@@ -335,18 +329,13 @@ def bitmap_shape(board: Board) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=1024)
-def _bitmap(
-    board: Board, black: float, white: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return a print's bitmap (height, width) at 10 px a module, and its black square's corners.
+def _bitmap(board: Board, black: float, white: float) -> NDArray[np.float32]:
+    """Return a print's bitmap (height, width) at 10 px a module.
 
-    Pixels on edges have the mean of their area, beside the print 0. The corners (4, 2) are TL, TR,
-    BR, BL in pixels of the bitmap, whose pixels' edges lie at halves; of a board they are those of
-    what is black.
+    Pixels on edges have the mean of their area, beside the print 0.
     """
-    extent = extent_of(board)
     scale = float(WARP_PX_PER_MODULE)
-    left, top, _, _ = extent.sheet.tolist()
+    left, top, _, _ = extent_of(board).sheet.tolist()
     plane = np.array([
         [scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]
     ])
@@ -357,62 +346,42 @@ def _bitmap(
         Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
     )
     coverage.sum_levels(cover, 0.0, bitmap)
-    x0, y0, x1, y1 = ((extent.ink - np.tile(extent.sheet[:2], 2)) * scale - 0.5).tolist()
-    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float32)
-    return bitmap.astype(np.float32), corners
-
-
-def _bitmap_share(target: Board) -> NDArray[np.float32]:
-    """Return the share (height, width) of each pixel of a bitmap that is printed on a sheet."""
-    return _bitmap(target, 1.0, 1.0)[0]
+    return bitmap.astype(np.float32)
 
 
 @lru_cache(maxsize=1024)
-def _grey_bitmap(
-    key: Board, black: float, white: float, behind: float
-) -> tuple[Grey, NDArray[np.float32]]:
+def _grey_bitmap(board: Board, black: float, white: float, behind: float) -> Grey:
     """As :func:`_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
-    bitmap, corners = _bitmap(key, black, white)
-    levels = bitmap.astype(np.float64)
-    levels += (1.0 - _bitmap_share(key)) * behind
-    return quantise(levels), corners
+    share = _bitmap(board, 1.0, 1.0)
+    return quantise(_bitmap(board, black, white).astype(np.float64) + (1.0 - share) * behind)
 
 
-def _perspective(
-    scenes: Scenes, row: int, box: Box, corners: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """Step 7: the perspective transform (3, 3) of the bitmap to the corners projected in step 6."""
-    target = (scenes.corners_px[row] - box[:2]).astype(np.float32)
-    return np.asarray(cv2.getPerspectiveTransform(corners, target))
+def _warped(
+    scenes: Scenes, row: int, box: Box, bitmap: NDArray[Any], border: int = 0
+) -> NDArray[Any]:
+    """Take the paper's steps 7 and 8: OpenCV warps the bitmap to the corners projected in step 6.
+
+    A bitmap's pixels have their edges at halves; beyond it is the level ``border``.
+    """
+    extent = extent_of(scenes.target(row))
+    square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
+    transform = cv2.getPerspectiveTransform(
+        rectangles(square[None])[0].astype(np.float32),
+        (scenes.corners_px[row] - box[:2]).astype(np.float32),
+    )
+    return cv2.warpPerspective(
+        bitmap, transform, (box[2] - box[0], box[3] - box[1]), flags=cv2.INTER_LINEAR,
+        borderValue=(border,),
+    )
 
 
-def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
+def _warp_grey(scenes: Scenes, row: int, box: Box) -> Grey:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
-    key = scenes.target(row)
-    bitmap, corners = _grey_bitmap(
-        key, black, white, 0.0 if key.is_marker else background
-    )
-    transform = _perspective(scenes, row, box, corners)
-    size = (box[2] - box[0], box[3] - box[1])
-    level = int(background + (0.5 + coverage.ROUNDING_SNAP))
-    view[:] = cv2.warpPerspective(
-        bitmap, transform, size, flags=cv2.INTER_LINEAR, borderValue=(level,)
-    )
-
-
-def _warp_levels(
-    scenes: Scenes, row: int, box: Box, mean: NDArray[np.float64], share: NDArray[np.float64]
-) -> None:
-    """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of its own."""
-    key = scenes.target(row)
-    bitmap, corners = _bitmap(key, *scenes.levels[row, 1:].tolist())
-    transform = _perspective(scenes, row, box, corners)
-    size = (box[2] - box[0], box[3] - box[1])
-    mean[:] = cv2.warpPerspective(bitmap, transform, size, flags=cv2.INTER_LINEAR)
-    share[:] = cv2.warpPerspective(
-        _bitmap_share(key), transform, size, flags=cv2.INTER_LINEAR
-    )
+    target = scenes.target(row)
+    bitmap = _grey_bitmap(target, black, white, 0.0 if target.is_marker else background)
+    border = int(background + (0.5 + coverage.ROUNDING_SNAP))
+    return np.asarray(_warped(scenes, row, box, bitmap, border))
 
 
 # --------------------------------------------------------------------------------------------------

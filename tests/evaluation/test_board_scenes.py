@@ -15,6 +15,7 @@ from support.board_pictures import (
 )
 from support.lengths import first_of, lengths
 from support.small_scenes import image_of, scenes_of
+from sweep.model.board import extent_of, in_space
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
@@ -62,8 +63,9 @@ def drawn(count, seed):
 
 def shown(scenes):
     """Whether all of a board lies well before the camera and faces it."""
+    outline = in_space(extent_of(scenes.targets[0]).sheet[None], scenes.plane)
     return (
-        scenes.outline_m[0, :, 2].min() > 0.03
+        outline[..., 2].min() > 0.03
         and scenes.rotation[0, :, 2] @ scenes.translation[0] < 0
     )
 

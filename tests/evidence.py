@@ -89,7 +89,7 @@ def run(file: str, *arguments: str) -> int:
         shard, shards = (int(number) for number in others[place + 1].split("/"))
         del others[place : place + 2]
     recorder = Recorder(shard, shards)
-    status = pytest.main(["-m", "long", *others], plugins=[recorder])
+    status = pytest.main(["-m", "evidence", *others], plugins=[recorder])
     Path(file).write_text(json.dumps({
         **circumstances(), "shard": shard, "shards": shards,
         "seconds": {name: round(spent, 1) for name, spent in recorder.seconds.items()},

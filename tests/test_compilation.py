@@ -42,6 +42,7 @@ def package(tmp_path):
     return tmp_path / "package"
 
 
+@pytest.mark.system
 def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
     (tmp_path / "mine.py").write_text(
         "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
@@ -56,7 +57,7 @@ def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
     assert Path(folder) == tmp_path / "__pycache__"
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package, tmp_path):
     cached = str(tmp_path / "cached")
     first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
@@ -70,7 +71,7 @@ def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package
     assert float(second) == float(interpreted)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("home", [True, False])
 def test_read_only_package_is_compiled_once_for_the_user_or_else_in_each_process(
     home, package, tmp_path

@@ -5,7 +5,6 @@ import runpy
 import tomllib
 from pathlib import Path
 
-import pytest
 import yaml
 
 import sweep
@@ -66,29 +65,3 @@ def test_links_of_a_hosted_tree_are_absolute_and_lead_to_files_of_the_tree():
         kind, version, path = link.removeprefix(f"{tree}/").split("/", 2)
         assert (kind, version) in {("blob", "v1.2.3"), ("raw", "v1.2.3")}
         assert (TOP / path.partition("#")[0]).exists(), link
-
-
-def test_citation_is_of_this_version_and_of_the_paper():
-    citation = yaml.safe_load((TOP / "CITATION.cff").read_text())
-    assert {"cff-version", "message", "title", "authors"} <= set(citation)
-    assert citation["version"] == sweep.__version__
-    assert citation["license"] == PROJECT["license"]
-    assert citation["references"][0]["doi"] in README
-
-
-@pytest.mark.parametrize(
-    "path", sorted((TOP / ".github" / "ISSUE_TEMPLATE").iterdir()), ids=lambda path: path.stem)
-def test_issue_forms_have_what_a_code_host_needs(path):
-    form = yaml.safe_load(path.read_text())
-    assert {"name", "description", "body"} <= set(form)
-    fields = [each for each in form["body"] if each["type"] != "markdown"]
-    assert len({each["id"] for each in fields}) == len(fields)
-    assert all(each["attributes"]["label"] for each in fields)
-
-
-def test_dockerfile_runs_what_exists():
-    text = (TOP / ".ci" / "Dockerfile").read_text()
-    example = re.search(r"sweep run (\S+)", text)
-    assert example is not None
-    assert (TOP / example[1]).is_file()
-    assert re.search(r"FROM python:(3\.\d+)", text)[1] in PROJECT["requires-python"]

@@ -4,37 +4,22 @@ import ast
 import doctest
 import inspect
 import re
-import shutil
 import subprocess
 import sys
-import sysconfig
-import venv
 from pathlib import Path
 
 import pytest
 
 import sweep
 from support.board_photographs import POSES, write_set
-from support.here import calls_here
 from sweep import library
-from sweep.errors import ArgumentError, PipelineError, SweepError
+from sweep.errors import ArgumentError, SweepError
 from sweep.execution.progress import progress_report
 
-TOP = Path(__file__).parent.parent
-
 FEW = {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 3}}
-TEXT = "pose = { side_px = 40, jitter_px = 0.5 }\naxes.trial = 3\n"
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A finished store; running its pipeline again computes nothing and starts no cluster."""
-    store = tmp_path_factory.mktemp("finished") / "few.zarr"
-    with calls_here():
-        sweep.run(FEW, store=store)
-    return store
-
-
+@pytest.mark.system
 def test_importing_the_package_imports_nothing_heavy():
     heavy = {"numpy", "numba", "cv2", "dask", "distributed", "xarray", "zarr", "tomlkit", "rich"}
     ran = subprocess.run(
@@ -75,7 +60,6 @@ def test_every_public_function_says_what_it_takes_returns_and_raises(name):
     assert sorted(", ".join(named).split(", ")) == sorted({*taken, *options} - {"options"})
 
 
-@pytest.mark.usefixtures("no_child")
 def test_the_example_of_every_public_function_runs(tmp_path):
     """All in one folder: below half a minute."""
     write_set(tmp_path, POSES[:3])
@@ -89,19 +73,6 @@ def test_the_example_of_every_public_function_runs(tmp_path):
         assert runner.run(test).failed == 0, name
 
 
-@pytest.mark.long
-def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path):
-    path = tmp_path / "pipeline.toml"
-    path.write_text(TEXT)
-    expected = sweep.open(finished)
-    for given in (FEW, path, str(path), sweep.Pipeline.from_toml(path)):
-        with sweep.run(given, store=finished) as results:
-            assert results.identical(expected)
-    with pytest.raises(PipelineError, match="side_pxx"):
-        sweep.run({"pose": {"side_pxx": 40}}, store=finished)
-
-
-@pytest.mark.usefixtures("no_child")
 def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
     seen = []
 
@@ -143,70 +114,6 @@ def test_arguments_that_cannot_be_are_value_errors_that_name_them(options, messa
 def test_what_is_no_pipeline_is_an_argument_error():
     with pytest.raises(ArgumentError, match="pipeline = 3: expected a Pipeline, the path of"):
         sweep.run(3)
-
-
-RIGHT = """
-from pathlib import Path
-
-import sweep
-
-
-def report(progress: sweep.Progress) -> None:
-    print(progress.done, progress.total)
-
-
-results = sweep.run(
-    {"axes": {"trial": 3}}, store=Path("few.zarr"), workers=2, reuse=["old.zarr"], progress=report
-)
-reveal_type(results)
-reveal_type(sweep.open("few.zarr"))
-reveal_type(sweep.Pipeline.from_text("axes.trial = 3"))
-reveal_type(sweep.__version__)
-try:
-    sweep.run("pipeline.toml", overwrite=True, progress=True, time_limit_s=60)
-except sweep.ArgumentError as error:
-    reveal_type(error.argument)
-"""
-
-WRONG = """
-import sweep
-
-sweep.run("pipeline.toml", "few.zarr")
-sweep.run("pipeline.toml", worker=2)
-sweep.run("pipeline.toml", workers="2")
-sweep.run(3)
-"""
-
-
-@pytest.mark.long
-def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path):
-    pytest.importorskip("mypy")
-    # An environment of its own, in which the package lies as pip would install it.
-    venv.create(tmp_path / "environment", with_pip=False)
-    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    site = tmp_path / "environment" / "lib" / version / "site-packages"
-    shutil.copytree(
-        TOP / "sweep", site / "sweep", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    (site / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    for name, text in (("right.py", RIGHT), ("wrong.py", WRONG)):
-        (tmp_path / name).write_text(text)
-    ran = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--config-file", "", "--no-color-output",
-         "--python-executable", str(tmp_path / "environment" / "bin" / "python"),
-         "right.py", "wrong.py"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={"PATH": "", "MYPY_CACHE_DIR": str(TOP / ".mypy_cache" / "user")},
-    )
-    lines = ran.stdout.splitlines()
-    revealed = [line.partition("Revealed type is ")[2] for line in lines if "Revealed" in line]
-    assert revealed == [
-        '"xarray.core.dataset.Dataset"', '"xarray.core.dataset.Dataset"',
-        '"sweep.experiment.pipeline.Pipeline"', '"str"', '"str"',
-    ], ran.stdout + ran.stderr
-    errors = [line for line in lines if ": error:" in line]
-    assert all(line.startswith("wrong.py:") for line in errors), ran.stdout
-    assert [int(line.split(":")[1]) for line in errors] == [4, 5, 6, 7], ran.stdout
 
 
 def test_every_module_that_mypy_sees_in_the_library_is_imported_on_use():

@@ -16,21 +16,6 @@ TOP = Path(__file__).parent.parent
 README = (TOP / "README.md").read_text()
 
 
-def block_after(marker, language):
-    block = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```", README, re.DOTALL)
-    assert block, marker
-    return block[1]
-
-
-def test_front_page_is_short():
-    assert len(README.splitlines()) <= 150
-
-
-def test_both_commands_are_one_line_each():
-    for marker in ("run", "test"):
-        assert block_after(marker, "sh").strip().count("\n") == 0
-
-
 @pytest.mark.parametrize("path", sorted((TOP / "pipelines").glob("*.toml")), ids=lambda p: p.stem)
 def test_every_pipeline_is_sound(path):
     pipeline = Pipeline.from_toml(path)
@@ -64,7 +49,6 @@ def test_a_close_look_is_that_of_the_run():
     assert windowed.errors["rotation_error_deg"] > 0
 
 
-@pytest.mark.usefixtures("no_child")
 def test_plan_says_what_is_active_and_what_it_takes(capsys):
     smoke = str(TOP / "pipelines" / "smoke.toml")
     settings = ["--set", "distortion=[-0.3, 0.1, 0, 0]", "--set", "useAruco3Detection=true"]

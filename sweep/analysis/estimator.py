@@ -460,7 +460,7 @@ UNSEEN_FACTOR = 2.0
 On draws whose worst 1 % carries half of the squares, on Student's t with 4 degrees of freedom and
 on lognormal errors with a logarithm's deviation of 0.8, a root mean square at its limit is then
 met in less than 5 % of the samples of 50, 100 and 400; without, in up to 49 %
-(`pytest -m long tests/analysis/test_requirements_at_the_limit.py`).
+(`pytest -m evidence tests/analysis/test_requirements_at_the_limit.py`).
 """
 
 

@@ -221,7 +221,7 @@ def expanded_tail(units: int, level: float = LEVEL) -> float:
 # look had the error probability of a single one, the first that errs would end the search. So
 # each spends a part. Looks at the same growing sample err together, so that the part may be
 # larger than one over their number (Bonferroni): by `looks_factor`. For rates that it suffices is
-# enumerated exactly (`pytest -m long tests/sampling/test_limit_search.py`).
+# enumerated exactly (`pytest -m evidence tests/sampling/test_limit_search.py`).
 
 FIRST, EACH = 0.35, 0.65
 

@@ -583,7 +583,7 @@ def check_requirements(
     to twice the largest that one did (`sweep.analysis.estimator.with_unseen_tail`): 100 draws
     of normal errors decide a root mean square that is below 0.6 of its limit, 400 one below 0.75.
     By simulation at the limit a false "met" has a probability below 0.025 for rates and quantiles,
-    below 0.05 for means (`pytest -m long tests/analysis/test_requirements_at_the_limit.py`), of
+    below 0.05 for means (`pytest -m evidence tests/analysis/test_requirements_at_the_limit.py`), of
     normal errors, of tails as of Student's t with 4 degrees of freedom and of lognormal errors, and
     of drawn tilts. Where few poses make most of the squares, quantiles (median, p95) are decided
     with fewer draws.

@@ -141,7 +141,7 @@ def _plain(
 # frame (z out) is every upright marker tilted about one image axis; and it is not finite for a
 # few poses on the optical axis in any frame. SQPNP's tolerances are absolute lengths. On 14,832
 # noise-free poses the plain calls of ippe, ippe_square and sqpnp were wrong for 2,441, 2,431 and
-# 572 of them (`pytest -m long -k guard -s` counts again). OpenCV inverts a lens in about five
+# 572 of them (`pytest -m evidence -k guard -s` counts again). OpenCV inverts a lens in about five
 # steps, converged or not: of 990 poses to 40° off the axis 36 to 45 % came out wrong by more than
 # 0.01° (tests/measure/test_guards.py), so corners are undistorted before.
 

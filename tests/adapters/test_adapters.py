@@ -63,7 +63,7 @@ def test_an_adapter_conforms(detector):
     assert max(map(abs, report.numbers["offset_px"])) < 0.02
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_all_families_of_an_adapter_come_in_our_order(detector):
     for family in load("detector", detector, ".").families:
         if family in ("tagCircle49h12", "tagCustom48h12", "tagStandard52h13"):
@@ -71,14 +71,6 @@ def test_all_families_of_an_adapter_come_in_our_order(detector):
         with mock.patch("sweep.conformance.check.Child", Here):
             report = check_plugin(detector, family)
         assert report.conforms, (family, report.findings)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("family", ["tagCircle49h12", "tagCustom48h12", "tagStandard52h13"])
-def test_large_families_come_in_our_order(family):
-    pytest.importorskip("pyapriltags")
-    report = check_plugin("pyapriltags", family, time_limit_s=300)
-    assert report.conforms, report.findings
 
 
 def test_a_run_is_a_plain_loop_with_the_package(tmp_path):

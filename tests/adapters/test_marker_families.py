@@ -118,27 +118,6 @@ def test_stag_reads_the_markers_that_are_drawn(library):
         assert np.ravel(ids).tolist() == [marker_id]
 
 
-def test_codes_of_stag_are_as_far_apart_as_their_name_says():
-    pytest.importorskip("stag")
-    for name in ("STAG_HD17", "STAG_HD19", "STAG_HD21", "STAG_HD23"):
-        codes = stag._stag_codes(name)
-        distances = np.bitwise_count(codes[:, None] ^ codes[None])
-        assert distances[~np.eye(len(codes), dtype=bool)].min() >= int(name[-2:])
-
-
-def test_circles_of_stag_have_their_areas():
-    pytest.importorskip("stag")
-    circle, dots = stag.stag_circles("STAG_HD21", 3)
-    circles = ((circle, stag.CIRCLE_RADIUS), *[(dot, stag.DOT_RADIUS) for dot in dots])
-    for polygon, radius in circles:
-        x0, y0, x1, y1 = polygon.T
-        assert abs((x0 * y1 - x1 * y0).sum() / 2 / (np.pi * radius**2) - 1) < 1e-12
-        centre = polygon[:, :2].mean(axis=0)
-        middles = (polygon[:, :2] + polygon[:, 2:]) / 2
-        reach = np.linalg.norm(np.concatenate([polygon[:, :2], middles]) - centre, axis=1)
-        assert np.abs(reach - radius).max() < stag.STAG_MODULES / 20_000
-
-
 def test_stag_image_is_that_of_many_samples():
     pytest.importorskip("stag")
     dictionary, marker_id = "STAG_HD19", 7

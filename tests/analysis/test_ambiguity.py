@@ -9,7 +9,7 @@ from scipy import stats
 
 from sweep.analysis import ambiguity
 from sweep.analysis.ambiguities import THRESHOLDS, ThresholdChoice
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError
 from sweep.experiment.schema import XYZ
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -117,13 +117,6 @@ def test_every_rate_is_that_of_a_plain_loop_with_exact_intervals(mixed):
         table["solved"].isel(tilt_deg=1, solver=2))
 
 
-def test_configurations_are_never_pooled_and_bins_are_dimensions(mixed):
-    binned = ambiguity(mixed, bins={"tilt_deg": [-0.5, 0.5, 1.5]}, thresholds=[0.2])
-    assert binned["kept"].dims == ("solver", "tilt_deg", "threshold")
-    assert binned["chosen_threshold"].dims == ("solver", "tilt_deg")
-    assert int(binned["solved"].sum()) == int((mixed["estimate"] == EstimateStatus.solved).sum())
-
-
 def choice_of(table):
     return [ThresholdChoice(int(each)).name for each in np.ravel(table["choice"].values)]
 
@@ -160,15 +153,6 @@ def test_every_other_outcome_of_the_choice_is_named():
     assert choice_of(choose(everywhere.T, flips.T)) == ["nothing_drawn"]
 
 
-def test_no_threshold_rejects_poses_without_another_solution():
-    flips = np.tile([True, False, False, False, True], 400)[None]
-    table = ambiguity(poses_of(np.full(flips.shape, np.nan), flips, axes=("tilt_deg", "trial")),
-                      thresholds=[0.2])
-    assert choice_of(table) == ["none"]
-    assert np.isnan(table["chosen_threshold"]).all()
-    assert (table["kept"] == 2000).all()
-
-
 def test_thresholds_that_keep_hardly_any_pose_are_of_no_use():
     ratio = np.where(np.arange(20_000) < 800, 0.01, 0.9)[None]  # 4 %, of which none is flipped
     flipped = (np.arange(20_000) % 10 == 9)[None] & (ratio > 0.5)
@@ -193,18 +177,13 @@ def test_a_bad_argument_is_named(mixed, arguments, name):
     assert caught.value.argument == name
 
 
-def test_a_dataset_without_alternatives_is_refused(mixed):
-    with pytest.raises(DatasetError, match="alternative_reprojection_error_px"):
-        ambiguity(mixed.drop_vars("alternative_reprojection_error_px"))
-
-
 def simulated(rng, stores, draws, flips_at):
     """Return as many stores (along tilt_deg) of independent draws; flips_at: ratio -> chance."""
     ratio = rng.beta(0.6, 1.2, (stores, draws))
     return poses_of(ratio, rng.random(ratio.shape) < flips_at(ratio), axes=("tilt_deg", "trial"))
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("flips_at", [
     lambda ratio: 0.01 + 0 * ratio,                       # at the wanted rate at every threshold
     lambda ratio: np.where(ratio < 0.3, 0.0099, 0.012),   # just below it, then above
@@ -224,15 +203,3 @@ def test_a_chosen_threshold_exceeds_the_wanted_rate_in_less_than_two_and_a_half_
     print(f"\n{wrong} of {stores} choose a threshold above the wanted rate; {chosen} choose one")
     assert stats.binom.sf(87, 2000, 0.025) < 1e-6
     assert wrong <= 87  # which 2.5 % exceed less often than that
-
-
-@pytest.mark.long
-def test_none_is_said_of_a_rate_that_a_threshold_keeps_in_less_than_two_and_a_half_percent():
-    rng = np.random.default_rng(12)
-    said = 0
-    for _ in range(4):
-        results = simulated(rng, 500, 3000, lambda ratio: np.where(ratio < 0.5, 0.0099, 0.3))
-        table = ambiguity(results, ["tilt_deg"], thresholds=[0.5, 0.8])
-        said += int((table["choice"] == ThresholdChoice.none).sum())
-    print(f"\n{said} of 2000 say that none does")
-    assert said <= 87

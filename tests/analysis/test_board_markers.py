@@ -14,8 +14,6 @@ from sweep.analysis import (
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 
-pytestmark = pytest.mark.quick
-
 
 def _boards() -> xr.Dataset:
     """Return 2 sizes x 30 draws of boards of 3 markers, the first size with 2 of them."""

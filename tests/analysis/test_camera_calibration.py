@@ -87,15 +87,6 @@ def test_errors_of_positions_are_those_that_solve_pnp_makes_with_the_camera(resu
             one["position_error_m"].values[k], found.ravel() - position, rtol=1e-6, atol=2e-7)
 
 
-def test_fewer_views_are_the_first_of_a_set(results):
-    both, few = camera_calibrations(results, [4, 6]), camera_calibrations(results, [4])
-    assert few.sizes["set"] == 3
-    np.testing.assert_allclose(  # OpenCV's threads add up in any order
-        both["intrinsic_error"].isel(views=0, set=0), few["intrinsic_error"].isel(views=0, set=0),
-        rtol=1e-4,
-    )
-
-
 def test_half_a_pixel_moves_the_principal_point_and_nothing_else(results):
     right = camera_calibrations(results, [6])
     shifted = camera_calibrations(results, [6], offset_px=0.5)

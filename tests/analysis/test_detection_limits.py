@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from support.comparisons import with_detected
 from support.small_datasets import perfect
@@ -138,12 +137,3 @@ def test_a_limit_that_cannot_be_is_refused(results, per, error, problem):
     with pytest.raises(error, match=problem) as refused:
         detection_limit(results, per=per)
     assert "\n" not in str(refused.value)
-
-
-def test_the_interval_in_metres_is_that_in_pixels():
-    results = dataset({"distance_m": [0.5, 1.0, 2.0, 4.0]}, [1.0, 1.0, 0.9, 0.2])
-    answer = detection_limit(results, rate=0.9)
-    for end, other in (("low", "high"), ("high", "low")):
-        assert answer[f"distance_m_{end}"].item() == pytest.approx(
-            FX * SIZE_M / answer[f"side_px_{other}"].item())
-    assert isinstance(answer, xr.Dataset)

@@ -4,7 +4,6 @@ import doctest
 import importlib
 import inspect
 import pkgutil
-import typing
 from pathlib import Path
 
 import pytest
@@ -27,13 +26,6 @@ def test_a_public_function_has_the_sections_of_numpydoc(function):
     parameters = lines[lines.index("Parameters"):lines.index("Returns")]
     for name in inspect.signature(function).parameters:
         assert any(name in line.split(", ") for line in parameters), name
-
-
-@PUBLIC
-def test_a_public_function_is_typed(function):
-    hints = typing.get_type_hints(function)
-    assert hints["return"] is xr.Dataset
-    assert set(hints) == {*inspect.signature(function).parameters, "return"}
 
 
 @pytest.mark.parametrize("module", MODULES, ids=[module.__name__ for module in MODULES])

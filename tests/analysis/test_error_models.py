@@ -9,7 +9,6 @@ import pytest
 from scipy import optimize
 
 import sweep
-from support.here import calls_here
 from support.pose_errors import (
     FX,
     SIZE_M,
@@ -366,12 +365,11 @@ trial = {trials}
 def stored(folder, trials, seed=3):
     pipeline = Pipeline.from_text(STORE.format(trials=trials).replace("seed = 3", f"seed = {seed}"))
     url = str(folder / f"tags{seed}.zarr")
-    with calls_here():
-        by_hand(url, pipeline)
+    by_hand(url, pipeline)
     return sweep.open(url)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
     """Cells that hold cover 0.93 to 0.97 of the errors of another seed, with a binomial tolerance.
 
@@ -408,7 +406,7 @@ def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
     assert 0.94 < np.concatenate(pooled).mean() < 0.965
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_intervals_hold_the_law_as_often_as_they_say():
     """300 simulations: 0.95 of 300 x 4 corners within 0.90 to 0.98, normal and Laplace errors."""
     for normal in (None, lambda rng, size: rng.laplace(size=size) / math.sqrt(2)):

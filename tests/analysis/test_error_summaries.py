@@ -138,18 +138,6 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
         assert all(table[name].isnull().all() for name in ends)
 
 
-@pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
-def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
-    results = measured(np.random.default_rng(6), {"trial": n})
-    answer = error_statistics(results, [])
-    values = np.array([length(degrees(pose)) for pose in poses(results)])
-    for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
-        ends = stats.quantile_test(values, p=p).confidence_interval(0.95)
-        for end, value in (("low", ends.low), ("high", ends.high)):
-            assert answer[f"rotation_{name}_deg_{end}"].item() == pytest.approx(
-                value, rel=2e-7, nan_ok=True)
-
-
 def test_settings_that_are_pooled_see_the_same_draws_and_add_no_certainty(mixed):
     rng = np.random.default_rng(7)
     one = with_flags_of_every_kind(rng, measured(rng, SCENE))
@@ -256,13 +244,6 @@ def test_without_a_bound_there_is_no_efficiency(mixed):
         assert all(array.isnull().all() for array in answer.values())
 
 
-def test_no_error_at_all_is_infinitely_efficient():
-    answer = efficiency(measured(np.random.default_rng(13), SIZES, relative=0.0, rotation=np.zeros(
-        (2, 3, 5, 2, 2, 3))), [])
-    assert answer["range_efficiency"] == np.inf
-    assert answer["rotation_efficiency_low"] == np.inf
-
-
 # Covariances.
 
 def test_true_covariances_are_trusted_and_others_are_not():
@@ -330,12 +311,6 @@ def test_flips_cost_the_trust_and_too_few_draws_give_none():
     infinite = results.copy(deep=True)
     infinite["nees"].values[0, 0] = np.inf
     assert covariance_trust(infinite, [])["nees_mean"] == np.inf
-
-
-@pytest.mark.parametrize("levels", [(), (0.5, 1.0), (50,), (math.nan,)])
-def test_a_level_that_is_no_probability_is_refused(mixed, levels):
-    with pytest.raises(ValueError, match="expected numbers between 0 and 1"):
-        covariance_trust(mixed, [], levels=levels)
 
 
 # Renderers.

@@ -101,16 +101,6 @@ def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
 
 
 @METHODS
-def test_shapes_broadcast_and_arrays_come_back(interval):
-    low, high = interval(np.array([[0], [3]]), np.array([4, 10, 0])[:2])
-    assert low.shape == high.shape == (2, 2)
-    assert low.dtype == high.dtype == np.float64
-    assert low[1, 1] == interval(3, 10)[0]
-    assert interval(np.uint8(3), np.int32(10))[1] == interval(3.0, 10.0)[1]
-    assert [end.shape for end in interval([], 5)] == [(0,), (0,)]
-
-
-@METHODS
 @pytest.mark.parametrize(("successes", "n", "said"), [
     (-1, 5, "successes = -1, n = 5: expected whole numbers"),
     ([1, 6], 5, "successes = 6, n = 5: expected whole numbers with 0 <= successes <= n <= 1e+15"),
@@ -127,10 +117,3 @@ def test_impossible_counts_are_refused_in_one_line(interval, successes, n, said)
         interval(successes, n)
     assert str(refused.value).startswith(said)
     assert "\n" not in str(refused.value)
-
-
-@METHODS
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.1, 95, np.nan])
-def test_a_level_that_is_no_probability_is_refused(interval, level):
-    with pytest.raises(ValueError, match=r"level = .*: expected a number between 0 and 1"):
-        interval(1, 2, level)

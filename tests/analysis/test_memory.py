@@ -11,7 +11,7 @@ def stores(tmp_path_factory):
     return [write_store(folder, poses) for poses in (10**6, 10**7)]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", CALLS)
 def test_ten_million_poses_are_analysed_below_a_gigabyte(stores, name):
     small, large = (measured(store, CALLS[name]) for store, _ in stores)

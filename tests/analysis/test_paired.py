@@ -10,10 +10,7 @@ from scipy import stats
 
 from support.comparisons import holm, with_detected
 from support.small_datasets import (
-    FX,
-    GRIDS,
     QUANTITIES,
-    SIZE_M,
     assert_agrees,
     freedom_in,
     is_detected,
@@ -219,21 +216,6 @@ def test_settings_that_see_the_same_draws_make_no_id_weaker():
             pooled[name].astype(float), alone[name].astype(float), rtol=1e-9, err_msg=name)
 
 
-@pytest.mark.parametrize("detected", [False, True])
-def test_where_all_ids_are_alike_none_is_weak(detected):
-    results = perfect(np.random.default_rng(8), {"marker_id": 4, "trial": 10})
-    answer = marker_ranking(with_detected(results, detected)).compute()
-    assert not answer["weak"].any()
-    assert (answer["p_value"].fillna(1.0) == 1.0).all()
-    assert (answer["expected_rate"] == float(detected)).all()
-
-
-def test_a_ranking_without_ids_is_refused():
-    results = perfect(np.random.default_rng(9), {"trial": 10})
-    with pytest.raises(DatasetError, match="marker_id: no such dimension; there are trial"):
-        marker_ranking(results)
-
-
 # Comparison of two configurations.
 
 def newcombe(both, first, second, neither):
@@ -392,17 +374,6 @@ def test_comparisons_in_bins_are_those_of_plain_loops():
         assert_agrees(answer, at, expected_seen(pairs) | expected_solved(pairs))
 
 
-def test_counts_of_comparisons_with_pooled_settings_are_those_of_plain_loops():
-    results = GRIDS["all"]
-    first, second = results.isel(noise_grey=0), results.isel(noise_grey=1)
-    answer = compare(first, second, ("tilt_deg",)).compute()
-    unsure = ("detection_p_value", "detection_difference_low", "detection_difference_high")
-    for index, pairs in pairs_of(first, second, ("tilt_deg",)).items():
-        wanted = expected_seen(pairs) | expected_solved(pairs)
-        assert_agrees(answer, {"tilt_deg": index[0]},
-                      {name: value for name, value in wanted.items() if name not in unsure})
-
-
 def test_settings_that_see_the_same_draws_make_no_difference_surer():
     one, _ = COMPARED["solvers"]
     one = one.expand_dims(noise_grey=[1.0], axis=0)
@@ -428,15 +399,6 @@ def test_a_treatment_compared_with_itself_shows_no_difference():
             assert answer[f"{name}_rmse_ratio{end}"].item() == pytest.approx(1, rel=1e-12)
 
 
-def test_scenes_of_two_ids_are_no_configurations_of_the_same_scenes():
-    # Camera, marker and pose make the key of the draws: these are others, nothing is paired.
-    results = mixed({"marker_id": 2, "tilt_deg": 2, "trial": 10, "noise_grey": 2}, 12)
-    for name in ("marker_id", "tilt_deg"):
-        with pytest.raises(DatasetError, match=name):
-            compare(results.isel({name: 0}), results.isel({name: 1}))
-    compare(results.isel(noise_grey=0), results.isel(noise_grey=1))
-
-
 def test_other_scenes_and_other_draws_are_not_compared():
     sizes = {"marker_id": 2, "trial": 10}
     first = mixed(sizes, 12)
@@ -459,12 +421,6 @@ def test_other_scenes_and_other_draws_are_not_compared():
 
 # Limit of detection.
 
-def stepped(rates, sizes, trials=40):
-    """Return a dataset whose rate at each size (..., size) is exactly this (in 1 / trials)."""
-    results = perfect(np.random.default_rng(13), sizes | {"trial": trials})
-    hits = np.round(np.array(rates) * trials)[..., None] > np.arange(trials)
-    return with_detected(results, hits)
-
 
 def expected_limit(sides, rates, wanted):
     """Return limit flag, side and next smaller side of (side, rate) in any order."""
@@ -475,27 +431,6 @@ def expected_limit(sides, rates, wanted):
     if len(good) == len(ladder):
         return 3, good[-1][0], math.nan
     return 1, good[-1][0], ladder[len(good)][0]
-
-
-@pytest.mark.parametrize("axis", ["side_px", "distance_m"])
-@pytest.mark.parametrize("rates", [
-    [0.0, 0.5, 0.95, 1.0], [0.9, 0.9, 0.9, 0.9], [0.0, 0.1, 0.2, 0.3], [0.95, 0.5, 0.95, 1.0],
-    [0.0, 0.0, 0.0, 0.9], [1.0, 1.0, 1.0, 0.875],
-])
-def test_the_limit_is_the_smallest_side_from_which_on_all_are_found(axis, rates):
-    along = rates[::-1] if axis == "distance_m" else rates  # far is small
-    results = stepped([along], {"tilt_deg": 1, axis: 4})
-    answer = detection_limit(results, 0.9).compute()
-    sides = results[axis].values if axis == "side_px" else FX * SIZE_M / results[axis].values
-    flag, side, below = expected_limit(sides, along, 0.9)
-    here = answer.isel(tilt_deg=0)
-    assert here["limit"].item() == flag
-    np.testing.assert_allclose(here["side_px"], side, rtol=1e-12)
-    if flag != 2:
-        assert here["side_px_per_module"].item() == pytest.approx(side / 7, rel=1e-12)
-        assert not here["side_px_low"].item() > side
-        assert not here["side_px_high"].item() < side
-        np.testing.assert_allclose(here["side_px_below"], below, rtol=1e-12)
 
 
 @pytest.mark.parametrize("per", [(), ("tilt_deg",), ("noise_grey", "tilt_deg")])

@@ -14,12 +14,10 @@ from scipy import special, stats
 
 from support.small_datasets import (
     ALL,
-    FX,
     GRIDS,
     INNER,
     QUANTITIES,
     SHARES,
-    SIZE_M,
     assert_values,
     draws_in,
     freedom_in,
@@ -215,7 +213,7 @@ CASES = pytest.mark.parametrize(("grid", "per"), EVERY + OF_ESTIMATION)
 LAST = [case for case, following in zip(EVERY, [*EVERY[1:], ("", ())], strict=True)
         if case[0] != following[0]]
 SLOWER_CASES = pytest.mark.parametrize(("grid", "per"), [
-    pytest.param(*case, marks=() if case in LAST + OF_ESTIMATION else pytest.mark.long)
+    pytest.param(*case, marks=() if case in LAST + OF_ESTIMATION else pytest.mark.evidence)
     for case in EVERY + OF_ESTIMATION
 ])
 """The same, of which by default one of each grid is tried."""
@@ -299,16 +297,6 @@ def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
         np.testing.assert_array_equal(answer[f"{name}_high"], edges[1:])
 
 
-def test_a_coordinate_that_is_no_dimension_can_be_binned():
-    # distance_m where side_px is the axis, as the store has it.
-    results, bins = GRIDS["all"], {"distance_m": [0.0, 1.5, 3.0]}
-    results = results.assign_coords(distance_m=("side_px", FX * SIZE_M / results["side_px"].values))
-    groups = poses(results, "estimate", ("solver",), bins)
-    assert all(groups.values())
-    assert_all_agree(error_statistics(results, ("solver",), bins), groups,
-                     ("solver", "distance_m"), expected_errors)
-
-
 FUNCTIONS_OF_ONE = pytest.mark.parametrize(
     "function", [detection_rate, flip_rate, failure_composition, error_statistics])
 
@@ -321,12 +309,6 @@ def test_a_small_spread_about_a_large_bias_keeps_its_digits():
     results = perfect(rng, sizes, rotation=vectors, position=1e3 * vectors)
     assert_all_agree(
         error_statistics(results), poses(results, "estimate"), (), expected_errors)
-
-
-@FUNCTIONS
-def test_a_single_pose_is_a_dataset_too(function, of, expected):
-    results = GRIDS["plain"].isel(trial=0, marker_id=0, distance_m=0)
-    assert_all_agree(function(results), poses(results, of), (), expected)
 
 
 @FUNCTIONS_OF_ONE

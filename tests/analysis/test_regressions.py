@@ -70,7 +70,7 @@ def test_other_scenes_are_not_compared():
         regressions(old, perfect(np.random.default_rng(6), SIZES))
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_chance_alone_is_rarely_worse():
     # 400 pairs of stores that differ by chance, each with 3 conditions: 5 % at most, expected 2.5.
     worse = 0

@@ -89,7 +89,7 @@ def covered(results, name, value):
     # A coverage of 0.943 shows less in 400 simulations with a chance of 3e-7 (binomial), ...
     (400, 0.885),
     # ... and in 12,000 with one of 1e-9.
-    pytest.param(12_000, 0.93, marks=pytest.mark.long),
+    pytest.param(12_000, 0.93, marks=pytest.mark.evidence),
 ])
 def test_intervals_cover(sims, least):
     even = dataset(sims)

@@ -234,15 +234,6 @@ def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
     assert Reach(int(one["reach"])) is (Reach.always if met else Reach.never)
 
 
-def test_sides_go_from_large_to_small():
-    results = perfect(np.random.default_rng(1), {"side_px": 3, "trial": 100, "solver": 1})
-    results["detection"].values[0] = DetectionStatus.no_candidate
-    results["estimate"].values[0] = EstimateStatus.no_detection
-    one = farthest_met(results, ["detection >= 0.9"], "side_px").isel(solver=0)
-    assert [float(one[name]) for name in ("low", "value", "high")] == [20.0, 20.0, 20.0]
-    assert one["side_px"].values.tolist() == [12.0, 20.0, 35.0]
-
-
 def test_verdicts_are_of_the_worst_condition():
     table = check_requirements(with_detected([1.0, 0.97, 0.2]), ["detection >= 0.9"],
                                per=["distance_m"])
@@ -323,12 +314,6 @@ def test_a_requirement_that_cannot_be_is_refused(texts, problem):
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_all_faults_are_told_at_once():
-    with pytest.raises(ArgumentError) as error:
-        parse_requirements(["detection", "foo_deg >= 1", "range_p95_m <= 1"])
-    assert len(str(error.value).splitlines()) == 3
-
-
 @pytest.mark.parametrize(("change", "text", "problem"), [
     (lambda r: r.isel(trial=slice(1)), "detection >= 0.5", "a single draw of each pose"),
     (lambda r: r.isel(trial=0), "detection >= 0.5", "a single draw of each pose"),
@@ -349,8 +334,7 @@ def test_a_member_of_an_axis_of_several_names_the_axis():
         check_requirements(results, ["detection >= 0.5"], per=["size_m"])
 
 
-def test_configurations_are_never_pooled():
-    results = mixed({"side_px": 2, "trial": 60, "cornerRefinementMethod": 2, "solver": 2})
-    table = check_requirements(results, ["detection >= 0.5"])
-    assert table["decision"].dims == ("cornerRefinementMethod", "solver", "requirement")
-    assert table.attrs["configuration_dims"] == ["cornerRefinementMethod", "solver"]
+def test_all_faults_are_told_at_once():
+    with pytest.raises(ArgumentError) as error:
+        parse_requirements(["detection", "foo_deg >= 1", "range_p95_m <= 1"])
+    assert len(str(error.value).splitlines()) == 3

@@ -15,7 +15,6 @@ from sweep.analysis import error_statistics
 from sweep.analysis.poses import SIGNED, SignedErrors
 from sweep.errors import ArgumentError
 from sweep.measure.flags import EstimateStatus, Flipped
-from sweep.model.pose import rotation_of_yaw_pitch_roll
 
 UPRIGHT = Rotation.from_rotvec([math.pi, 0, 0])
 NAMES = [quantity.name for group in SIGNED.values() for quantity in group]
@@ -94,12 +93,6 @@ def test_in_plane_error_is_what_is_left_of_the_rotation_after_the_shortest_one(s
     product = Rotation.from_rotvec(swing) * Rotation.from_rotvec(turn)
     left = (product * truth.error.inv()).magnitude()
     assert left.max() < 1e-9
-
-
-def test_the_convention_is_that_of_the_poses_of_pipelines():
-    angles = np.radians(Truth(50, 0.1).angles)
-    ours = rotation_of_yaw_pitch_roll(*angles.T)
-    np.testing.assert_allclose(ours, Truth(50, 0.1).rotation.as_matrix(), atol=1e-12)
 
 
 @given(st.floats(1e-12, 1e-3), st.sampled_from(["yaw", "pitch", "roll"]), st.booleans())

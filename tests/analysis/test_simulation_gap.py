@@ -57,18 +57,6 @@ def test_values_are_numpys_and_gaps_their_differences_and_ratios():
     assert (gap.units == PHOTOGRAPHS).all()
 
 
-def test_one_setting_of_photographs_without_bins_is_compared():
-    rng = np.random.default_rng(4)
-    first, second = (each.isel(cornerRefinementMethod=0)
-                     for each in (results_of(rng), twins(rng, scale=0.7)))
-    gap = simulation_gap(first, second)
-    expected = [np.quantile(errors(each.expand_dims("cornerRefinementMethod"),
-                                   "rotation_median_deg", each.cornerRefinementMethod.item()),
-                            0.5, method="inverted_cdf") for each in (first, second)]
-    assert gap.rotation_median_deg.values == pytest.approx(expected)
-    assert gap.rotation_median_deg_gap.dims == ()
-
-
 def test_rates_are_those_of_the_photographs_alone_and_their_difference_newcombes():
     rng = np.random.default_rng(2)
     first, second = results_of(rng), twins(rng)
@@ -228,7 +216,7 @@ def test_tables_of_photographs_have_woodruffs_intervals():
             assert ends == pytest.approx(interval(error, counted, percent), rel=1e-7, nan_ok=True)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("photographs", [13, 22])
 @pytest.mark.parametrize(("share", "correlation"), [(0.5, 0.1), (0.5, 0.5), (0.9, 0.1), (0.9, 0.5)])
 def test_intervals_hold_what_is_true(photographs, share, correlation):

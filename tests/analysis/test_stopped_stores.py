@@ -8,14 +8,12 @@ from scipy import stats
 from sweep.analysis import (
     ambiguity,
     compare,
-    detection_limit,
     detection_rate,
     error_statistics,
     failure_composition,
     marker_ranking,
     precision_reached,
 )
-from sweep.analysis.dataset import computed_scenes
 from sweep.analysis.decisions import Reached
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -76,11 +74,6 @@ def stopped(full):
     }).assign_attrs(pipeline=PIPELINE)
 
 
-def test_scenes_that_were_not_needed_are_not_counted_as_computed(full, stopped):
-    assert int(computed_scenes(full).sum()) == 3 * TRIALS
-    assert computed_scenes(stopped).sum("trial").values.tolist() == STOPPED_AT.tolist()
-
-
 def test_conditions_have_all_their_trials_and_clopper_and_pearsons_interval(stopped, full):
     table = detection_rate(stopped, ["side_px"])
     assert table.looked_for.values.tolist() == STOPPED_AT.tolist()
@@ -117,12 +110,6 @@ def test_tables_say_which_rule_stopped_the_sampling(stopped, full):
     assert "sampling" not in detection_rate(full).attrs
 
 
-def test_poses_that_are_left_out_are_not_needed(stopped):
-    counts = failure_composition(stopped)["count"]
-    assert counts.sel(outcome="not_run") == 0
-    assert counts.sel(outcome="not_needed") == 2 * 3 * (TRIALS - 50)
-
-
 def test_cells_in_which_nothing_was_looked_for_do_not_lessen_the_trials(stopped):
     flags = stopped.detection.copy()
     flags[0, :50] = DetectionStatus.not_visible
@@ -139,11 +126,6 @@ def test_intervals_of_errors_are_wider_than_those_of_fixed_trials(stopped, full)
         freedom = 60  # about, which hardly matters
         expected = stats.t.isf((1 - level) / 2, freedom) / stats.t.isf(0.025, freedom)
         np.testing.assert_allclose(np.divide(*ends), expected, rtol=0.02)
-
-
-def test_a_detection_limit_takes_the_interval_of_stopped_rates(stopped):
-    assert detection_limit(stopped, 0.9).side_px == 30
-    assert detection_limit(stopped, 0.9).side_px_low == 30
 
 
 def test_markers_are_ranked_over_common_trials(stopped):

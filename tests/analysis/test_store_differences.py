@@ -7,12 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.example_results import example_results
-from sweep.analysis import per_marker, store_differences
+from sweep.analysis import store_differences
 from sweep.errors import DatasetError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-
-pytestmark = pytest.mark.quick
 
 TEXT = """
 [pose]
@@ -68,12 +66,6 @@ def test_flags_corners_and_poses_that_differ_are_those_of_plain_numpy(first):
     np.testing.assert_allclose(table["position_shift_m"][1, 0], np.median(lengths), rtol=1e-5)
 
 
-def test_a_store_has_no_differences_to_itself(first):
-    table = store_differences(first, first)
-    assert not any(table[name].any() for name in table if str(name).endswith("_differing"))
-    assert table.sizes["entry"] == 0
-
-
 def test_what_differs_in_the_fingerprints_is_listed(first, tmp_path):
     def made_with(**fingerprint):
         return first.assign_attrs(sweep=json.dumps({"fingerprint": fingerprint}))
@@ -112,10 +104,3 @@ def test_stores_that_are_no_pair_are_refused_in_one_line(first, change, named):
     with pytest.raises(DatasetError, match=named) as refused:
         store_differences(first, change(first))
     assert "\n" not in str(refused.value)
-
-
-def test_markers_of_boards_alone_are_refused(first):
-    twice = first["detection"].expand_dims(marker=2, axis=-1)
-    markers = per_marker(first.assign(marker_detection=twice))
-    with pytest.raises(DatasetError, match="per_marker"):
-        store_differences(markers, markers)

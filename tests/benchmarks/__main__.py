@@ -26,8 +26,7 @@ HISTORY = HERE / "history.jsonl"
 QUICK = {
     "analysis": (["1e4", "60"], ["CALLS = dict(list(CALLS.items())[:2])"]),
     "detectors": (["--scenes", "8", "--noise", "0", "--only", "none"], []),
-    "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS, COUNT = 1, 3, 3.0, 1, 24",
-                       "OTHERS = {}"]),
+    "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS = 1, 3, 3.0, 1"]),
     "fit": (["1", "3"], []),
     "kernel": ([], ["SIZES = BOARD_SIZES = SIZES[:1]", "POSES = {640: 20}", "REPEATS = 1",
                     "BOARD_POSES = {640: 2}", "DISTANCES = DISTANCES[:1]",
@@ -49,8 +48,6 @@ QUICK = {
         "CASES = {'paper_fig4': (['distance_m=[0.1, 0.3]', 'tilt_deg=[0]'], 'detection_rate')}",
         "CASES['paper_fig4'][0].append('search.precision={ detection_rate = 0.2 }')",
         "CASES['paper_fig4'][0].append('search.max_trials=40')"]),
-    "verify": ([], ["GRID = GRID.replace('0, 50', '0, 2').replace('200 }', '4 }')",
-                    "EXTENTS, ROUNDS = (1, 4, 50), 1"]),
     "extremes": ([str(TOP / "pipelines" / "extremes" / "tilt_zero.toml")], []),
 }
 """Arguments of the smallest size of each, and statements that make its constants small."""

@@ -1,24 +1,16 @@
-"""The engine against bare processes, against itself in pieces, and against what one would pick.
+"""The engine against bare processes, and against itself in pieces.
 
-    pip install joblib xyzpy
     python tests/benchmarks/bench_engine.py [SECONDS]
 
 Each part works for about SECONDS (default 60) on all cores; ratios within one run.
 """
 
-import importlib.util
 import itertools
-import json
-import math
 import multiprocessing
-import os
-import resource
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 from tables import header, row
@@ -54,8 +46,6 @@ MARKERS, DISTANCES = 10, 20
 START_S = 8.0
 """Seconds that independent processes have to start."""
 REPEATS = 3
-COUNT = 20_000
-"""Poses of the comparison with other tools."""
 
 
 def grid(trials):
@@ -169,111 +159,11 @@ def shared_work():
     row("20 sweeps / one sweep of 4 refinements x 5 solvers", f"{ratio:.1f}")
 
 
-# What a user would pick instead, on the same images and work: one call a pose.
-
-OTHERS = {
-    "joblib": """
-from joblib import Parallel, delayed
-rows = Parallel(n_jobs=workers)(delayed(one)(i) for i in range(count))
-""",
-    "dask.delayed, gathered": """
-import dask
-from distributed import Client, LocalCluster
-with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None,
-                  silence_logs=50) as cluster, Client(cluster) as client:
-    rows = dask.compute(*[dask.delayed(one)(i) for i in range(count)])
-""",
-    "xyzpy, its own storage": """
-import xyzpy
-runner = xyzpy.Runner(one_dict, var_names=["detection", "estimate", "rotation_error_deg"])
-harvester = xyzpy.Harvester(runner, data_name=folder + "/x.h5", engine="h5netcdf")
-harvester.harvest_combos({"i": list(range(count))}, parallel=True, num_workers=workers,
-                         verbosity=0)
-rows = [None] * count
-""",
-}
-
-COMMON = """
-import json, resource, sys, time
-import numpy as np
-from bench_engine import one, one_dict, setup
-workers, count, folder = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
-if __name__ == "__main__":
-    begun = time.perf_counter()
-{body}
-    assert len(rows) == count
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps([count / (time.perf_counter() - begun), peak]))
-"""
-
-_ONE: dict = {}
-
-
-def setup():
-    if not _ONE:
-        scenes = grid(1)[1]
-        pipeline = Pipeline.from_text(grid(max(COUNT // scenes, 1))[0])
-        _ONE["pipeline"] = pipeline
-        _ONE["shape"] = [len(axis) for axis in pipeline.axes]
-    return _ONE["pipeline"], _ONE["shape"]
-
-
-def one(i):
-    """One pose by number, as a user's function would compute it."""
-    pipeline, shape = setup()
-    indices = [np.array([k], dtype=np.intp) for k in np.unravel_index(i, shape)]
-    columns = run_cells(pipeline.experiment, indices).columns
-    return {name: parts[0][0] for name, parts in columns.items()}
-
-
-def one_dict(i):
-    values = one(i)
-    return values["detection"], values["estimate"], values["rotation_error_deg"]
-
-
-def what_one_would_pick():
-    workers, count = default_workers(), COUNT
-    pipeline, _ = setup()
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        begun = time.perf_counter()
-        execute(pipeline, f"{folder}/s.zarr", workers=workers)
-        rate = math.prod(len(axis) for axis in pipeline.axes) / (time.perf_counter() - begun)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        rows.append(("sweep", rate, peak))
-        for name, body in OTHERS.items():
-            package = name.split(",")[0].split(".")[0]
-            if importlib.util.find_spec(package) is None:
-                print(f"{name}: not installed", file=sys.stderr)
-                continue
-            script = Path(folder) / f"{package}_run.py"
-            indented = "\n".join(f"    {line}" for line in body.splitlines())
-            script.write_text(COMMON.format(body=indented))
-            path = os.pathsep.join(
-                filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
-            ran = subprocess.run(
-                [sys.executable, str(script), str(workers), str(count), folder],
-                capture_output=True, text=True, check=False,
-                env={"PYTHONPATH": path, "PATH": "/usr/bin:/bin",
-                     "OPENCV_FOR_THREADS_NUM": "1"},
-            )
-            if ran.returncode:
-                print(f"{name}: {ran.stderr.strip().splitlines()[-1]}", file=sys.stderr)
-                continue
-            other, memory = json.loads(ran.stdout.strip().splitlines()[-1])
-            rows.append((name, other, memory))
-    print()
-    header("tool", "poses/s, start included", "sweep / it", "client's peak memory")
-    for name, rate, memory in rows:
-        row(name, f"{rate:.0f}", f"{rows[0][1] / rate:.1f}", f"{memory:.0f} MB")
-
-
 def main():
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
     header("engine", "ratio")
     shared_work()
     engine_against_processes(seconds)
-    what_one_would_pick()
 
 
 if __name__ == "__main__":

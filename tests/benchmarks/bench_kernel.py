@@ -1,8 +1,8 @@
 """The kernel against a user's good loop, and against the bare calls that it makes.
 
-    python tests/benchmarks/bench_kernel.py [markers] [boards] [images]
+    python tests/benchmarks/bench_kernel.py [markers] [boards]
 
-Single markers, boards, and images of boards alone; all three if none is named. One core, medians of
+Single markers and boards; both if none is named. One core, medians of
 paired runs, seconds of the processor: ratios count.
 """
 
@@ -274,40 +274,7 @@ def boards_table():
                 *compared(block, bare, board_loop(block, *naive)))
 
 
-def images_table():
-    """One image of 35 markers against 35 images of a marker each, at the same poses."""
-    header("frame", "distance", "image / images of its markers one by one",
-           "34 markers outside the frame / one")
-    for (width, height), (near, far) in itertools.product(BOARD_SIZES, DISTANCES):
-        def made(board, width=width, height=height, near=near, far=far):
-            return Block(BOARD, width, height, BOARD_POSES[width], board=board, near=near, far=far)
-
-        def of_markers(places):
-            tables = (f"[[board.markers]]\nmarker_id = {k}\nx_m = {x}\ny_m = {y}\n"
-                      for k, x, y in places)
-            return made('kind = "markers"\n' + "".join(tables))
-
-        def drawn(block):
-            box = block.boxes
-            for _ in block.images(np.column_stack(
-                    [np.maximum(box[:, :2], 0), np.minimum(box[:, 2:], block.scenes.frame)]), 20):
-                pass
-
-        whole = made(BOARDS["grid of 7 x 5"])
-        corners = whole.values["board"].listed(1)[0].corners_m
-        parts = [of_markers([(k, *each.mean(axis=0)[:2])]) for k, each in enumerate(corners)]
-        two, many = (of_markers([(k, 100 * k, 0) for k in range(n)]) for n in (2, 35))
-        ratios, outside = [], []
-        for _ in range(REPEATS + 1):
-            whole_s, *part_s = (clock(drawn, block) for block in (whole, *parts))
-            ratios.append(whole_s / sum(part_s))
-            two_s, many_s = clock(two.run), clock(many.run)
-            outside.append(many_s / two_s)
-        row(f"{width} x {height}", f"{near}-{far} m", f"{statistics.median(ratios[1:]):.2f}",
-            f"{statistics.median(outside[1:]):.2f}")
-
-
-TABLES = {"markers": markers_table, "boards": boards_table, "images": images_table}
+TABLES = {"markers": markers_table, "boards": boards_table}
 
 
 @single_threaded()

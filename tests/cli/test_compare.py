@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 import sweep
 from support.board_photographs import POSES, write_set
-from support.here import calls_here
 from support.photograph_results import results_of, twins
 from sweep import cli
 from sweep.analysis import simulation_gap
@@ -93,9 +92,8 @@ def stores(tmp_path_factory):
     text = "[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\ntrial = 2\n"
     refined = text + 'cornerRefinementMethod = ["none", "subpix"]\n'
     folder = tmp_path_factory.mktemp("stores")
-    with calls_here():
-        for name, made in (("a", text), ("b", text), ("c", "seed = 2\n" + text), ("d", refined)):
-            sweep.run(sweep.Pipeline.from_text(made), store=folder / f"{name}.zarr")
+    for name, made in (("a", text), ("b", text), ("c", "seed = 2\n" + text), ("d", refined)):
+        sweep.run(sweep.Pipeline.from_text(made), store=folder / f"{name}.zarr")
     return folder
 
 
@@ -125,35 +123,33 @@ def test_stores_that_are_no_pair_are_refused_in_one_line(other, flags, named, st
     assert err.count("\n") == 1
 
 
-@pytest.mark.long
 def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys):
     shots = write_set(tmp_path, POSES)
     given = ["--camera", tmp_path / "camera.json", "--board", tmp_path / "board.toml"]
     scene = tmp_path / "same.toml"
     scene.write_text("[scene]\nblack = 35\nwhite = 210\nblur_px = 0.6\nnoise_grey = 2\n")
-    with calls_here():
-        code, *_ = told(
-            capsys, "photos", shots, *given, "--store", tmp_path / "shots.zarr",
-            "--set", 'cornerRefinementMethod=["none", "subpix"]',
-        )
-        assert code == 0
-        code, out, _ = told(capsys, "compare", tmp_path / "shots.zarr", scene)
-        assert code == 0
-        assert "5 photographs and their twins" in out
-        assert (tmp_path / "shots-same.zarr").is_dir()
-        code, out, _ = told(
-            capsys, "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
-        (median,) = (each for each in json.loads(out)["rows"]
-                     if each["statistic"].startswith("rotation error, median")
-                     and each["cornerRefinementMethod"] == "subpix")
-        # The photographs were rendered with this scene, but for the board around each marker.
-        assert 0.5 < median["gap"]["value"] < 2
-        simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
-        assert simulated.sizes["trial"] == len(POSES)
-        scene.write_text("[scene]\nblur_px = 3\n")
-        code, _, err = told(capsys, "compare", tmp_path / "shots.zarr", scene)
-        assert code == 2
-        assert "holds another experiment" in err
+    code, *_ = told(
+        capsys, "photos", shots, *given, "--store", tmp_path / "shots.zarr",
+        "--set", 'cornerRefinementMethod=["none", "subpix"]',
+    )
+    assert code == 0
+    code, out, _ = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+    assert code == 0
+    assert "5 photographs and their twins" in out
+    assert (tmp_path / "shots-same.zarr").is_dir()
+    code, out, _ = told(
+        capsys, "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
+    (median,) = (each for each in json.loads(out)["rows"]
+                 if each["statistic"].startswith("rotation error, median")
+                 and each["cornerRefinementMethod"] == "subpix")
+    # The photographs were rendered with this scene, but for the board around each marker.
+    assert 0.5 < median["gap"]["value"] < 2
+    simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
+    assert simulated.sizes["trial"] == len(POSES)
+    scene.write_text("[scene]\nblur_px = 3\n")
+    code, _, err = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+    assert code == 2
+    assert "holds another experiment" in err
     empty = tmp_path / "empty.toml"
     empty.write_text("seed = 3\n")
     for name, expected in (("empty.toml", "expected a section [scene]"),

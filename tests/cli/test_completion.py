@@ -10,6 +10,7 @@ from sweep import cli
 from sweep.cli.parser import build_parser
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_each_script_is_one_of_its_shell_and_has_every_command_and_option(shell, capsys, tmp_path):
     pytest.importorskip("shtab")

@@ -1,6 +1,5 @@
 """JSON that commands print: the standard's numbers or null, and a flag beside an infinite one."""
 
-import ast
 import enum
 import json
 import math
@@ -13,12 +12,9 @@ import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import sweep.cli
 from sweep.analysis import calibration_summary
 from sweep.messages import to_json
 from sweep.report.comparison_tables import calibration_table
-
-HERE = Path(sweep.cli.__file__).parent
 
 
 def strict(text):
@@ -72,13 +68,6 @@ def back(value, flag=None):
 )))
 def test_every_infinity_is_told_beside_its_number(content):
     assert back(strict(to_json(content))) == content
-
-
-@pytest.mark.parametrize("path", sorted(HERE.glob("*.py")), ids=lambda path: path.stem)
-def test_commands_print_json_by_the_one_writer(path):
-    names = {alias.name for node in ast.walk(ast.parse(path.read_text()))
-             if isinstance(node, ast.Import) for alias in node.names}
-    assert "json" not in names
 
 
 def test_calibrations_are_numbers_with_units_in_the_keys():

@@ -1,14 +1,10 @@
 """Ordinary mistakes of a new user: each is told in a line that says what to change, or works."""
 
-import json
 import shlex
-import subprocess
-import sys
 
 import pytest
 
 import sweep
-from support.here import calls_here
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import SweepError
@@ -44,11 +40,10 @@ def folder(stores, monkeypatch):
 
 
 def told(capsys, line):
-    with calls_here():
-        try:
-            code = cli.main(shlex.split(line))
-        except SystemExit as stopped:
-            code = stopped.code
+    try:
+        code = cli.main(shlex.split(line))
+    except SystemExit as stopped:
+        code = stopped.code
     return code, *capsys.readouterr()
 
 
@@ -108,27 +103,17 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
     ("line", "command"),
     [
         ("run small.toml", "sweep report runs/small.zarr"),
-        pytest.param("run runs/small.zarr", "sweep report runs/small.zarr", marks=pytest.mark.long),
-        pytest.param(
-            "plan small.toml --set trial=1", "sweep run small.toml --set trial=1",
-            marks=pytest.mark.long,
-        ),
+        ("run runs/small.zarr", "sweep report runs/small.zarr"),
+        ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
         ("show runs/small.zarr", "sweep plan runs/small.zarr"),
         ("repro runs/small.zarr --at trial=1",
          "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
         ("status runs/small.zarr", "sweep report runs/small.zarr"),
         ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
         ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
-        pytest.param(
-            "verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr",
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            "report runs/small.zarr", "sweep tradeoff runs/small.zarr", marks=pytest.mark.long),
-        pytest.param(
-            "tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr",
-            marks=pytest.mark.long,
-        ),
+        ("verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr"),
+        ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
+        ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
     ],
 )
 def test_every_command_ends_with_what_to_do_next(line, command, capsys):
@@ -139,18 +124,6 @@ def test_every_command_ends_with_what_to_do_next(line, command, capsys):
     assert cli.parser.build_parser()[0].parse_args(shlex.split(command)[1:]).command is not None
 
 
-@pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("line", [
-    "run small.toml --json", "status runs/small.zarr --json",
-    "verify runs/small.zarr --sample 0 --json",
-])
-def test_json_is_one_object_and_nothing_else(line, capsys):
-    code, out, err = told(capsys, line)
-    assert (code, err) == (0, "")
-    assert json.loads(out)
-
-
-@pytest.mark.long
 def test_repro_writes_no_file_unasked(folder, capsys):
     before = sorted(folder.rglob("*"))
     assert told(capsys, "repro runs/small.zarr")[0] == 0
@@ -167,7 +140,7 @@ def test_verify_of_a_store_that_is_being_written_points_to_its_status(capsys):
 
 @pytest.mark.usefixtures("folder")
 def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
-    with calls_here(), sweep.run("runs/small.zarr") as results:
+    with sweep.run("runs/small.zarr") as results:
         assert results.sizes["trial"] == 2
     with pytest.raises(SweepError, match="a folder that is no store"):
         sweep.run("runs")
@@ -180,25 +153,13 @@ def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
 def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
     url = str(tmp_path / "far.zarr")
     far = {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [2], "trial": 2}}
-    with calls_here(), sweep.run(far, store=url):
+    with sweep.run(far, store=url):
         pass
     assert capsys.readouterr().err.splitlines() == [
         "the marker's side is at most 2 px, less than a pixel a module: too small to be read",
         "warning: nothing was detected: 2 no_candidate (No candidate at the marker)",
         f"look at it: sweep repro {url} --at side_px=2.0,trial=0 -o scene.png",
     ]
-
-
-@pytest.mark.long
-def test_a_script_without_a_main_guard_runs_once(tmp_path):
-    (tmp_path / "script.py").write_text(
-        "import sweep\nprint('begun')\n"
-        "results = sweep.run({'axes': {'side_px': [20, 40], 'trial': 2}, 'pose': {'jitter_px': 1}},"
-        " store='s.zarr', workers=2)\nprint(results.sizes['side_px'])\n"
-    )
-    ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True,
-                         text=True, check=False)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "begun\n2\n", "")
 
 
 # Runs that have to be confirmed.
@@ -236,6 +197,6 @@ def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "
             "`--yes`") in err.splitlines()[-1]
     assert not (tmp_path / "runs/small.zarr").exists()
-    with calls_here(), pytest.raises(SweepError, match="yes=True"):
+    with pytest.raises(SweepError, match="yes=True"):
         sweep.run("small.toml")
     assert told(capsys, "run small.toml --yes")[0] == 0

@@ -14,7 +14,7 @@ from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.store.locations import check_writable, checked_url, exists
+from sweep.store.locations import check_writable, exists
 
 PIPELINE = """
 [pose]
@@ -110,11 +110,6 @@ def test_a_store_that_can_only_be_read_is_not_begun(folder, monkeypatch):  # noq
         "https://example.org/x.zarr: can only be read; choose a path or s3://")
 
 
-def test_names_that_only_look_like_urls_are_paths():
-    for path in ("a:b.zarr", "./file:x", "~user/x.zarr", "x~", "./~/x.zarr"):
-        assert checked_url(path) == path
-
-
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may become another user")
 def test_a_folder_that_may_not_be_searched_is_told(folder, monkeypatch):
     private = folder / "private"
@@ -176,6 +171,7 @@ def test_a_defect_is_not_taken_for_the_system(monkeypatch):
         cli.main(["status", "x"])
 
 
+@pytest.mark.system
 def test_full_standard_output_is_told_in_one_line():
     buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
     for arguments, environment in (
@@ -190,6 +186,7 @@ def test_full_standard_output_is_told_in_one_line():
             "standard output cannot be written: No space left on device; free space on the disk\n")
 
 
+@pytest.mark.system
 def test_characters_that_a_terminal_lacks_are_printed_as_escapes(tmp_path):
     (tmp_path / "x.toml").write_text('title = "\u2013"\n[nonsense-\u00e9]\n', encoding="utf-8")
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}

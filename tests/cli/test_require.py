@@ -49,7 +49,6 @@ def require(folder, monkeypatch, capsys):
     return run
 
 
-@pytest.mark.long
 def test_what_the_pipeline_requires_is_decided(require):
     code, out, err = require("two.zarr")
     assert (code, err) == (1, "")
@@ -90,11 +89,6 @@ def test_every_condition_that_fails_has_a_line(require):
     assert {row["decision"] for each in told for row in each["failing"]} == {"not_met"}
 
 
-def test_pooled_axes_are_named(require):
-    out = require("two.zarr", "detection >= 0.3", "--per", "")[1]
-    assert "pooled over side_px" in out
-
-
 def test_markdown_has_every_condition(require):
     code, out, _ = require("two.zarr", "--markdown", "--at", "solver=iterative")
     assert code == 1
@@ -119,7 +113,6 @@ def test_a_store_is_not_worse_than_itself(require):
     assert "not worse  detection_rate" in out
 
 
-@pytest.mark.long
 def test_a_worse_store_is_not_met(folder, require):
     noisy = Pipeline.from_text(TEXT, ["noise_grey=8", "blur_px=1.5"])
     close(by_hand(str(folder / "noisy.zarr"), noisy))

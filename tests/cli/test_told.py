@@ -40,18 +40,6 @@ def told(capsys, *arguments):
     return text, json.loads(capsys.readouterr().out)
 
 
-def test_detections_are_told_of_what_was_looked_for(store, capsys):
-    text, summary = told(capsys, "run", store)
-    state = told(capsys, "status", store)
-    flags = state[1]["detection"]
-    looked_for = sum(flags.values()) - flags.get("not_visible", 0) - flags.get("not_modelled", 0)
-    assert summary["looked_for"] == state[1]["looked_for"] == looked_for <= 16
-    line = f"detected {summary['detected']} of {looked_for} looked for"
-    assert f"8 poses, {line}" in text
-    assert "results" not in text
-    assert f"looked for  {looked_for}" in state[0]
-
-
 def test_a_bound_that_no_pose_has_is_a_line_of_every_command_and_of_the_report(store, capsys):
     wanted = "no pose has a bound: clipped"
     for command in ("run", "status", "plan"):

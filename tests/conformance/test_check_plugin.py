@@ -1,8 +1,6 @@
 """`sweep plugins check` on OpenCV's own detector, on our solvers, and on plug-ins with faults."""
 
 import json
-import shutil
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -11,8 +9,6 @@ from support.here import Here
 from sweep.cli import main
 from sweep.conformance.check import check_plugin
 from sweep.errors import ArgumentError, PipelineError
-
-GUIDE = Path(__file__).parents[2] / "pipelines" / "plugins"
 
 DETECTOR = """
 import os, time
@@ -89,7 +85,7 @@ def test_what_conforms_passes_six_checks(source, checked):
      "offset by (0.50, 0.50) px: declare pixel_center = 0.5"),
     (SOLVER, "translation = translation + 1e-9 * len(SEEN)", "repeats itself", "32 of 32"),
     (SOLVER, "translation = translation + 1e-6 * len(rotation)", "ignores the batch", "32 of 32"),
-    *(pytest.param(*case, marks=pytest.mark.long) for case in (
+    *(pytest.param(*case, marks=pytest.mark.evidence) for case in (
         (DETECTOR, "image[:] = 0", "returns markers", "changed the image"),
         (DETECTOR, "corners, ids = corners[:0], ids[:0]", "finds markers", "0 of 32"),
         (DETECTOR, "corners += np.random.default_rng().random() * 1e-3", "repeats itself",
@@ -109,7 +105,7 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
     assert named in found[check]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
     (DETECTOR, "os.abort()", "returns markers", "SIGABRT"),
     (DETECTOR, "image.shape[0] > 8 or os._exit(3)", "has no memory", "exit status 3"),
@@ -122,15 +118,6 @@ def test_a_crash_or_an_endless_call_ends_the_checks(source, body, check, named, 
     report = checked(source, body, child=Child, time_limit_s=5 if "sleep" in body else 60)
     assert named in faults(report)[check]
     assert report.findings[-1].check == check
-
-
-@pytest.mark.long
-def test_plug_ins_of_the_guide_conform(tmp_path):
-    for name in ("homography:SOLVER", "consensus:SOLVER", "enlarged:DETECTOR"):
-        shutil.copy(GUIDE / f"{name.partition(':')[0]}.py", tmp_path)
-        with mock.patch("sweep.conformance.check.Child", Here):
-            report = check_plugin(name, folder=str(tmp_path))
-        assert report.conforms, faults(report)
 
 
 @pytest.mark.parametrize(("name", "options", "error", "named"), [

@@ -8,7 +8,7 @@ import pytest
 
 from sweep.analysis.intervals import clopper_pearson
 from sweep.diagnosis.causes import CAUSES, FLIPS, size_ratios
-from sweep.diagnosis.inference import CLEAR_ODDS, PAIRED, measured, rank
+from sweep.diagnosis.inference import CLEAR_ODDS, PAIRED, rank
 from sweep.diagnosis.observations import REFINEMENTS, Observations
 from sweep.model.calibration import Calibration
 
@@ -167,7 +167,7 @@ def test_causes_are_found_and_none_is_invented():
     assert counts["first"] >= 0.9 * counts["told"] > 2
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_thousand_observations():
     """A rate at its limit fails by chance in 2.5 % (the upper end of Clopper and Pearson)."""
     single = table([judged(seed) for seed in range(1000)])
@@ -181,11 +181,3 @@ def test_thousand_observations():
         print(hits, of, low, high)
         assert high >= limit
     assert single["alarms"] <= 0.05 * single["sound"]
-
-
-def test_measured_lists_components_by_row():
-    rows = observation(0, pairs=False)[1]
-    row, component, value = measured(rows)
-    assert np.isfinite(value).all()
-    assert (np.diff(row) >= 0).all()
-    assert set(component) <= {0, 1, 2, 3}

@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-import subprocess
 
 import cv2
 import numpy as np
@@ -198,30 +197,6 @@ def test_several_processes_write_the_same_files(exported, pipeline, tmp_path, mo
     assert files_of(tmp_path / "shared") == files_of(exported[0])
 
 
-@pytest.mark.long
-def test_a_pool_of_processes_writes_the_same_files(exported, pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr(exporting, "BATCH", 5)
-    assert export(pipeline, tmp_path / "pool", workers=2).written == 18
-    assert files_of(tmp_path / "pool") == files_of(exported[0])
-
-
-def test_checksums_are_those_of_sha256sum(exported):
-    folder, _ = exported
-    if shutil.which("sha256sum") is None:
-        pytest.skip("sha256sum is not installed")
-    subprocess.run(["sha256sum", "-c", "--quiet", "images.sha256"], cwd=folder, check=True)
-
-
-def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):
-    (tmp_path / "p.toml").write_text(
-        TEXT.replace("tilt_deg = [0, 50]", "bearing_x_deg = [0, 80]")
-        .replace("distance_m = [0.1, 0.2, -0.2]\ntrial = 3", "distance_m = [0.2]"))
-    assert cli.main(["export", str(tmp_path / "p.toml"), str(tmp_path / "out")]) == 0
-    assert "1 images" in capsys.readouterr().out
-    assert len(truth(tmp_path / "out")) == 1
-    assert "1 scenes more have no image" in (tmp_path / "out/README.md").read_text()
-
-
 def test_folders_of_others_are_refused_in_a_line(exported, pipeline, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(StoreError, match=r"holds notes\.txt, and no export"):
@@ -264,3 +239,13 @@ def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
         changed = Pipeline.from_text(pipeline.text, [other])
         among = changed.experiment.image_keys(scene_indices(changed, np.arange(18)))
         assert not set(among.tolist()) & set(keys.tolist()), other
+
+
+def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):
+    (tmp_path / "p.toml").write_text(
+        TEXT.replace("tilt_deg = [0, 50]", "bearing_x_deg = [0, 80]")
+        .replace("distance_m = [0.1, 0.2, -0.2]\ntrial = 3", "distance_m = [0.2]"))
+    assert cli.main(["export", str(tmp_path / "p.toml"), str(tmp_path / "out")]) == 0
+    assert "1 images" in capsys.readouterr().out
+    assert len(truth(tmp_path / "out")) == 1
+    assert "1 scenes more have no image" in (tmp_path / "out/README.md").read_text()

@@ -1,6 +1,5 @@
 """``sweep score``: answers of programs that know nothing of us equal a run; bad files are told."""
 
-import codecs
 import csv
 import re
 import subprocess
@@ -12,7 +11,6 @@ import pytest
 
 import sweep
 from support.blocks import run_cells
-from support.here import calls_here
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import ArgumentError, PipelineError, StoreError
@@ -50,12 +48,6 @@ tilt_deg = [0, 50]
 distance_m = [0.1, 0.25]
 trial = 3
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_child():
-    with calls_here():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +158,7 @@ def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
     assert any("pass --pixel-center 0.5" in line for line in wrong)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("form", ["rvec", "quaternion"])
 def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
     generator = np.random.default_rng(3)
@@ -226,21 +218,6 @@ def test_several_programs_and_our_own_detector_are_paired_on_one_axis(exported, 
     assert not (results.detection.sel(detector="nothing.npz") == DetectionStatus.detected).any()
     assert any("no marker: each of 24 images counts as searched in vain" in line
                for line in ready.lines)
-
-
-@pytest.mark.long
-def test_windows_are_scored_as_whole_frames_are(exported, ran, tmp_path):
-    pipeline = Pipeline.from_text(TEXT.replace('window = "full"', ""), name="scored")
-    export(pipeline, tmp_path / "windows", windowed=True)
-    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
-    origins = {row["image"]: row for row in rows_of(tmp_path / "windows/truth.csv")}
-    for row in rows:
-        for axis, k in ((axis, k) for axis in "xy" for k in range(4)):
-            origin = float(origins[row["image"]][f"origin_{axis}_px"])
-            row[f"{axis}{k}"] = repr(float(row[f"{axis}{k}"]) - origin)
-    path = write(tmp_path / "windows.csv", rows)
-    results, _ = run_answers(tmp_path / "windows", path, tmp_path / "windows.zarr")
-    assert_equal(ran, results, ["corner_error_px", "estimate", "translation_error_m"])
 
 
 def test_scenes_that_were_not_exported_are_failed_and_said(exported):
@@ -305,58 +282,12 @@ def test_a_bad_file_is_told_in_a_line_and_nothing_is_written(kind, exported, tmp
     assert not (tmp_path / "x.zarr").exists()
 
 
-def test_many_faults_are_counted(exported, tmp_path):
-    path = tmp_path / "many.csv"
-    path.write_text(GOOD.splitlines()[0] + "\n" + "none.png,0,1,2,3,4,5,6,7,8\n" * 100)
-    with pytest.raises(PipelineError) as error:
-        prepare(exported, [path])
-    assert len(error.value.faults) == 21
-    assert error.value.faults[-1] == "... and 80 faults more"
-
-
-def spelled_otherwise():
-    """Yield the name of a spelling and what it does to the file's text."""
-    yield "BOM and CRLF", lambda text: codecs.BOM_UTF8 + text.replace("\n", "\r\n").encode()
-    yield "UTF-16", lambda text: text.encode("utf-16")
-    yield "semicolons, decimal commas", lambda text: "\n".join(
-        line if k == 0 else line.replace(",", ";").replace(".png", "#png").replace(".", ",")
-        .replace("#png", ".png")
-        for k, line in enumerate(text.replace(text.splitlines()[0],
-                                              text.splitlines()[0].replace(",", ";")).splitlines())
-    ).encode()
-    yield "tabs, comments, empty lines", lambda text: (
-        "# made by\n\n" + text.replace(",", "\t") + "\n\n").encode()
-    yield "quotes and old line ends", lambda text: "\r".join(
-        ",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()).encode()
-
-
-@pytest.mark.parametrize(("name", "spell"), [*spelled_otherwise()])
-def test_whatever_wrote_the_csv_its_numbers_are_the_same(name, spell, exported, tmp_path):
-    del name
-    path = tmp_path / "detections.csv"
-    path.write_bytes(spell((exported / "detections.csv").read_text()))
-    prepare(exported, [path])  # writes detections.npz: of the same bytes, or it would be refused
-    prepare(exported, [exported / "detections.csv"])
-
-
 def test_an_image_that_is_named_without_a_marker_counts_as_searched(exported, tmp_path):
     names = [row["image"] for row in rows_of(exported / "truth.csv")]
     path = tmp_path / "none.csv"
     path.write_text("image,id,x0,y0,x1,y1,x2,y2,x3,y3\n" + f"{names[0]},,,,,,,,,\n")
     assert prepare(exported, [path], names=["nothing-found"]).lines == [
         "nothing-found: no marker: each of 24 images counts as searched in vain"]
-
-
-@pytest.mark.long
-def test_of_doubled_rows_the_nearest_counts_if_asked_for(exported, ran, tmp_path):
-    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
-    far = [{**row, "x0": repr(float(row["x0"]) + 3)} for row in rows]
-    path = write(tmp_path / "doubled.csv", [*far, *rows])
-    with pytest.raises(PipelineError, match="twice"):
-        prepare(exported, [path])
-    ready = prepare(exported, [path], doubled="nearest")
-    results = results_of(ready.pipeline, tmp_path / "doubled.zarr")
-    assert_equal(ran, results, ["corner_error_px", "translation_error_m"])
 
 
 def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):

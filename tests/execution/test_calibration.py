@@ -13,7 +13,6 @@ from sweep.execution.forecast import (
     block_time_limit_s,
     blocks_of,
     demand_of,
-    forecast,
     measure,
     measured_or_assumed,
 )
@@ -44,7 +43,7 @@ class Failing(Here):
         raise ChildDiedError("SIGSEGV")
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
     pipeline = Pipeline.from_text(HUGE)
     with Child("sweep.execution.forecast") as child:
@@ -58,16 +57,6 @@ def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_si
     with Failing() as child:
         assumed = measured_or_assumed(child, pipeline, 1.0)
     assert (assumed.sampled, assumed.over) == (0, False)
-
-
-@pytest.mark.long
-def test_plan_measures_what_a_pose_takes():
-    pipeline = Pipeline.from_text(
-        "[scene]\nnoise_grey = 3\n[axes]\nside_px = [20, 40]\ntrial = 9")
-    expected = forecast(pipeline, 2)
-    assert not expected.over
-    assert expected.worker_bytes > 50e6
-    assert 0 < expected.pose_s < 1
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,9 @@ import itertools
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import time
-from collections import Counter
 from pathlib import Path
 
 import psutil
@@ -18,7 +16,6 @@ import xarray as xr
 
 from support.clusters import Cluster, workers_below
 from support.commands import command, complaints, started
-from support.lengths import lengths
 from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
@@ -48,37 +45,21 @@ tilt_deg = [10, 45]
 solver = ["ippe_square", "iterative"]
 trial = %d
 """
-SHORT_TRIALS, LONG_TRIALS = 250, 1500
-
-IN_WAVES = {
-    "precision": """
+PRECISION = """
 [search]
 precision = { detection_rate = 0.03 }
 per = ["distance_m", "tilt_deg"]
-""",
-    "limit": """
-[require]
-all = ["detection >= 0.9"]
-[search]
-along = "distance_m"
-""",
-    "choose": """
-[require]
-all = ["detection >= 0.9"]
-[search]
-largest = "distance_m"
-""",
-}
+"""
 
 CLIENT = """
-import json, sys
+import sys
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
-    pipeline, store, scheduler, options = sys.argv[1:]
+    pipeline, store, scheduler = sys.argv[1:]
     execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
-            block_s=0.05, **json.loads(options))
+            block_s=0.05)
 """
 
 
@@ -111,48 +92,34 @@ def prepared(folder, text, name):
 class Chaos:
     """Runs into new stores, again and again, and kills what runs them at random instants.
 
-    In turn: a worker, the scheduler, the client; with processes of the client's, and with a cluster
-    outside of it that goes on when the client dies. Cells of an ``older`` store are reused, and
-    every other store stands in the place of an older one.
+    In turn: a client, a worker, the scheduler; of a cluster outside, which goes on when its client
+    dies, or of a client with processes of its own.
     """
 
-    def __init__(self, folder, pipeline, path, reference, seed, older=""):
+    def __init__(self, folder, pipeline, path, reference):
         self._folder, self._pipeline, self._path = folder, pipeline, path
-        self._older = older
         self._reference = reference
-        self._random = random.Random(seed)
+        self._random = random.Random(SEED)
         self._left = contextlib.ExitStack()
         self._cluster = None
-        self._waited = False
         self.stores = 0
-        self.killed = Counter()
-        self.ended = Counter()
+        self._next_store()
 
     def run(self, kills):
-        turns = itertools.cycle(
-            [self._scheduler_outside, self._client_inside, self._worker_inside,
-             self._client_outside, self._worker_outside]
-        )
-        wanted = {"worker": 0, "scheduler": 0, "client": 0}
-        for _, victim in zip(range(kills), itertools.cycle(wanted), strict=False):
-            wanted[victim] += 1
         with self._left:
-            self._next_store()
-            while self.killed.total() < kills:
-                turn = next(turns)
-                victim = turn.__name__.split("_")[1]
-                if self.killed[victim] < wanted[victim]:
-                    turn()
-            self._to_the_end()
-        assert dict(self.killed) == {k: n for k, n in wanted.items() if n}
+            for _, victim in zip(
+                range(kills), itertools.cycle(["client", "worker", "scheduler"]), strict=False
+            ):
+                while not self._killed(victim):
+                    pass
+            if Path(self._url).exists():
+                with self._client() as client:
+                    assert client.wait(timeout=900) == 0, self._told()
+                whole(self._url, self._pipeline, self._reference)
 
     def _next_store(self):
         self.stores += 1
         self._url = str(self._folder / f"chaos{self.stores}.zarr")
-        self._overwritten = None
-        if self._older and self.stores % 2 == 0:
-            shutil.copytree(self._older, self._url)
-            self._overwritten = open_store(self._url).run_id
 
     def _receipts(self):
         try:
@@ -161,33 +128,54 @@ class Chaos:
             return 0
 
     def _client(self, scheduler=""):
-        log = (self._folder / "client.log").open("w")
-        self._left.callback(log.close)
-        options = {"reuse": [self._older]} if self._older else {}
-        if self._overwritten is not None:
-            with contextlib.suppress(StoreError):  # it may be gone, and the new one not there
-                options["overwrite"] = open_store(self._url).run_id == self._overwritten
-        return started(
-            ["-c", CLIENT, self._path, self._url, scheduler, json.dumps(options)],
-            stdout=log, stderr=log,
-        )
+        log = self._left.enter_context((self._folder / "client.log").open("w"))
+        return started(["-c", CLIENT, self._path, self._url, scheduler], stdout=log, stderr=log)
 
     def _told(self):
         return (self._folder / "client.log").read_text()
 
-    def _instant(self, client):
-        """Wait for a random instant; tell whether the run still goes on then.
+    def _outside(self):
+        """Return the cluster outside and the parent of its workers; start them."""
+        if self._cluster is None:
+            cluster = self._left.enter_context(Cluster(self._folder))
+            self._cluster = cluster, cluster.nannies(2)
+        return self._cluster
 
-        Half of them lie anywhere from the start, the others just after a block was committed.
-        """
-        if self._random.random() < 0.5:
-            deadline = time.monotonic() + self._random.uniform(0.0, 6.0)
-            while client.poll() is None and time.monotonic() < deadline:
-                time.sleep(0.01)
-        else:
-            self._some_blocks(client)
-            time.sleep(self._random.uniform(0.0, 0.3))
-        return client.poll() is None
+    def _killed(self, victim):
+        """Kill at a random instant; tell whether the run still went on then."""
+        cluster = parent = None
+        if victim == "scheduler" or self._random.random() < 0.5:
+            cluster, parent = self._outside()
+        with self._client(cluster.address if cluster else "") as client:
+            if self._random.random() < 0.5 and victim != "worker":
+                self._seconds(client, 6.0)
+            else:
+                self._some_blocks(client)
+                self._seconds(client, 0.3)
+            if client.poll() is not None:
+                if client.returncode == 0:
+                    whole(self._url, self._pipeline, self._reference)
+                    self._next_store()
+                return False
+            if victim == "worker":
+                there = workers_below(parent or client)
+                if not there:
+                    return False
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    self._random.choice(there).kill()
+                self._some_blocks(client)  # the run goes on without being asked to
+                assert client.poll() in {None, 0}, self._told()
+            else:
+                (client if victim == "client" else cluster.scheduler).kill()
+        if victim == "scheduler":
+            cluster.__exit__()
+            self._cluster = None
+        return True
+
+    def _seconds(self, client, most):
+        deadline = time.monotonic() + self._random.uniform(0.0, most)
+        while client.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
 
     def _some_blocks(self, client):
         enough = self._receipts() + self._random.randint(1, 6)
@@ -196,126 +184,18 @@ class Chaos:
             assert time.monotonic() < deadline, "no block was committed for five minutes"
             time.sleep(0.02)
 
-    def _see_it_finished(self, client):
-        """Handle a client that ended of itself: with a finished store, or so that one goes on."""
-        code = client.wait()
-        self.ended[code] += 1
-        if code == 0:
-            whole(self._url, self._pipeline, self._reference)
-            self._next_store()
 
-    def _to_the_end(self):
-        if not Path(self._url).exists():
-            return
-        with self._client() as client:
-            assert client.wait(timeout=900) == 0, self._told()
-        whole(self._url, self._pipeline, self._reference)
-
-    def _outside(self):
-        """Return scheduler, workers' parent and address of the cluster outside; start one."""
-        if self._cluster is None:
-            cluster = self._left.enter_context(Cluster(self._folder))
-            self._cluster = cluster, cluster.scheduler, cluster.nannies(2), cluster.address
-        return self._cluster[1:]
-
-    def _end_outside(self):
-        self._cluster[0].__exit__()
-        self._cluster = None
-
-    def _scheduler_outside(self):
-        scheduler, _, address = self._outside()
-        with self._client(address) as client:
-            if not self._instant(client):
-                self._see_it_finished(client)
-                return
-            scheduler.kill()
-            self.killed["scheduler"] += 1
-            if not self._waited:
-                # It ends of itself, rather than wait for ever for blocks that nobody computes.
-                self._waited = True
-                code = client.wait(timeout=120)
-                self.ended[code] += 1
-                assert code != 0
-            else:
-                time.sleep(self._random.uniform(0.0, 1.0))
-        self._end_outside()
-
-    def _client_inside(self):
-        with self._client() as client:
-            self._kill_client(client)
-
-    def _client_outside(self):
-        # The cluster stays: its workers end the blocks that they are at, while the next client
-        # has them computed again.
-        with self._client(self._outside()[2]) as client:
-            self._kill_client(client)
-
-    def _kill_client(self, client):
-        if self._instant(client):
-            client.kill()
-            client.wait()
-            self.killed["client"] += 1
-        else:
-            self._see_it_finished(client)
-
-    def _worker_inside(self):
-        with self._client() as client:
-            self._kill_worker(client, client)
-
-    def _worker_outside(self):
-        _, parent, address = self._outside()
-        with self._client(address) as client:
-            self._kill_worker(client, parent)
-
-    def _kill_worker(self, client, parent):
-        self._some_blocks(client)
-        time.sleep(self._random.uniform(0.0, 0.5))
-        there = workers_below(parent)
-        if client.poll() is None and there:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                self._random.choice(there).kill()
-                self.killed["worker"] += 1
-            # The run goes on without being asked to.
-            self._some_blocks(client)
-            assert client.poll() in {None, 0}, self._told()
-        if client.poll() is not None:
-            self._see_it_finished(client)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("count", "older"), [(6, False), (6, True), (200, False)])
-def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, older, tmp_path):
-    trials = SHORT_TRIALS if count < 100 else LONG_TRIALS
-    pipeline, path, reference = prepared(tmp_path, GRID % trials, "undisturbed")
-    old = str(tmp_path / "old.zarr") if older else ""
-    if older:
-        by_hand(old, Pipeline.from_text(GRID % 20))
-    chaos = Chaos(tmp_path, pipeline, path, reference, SEED, old)
-    begun = time.monotonic()
-    chaos.run(count)
-    print(
-        f"seed {SEED}: {chaos.killed.total()} kills ({dict(chaos.killed)}), {chaos.stores} stores "
-        f"of {pipeline.size(Stage.scene):,} scenes, 0 differences, 0 blocks lost or doubled; "
-        f"clients that ended of themselves, by status: {dict(chaos.ended)}; "
-        f"{time.monotonic() - begun:.0f} s; left behind: "
-        f"{sum(1 for _ in tmp_path.rglob('*.partial'))} partial files"
-    )
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("rule", "count"), [("precision", 20), ("limit", 3), ("choose", 3)])
-def test_kills_of_a_run_in_waves_change_no_bit(rule, count, tmp_path):
-    text = (GRID % 2000).replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]") + IN_WAVES[rule]
-    pipeline, path, reference = prepared(tmp_path, text, "undisturbed")
-    chaos = Chaos(tmp_path, pipeline, path, reference, SEED)
-    chaos.run(count)
-    needed = open_store(reference)
-    needed = sum(receipt.scenes_needed for _, receipt in receipts(needed, committed(needed)))
-    assert 0 < needed < pipeline.size(Stage.scene)
-    print(
-        f"{chaos.killed.total()} kills ({dict(chaos.killed)}), {chaos.stores} stores of "
-        f"{needed:,} needed scenes of {pipeline.size(Stage.scene):,}, 0 differences"
-    )
+@pytest.mark.evidence
+@pytest.mark.parametrize(("text", "kills"), [
+    pytest.param(GRID % 250, 60, id="grid"),
+    pytest.param((GRID % 2000).replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]")
+                 + PRECISION, 15, id="waves"),
+])
+def test_kills_at_random_instants_change_no_bit_and_lose_no_block(text, kills, claim, tmp_path):
+    chaos = Chaos(tmp_path, *prepared(tmp_path, text, "undisturbed"))
+    chaos.run(kills)
+    claim("stores after kills of client, worker, scheduler at random instants",
+          f"an undisturbed run; {kills} kills", 0.0, "bits differ")
 
 
 SMALL = (GRID % 10).replace("[0.2, 0.3, 0.4]", "[0.2, 0.3, 0.4, 0.5]")
@@ -362,8 +242,8 @@ def small(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
-@pytest.mark.long
-@lengths(2, ALL)
+@pytest.mark.system
+@pytest.mark.parametrize("count", [2, pytest.param(ALL, marks=pytest.mark.evidence)])
 def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     count, small, tmp_path
 ):
@@ -396,7 +276,7 @@ def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     print(f"killed at {len(chosen) - 1} of {total} instants of a block")
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.filterwarnings("ignore:Object at zarr.*partial")  # left by a kill, and no fault
 def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
     small, tmp_path
@@ -424,8 +304,8 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
         whole(url, pipeline, reference)
 
 
-@pytest.mark.long
-@lengths(2, ALL)
+@pytest.mark.evidence
+@pytest.mark.parametrize("count", [ALL])
 def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
     count, small, tmp_path
 ):
@@ -444,8 +324,8 @@ def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
         assert committed(open_store(str(url))) == set()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("count", [2, ALL])
+@pytest.mark.evidence
+@pytest.mark.parametrize("count", [ALL])
 def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, cluster, tmp_path):
     pipeline, path, _ = small
     url = str(tmp_path / "small.zarr")
@@ -532,44 +412,7 @@ def told_in_a_line(ran, what, codes=(1,)):
 FULL = "No space left on device"
 
 
-@pytest.mark.long
-def test_run_on_a_full_disk_says_so_in_a_line_and_continues_when_there_is_room(
-    small, disk, cluster, tmp_path
-):
-    pipeline, path, reference = small
-    url = str(disk.path / "small.zarr")
-    store = create_store(url, pipeline, (1, 1, 2))
-    arguments = ("run", path, "--store", url, "--scheduler", cluster.scheduler_address)
-    told_in_a_line(command(*arguments, cwd=tmp_path), FULL)
-    done = len(committed(store))
-    assert 0 < done < len(store.blocks)
-    disk.remount("size=64m")
-    ran = command(*arguments, "--json", cwd=tmp_path)
-    assert (ran.returncode, complaints(ran)) == (0, [])
-    assert json.loads(ran.stdout)["computed_blocks"] == len(store.blocks) - done
-    whole(url, pipeline, reference)
-
-
-@pytest.mark.long
-def test_read_only_store_is_told_in_a_line_and_continued_when_it_can_be_written(
-    small, disk, tmp_path
-):
-    pipeline, path, reference = small
-    url = str(disk.path / "small.zarr")
-    disk.remount("size=64m")
-    store = create_store(url, pipeline, (2, 2, 10))
-    compute_block(url, store.run_id, store.blocks[0])
-    disk.remount("ro")
-    arguments = ("run", path, "--store", url, "--workers", 2)
-    told_in_a_line(command(*arguments, cwd=tmp_path), "Read-only file system", {1, 2})
-    fresh = ("run", path, "--store", disk.path / "new.zarr", "--workers", 2)
-    told_in_a_line(command(*fresh, cwd=tmp_path), "Read-only file system", {1, 2})
-    disk.remount("rw")
-    ran = command(*arguments, cwd=tmp_path)
-    assert (ran.returncode, complaints(ran)) == (0, [])
-    whole(url, pipeline, reference)
-
-
+@pytest.mark.system
 def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(small, disk):
     pipeline, _, _ = small
     url = disk.path / "small.zarr"
@@ -586,7 +429,7 @@ def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(small, disk):
     assert committed(create_store(str(url), pipeline, (1, 1, 10))) == set()
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("blocks_done", ["some", "all"])
 def test_disk_that_is_full_to_any_page_is_told_in_a_line(blocks_done, small, disk, tmp_path):
     """The lock, the marks, a block's variables, its receipt, and the closing: each hits the end."""

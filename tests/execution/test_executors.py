@@ -13,7 +13,6 @@ import psutil
 import pytest
 from distributed import Client, LocalCluster
 
-import sweep
 from support.commands import started
 from support.here import Here
 from support.stores import by_hand, same
@@ -23,13 +22,11 @@ from sweep.execution.block_task import other_here
 from sweep.execution.executors import Children
 from sweep.execution.on_cluster import OnCluster, Worker, connected
 from sweep.execution.progress import Tally
-from sweep.execution.runner import compute, execute, recompute
+from sweep.execution.runner import compute, execute
 from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
-from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import writing
 
 PIPELINE = Pipeline.from_text(
     "seed = 3\npose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }\n"
@@ -45,6 +42,7 @@ def undisturbed(tmp_path_factory):
 
 # A Dask cluster that a run starts for itself.
 
+@pytest.mark.system
 def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tmp_path):
     me, threads = psutil.Process(), set(threading.enumerate())
     before = me.children(recursive=True)
@@ -64,47 +62,6 @@ def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tm
 
 
 # Children.
-
-@pytest.mark.long
-def test_small_run_and_small_repair_take_one_process_and_leave_nothing(
-    undisturbed, tmp_path, monkeypatch
-):
-    begun = []
-    monkeypatch.setattr(executors, "SMALL_RUN_LIMIT_S", 300.0)
-    start = Child._start
-    monkeypatch.setattr(Child, "_start", lambda child: (begun.append(child), start(child)))
-    me, threads = psutil.Process(), set(threading.enumerate())
-    before = me.children(recursive=True), len(me.net_connections())
-    url = str(tmp_path / "small.zarr")
-    summary = execute(PIPELINE, url, block_s=0.01)
-    assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
-    left = {thread.name.partition("_")[0] for thread in set(threading.enumerate()) - threads}
-    assert left <= {"zarr", "asyncio"}  # Zarr's own
-    assert same(url, undisturbed)
-    store = open_store(url, "r+")
-    with writing(store.url, store.storage):
-        drop_block(store, store.blocks[0])
-        recompute(store, [0])
-    assert same(url, undisturbed)
-    assert len(begun) == 2
-    assert (me.children(recursive=True), len(me.net_connections())) == before
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("workers", [None, 3])
-def test_what_takes_longer_than_it_was_measured_gets_more_processes(
-    workers, undisturbed, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(executors, "SMALL_RUN_LIMIT_S", 0.0)
-    count = []
-    room = Children.room
-    monkeypatch.setattr(Children, "room", lambda one: count.append(room(one)) or count[-1])
-    monkeypatch.setattr("sweep.execution.runner.default_workers", lambda: 2)
-    url = str(tmp_path / "long.zarr")
-    summary = execute(PIPELINE, url, block_s=1e-6, workers=workers)
-    assert count[-1] == workers or 2
-    assert summary.computed_blocks == summary.blocks == 12
-    assert same(url, undisturbed)
 
 
 def test_processes_that_cannot_be_started_are_told_in_a_line(monkeypatch, capsys):
@@ -135,7 +92,7 @@ def compute_in(store, child):
         compute(store, waiting, Tally(store, waiting), executor, (), 60, interrupts)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
     monkeypatch.setattr(executors, "compute_blocks", suicide)
@@ -155,7 +112,7 @@ def test_block_that_fails_is_named(raised, error, reason, undisturbed):
         compute_in(open_store(undisturbed), Failing(raised))
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_children_end_with_their_client_whatever_ends_it(tmp_path):
     """Also where Ctrl-C is ignored; and a lost scheduler is told in the last line."""
     (tmp_path / "long.toml").write_text(
@@ -215,6 +172,7 @@ def refusal(client):
     return str(raised.value)
 
 
+@pytest.mark.system
 def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypatch):
     monkeypatch.setattr(on_cluster, "WORKERS_S", 0.5)
     with local_cluster(0) as cluster:
@@ -230,6 +188,7 @@ def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypa
         assert "expected a distributed.Client or a cluster object" in refusal(given)
 
 
+@pytest.mark.system
 def test_workers_that_are_threads_of_the_caller_or_have_other_versions_are_refused(
     tmp_path, monkeypatch
 ):
@@ -241,25 +200,6 @@ def test_workers_that_are_threads_of_the_caller_or_have_other_versions_are_refus
             with pytest.raises(ArgumentError, match=r"tcp://.*: opencv is .*, the run began"):
                 execute(PIPELINE, tmp_path / "other.zarr", **given)
     assert not (tmp_path / "other.zarr").exists()
-
-
-@pytest.mark.long
-def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_path):
-    def stop(progress):
-        if progress.done:
-            raise KeyboardInterrupt
-
-    with local_cluster() as cluster, Client(cluster, set_as_default=False) as client:
-        with pytest.raises(KeyboardInterrupt):
-            execute(
-                PIPELINE, tmp_path / "stopped.zarr", client=client, block_s=1e-6, progress=stop
-            )
-        deadline = time.monotonic() + 30
-        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        results = sweep.run(PIPELINE, store=tmp_path / "stopped.zarr", client=client)
-        assert (results.detection != 0).all()
 
 
 @pytest.mark.parametrize(("states", "line"), [
@@ -281,7 +221,7 @@ def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch,
     assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_path, capfd):
     pipeline = Pipeline.from_text(
         '[pose]\nside_px = 60\n[detector]\ncornerRefinementMethod = "subpix"\n[axes]\ntrial = 4\n'

@@ -8,7 +8,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -218,6 +217,7 @@ def _account():
     return key
 
 
+@pytest.mark.system
 def test_server_refuses_changes_while_a_process_writes(bucket, monkeypatch):
     monkeypatch.setattr("sweep.store.lock.SILENCE_S", 3.0)
     url = "s3://bucket/written.zarr"
@@ -280,7 +280,7 @@ def tls(settings):
 # --- stores on the server ---
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
     bucket, certificates, small, tmp_path
 ):
@@ -307,7 +307,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
         assert not bucket.told_in(content.decode("latin-1")), key
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
     url = "s3://bucket/plain.zarr"
     run = ("run", small, "--workers", "2", "--json")
@@ -332,40 +332,6 @@ def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
     assert "seed: the store has 5, this run 6" in other.stderr
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("bucket")
-def test_remote_run_in_waves_is_tightened_to_what_a_local_one_holds(tmp_path):
-    path = tmp_path / "waves.toml"
-    path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [8, 13, 30]\n")
-    local, remote = str(tmp_path / "local.zarr"), "s3://bucket/waves.zarr"
-    for store, width in ((remote, 0.2), (remote, 0.1), (local, 0.1)):
-        ran = command("run", path, "--store", store, "--max-trials", "150",
-                            "--precision", f"detection_rate = {width}", "--json")
-        assert ran.returncode == 0, ran.stderr
-        assert json.loads(ran.stdout)["needed"] < 450
-    assert digests(remote) == digests(local)
-
-
-@pytest.mark.long
-def test_killed_remote_run_is_told_and_continues(bucket, many, tmp_path):
-    url = "s3://bucket/killed.zarr"
-    with started(tmp_path / "run.log", tmp_path / "run.py", many, url, "") as running:
-        wait_until(
-            lambda: sum("/commits/receipt/c/" in key for key in bucket.keys("killed.zarr")) > 1
-            or running.poll() is not None, "no block is committed",
-        )
-        assert running.poll() is None, (tmp_path / "run.log").read_text()
-        os.killpg(running.pid, signal.SIGKILL)
-        running.wait(TIMEOUT_S)
-    state = json.loads(command("status", url, "--json").stdout)
-    assert 0 < state["blocks_done"] < state["blocks"]
-    ran = command("run", many, "--store", url, "--workers", "2", "--json")
-    assert ran.returncode == 0, ran.stderr
-    summary = json.loads(ran.stdout)
-    assert summary["computed_blocks"] == state["blocks"] - state["blocks_done"]
-    assert digests(url, MANY) == expected(MANY)
-
-
 REFUSED = {
     "wrong secret": ({"AWS_SECRET_ACCESS_KEY": "wrong"}, "s3://bucket/no.zarr"),
     "wrong key": ({"AWS_ACCESS_KEY_ID": "AKIAWRONG"}, "s3://bucket/no.zarr"),
@@ -378,11 +344,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case, id=case, marks=() if case == "wrong secret" else pytest.mark.long)
+        pytest.param(case, id=case, marks=() if case == "wrong secret" else pytest.mark.evidence)
         for case in REFUSED
     ],
 )
@@ -424,16 +390,6 @@ def test_credentials_in_a_store_name_are_refused_and_not_repeated(
 # --- schedulers that refuse ---
 
 
-def test_server_that_never_answers_is_given_up(monkeypatch):
-    monkeypatch.setattr("sweep.execution.on_cluster.ANSWER_S", 0.5)
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(ArgumentError, match="no answer within"), connected(
-            Pipeline.from_text(SMALL), address, None
-        ):
-            pass
-
-
 @pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a"])
 def test_what_is_no_address_is_told(address):
     with pytest.raises(
@@ -467,7 +423,7 @@ def being_run(cluster, many, url, tmp_path):
     assert log.read_text() == ""
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_join_and_leave_during_a_run(number, many, tmp_path):
     url = str(tmp_path / "many.zarr")
@@ -481,29 +437,4 @@ def test_workers_join_and_leave_during_a_run(number, many, tmp_path):
             first.wait(TIMEOUT_S)
             after(5)
             cluster.worker()
-    assert digests(url, MANY) == expected(MANY)
-
-
-@pytest.mark.long
-def test_run_ends_with_its_scheduler_and_continues_on_another(many, tmp_path):
-    url = str(tmp_path / "many.zarr")
-    log = tmp_path / "lost.log"
-    with Cluster(tmp_path / "lost") as cluster:
-        cluster.worker()
-        with started(log, tmp_path / "run.py", many, url, cluster.address) as running:
-            wait_until(
-                lambda: running.poll() is not None or blocks_done(url) >= 2, "no progress"
-            )
-            assert running.poll() is None, log.read_text()
-            cluster.scheduler.kill()
-            assert running.wait(TIMEOUT_S) == 1
-    assert re.fullmatch(r".*the scheduler went away; run it again to continue.*\n",
-                        log.read_text())
-    done = blocks_done(url)
-    assert done >= 2
-    with Cluster(tmp_path / "other") as cluster:
-        cluster.worker()
-        cluster.worker()
-        with being_run(cluster, many, url, tmp_path):
-            pass
     assert digests(url, MANY) == expected(MANY)

@@ -5,7 +5,6 @@ import shutil
 import pytest
 import xarray as xr
 
-from support.here import calls_here
 from support.poison import Poison, poisoned
 from support.stores import by_hand, same
 from sweep.cli import main
@@ -16,6 +15,8 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.store.blocks import begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
+
+pytestmark = pytest.mark.system
 
 TEXT = """
 seed = 3
@@ -62,13 +63,11 @@ def copied(failed, tmp_path):
     return shutil.copytree(failed, str(tmp_path / "copied.zarr"))
 
 
-@pytest.mark.long
 def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
     before = status(copied)
     assert [len(before.failed), len(before.crashed)] == [1, 1]
     assert execute(pipeline, copied).computed_blocks == 0
-    with calls_here():
-        summary = execute(pipeline, copied, retry_failed=True)
+    summary = execute(pipeline, copied, retry_failed=True)
     assert (summary.retried, summary.recovered, summary.computed_blocks) == (2, 2, 2)
     assert (summary.failures, summary.warnings) == ([], [])
     assert same(copied, clean)
@@ -80,23 +79,12 @@ def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
     assert (again.retried, again.computed_blocks) == (0, 0)
 
 
-@pytest.mark.long
-def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):
-    url = str(tmp_path / "grown.zarr")
-    with calls_here():
-        summary = execute(pipeline, url, reuse=[failed])
-    assert (summary.failed, summary.crashed, summary.warnings) == (0, 0, [])
-    # One estimate raised; a detection ended its process, and both its solvers went without.
-    assert (summary.computed_scenes, summary.computed_estimates) == (2, 3)
-    assert same(url, clean)
-
-
 def test_command_says_that_there_is_nothing_to_try_again(clean, capsys):
     assert main(["run", clean, "--retry-failed"]) == 0
     assert "no cell failed or crashed; nothing is tried again" in capsys.readouterr().out
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied, monkeypatch):
     import zarr.storage._local as local  # noqa: PLC0415
 
@@ -141,6 +129,14 @@ def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied
         if not stopped:
             break
     assert instants >= 4  # a mark, two blocks, and the end
-    with calls_here():
-        execute(pipeline, copied, retry_failed=True)
+    execute(pipeline, copied, retry_failed=True)
     assert same(copied, clean)
+
+
+def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):
+    url = str(tmp_path / "grown.zarr")
+    summary = execute(pipeline, url, reuse=[failed])
+    assert (summary.failed, summary.crashed, summary.warnings) == (0, 0, [])
+    # One estimate raised; a detection ended its process, and both its solvers went without.
+    assert (summary.computed_scenes, summary.computed_estimates) == (2, 3)
+    assert same(url, clean)

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import zarr
 
 import sweep
 from support.blocks import run_block
-from support.commands import command
 from support.store_files import edit_root
 from support.stores import by_hand, same
 from sweep.cli import main
@@ -62,7 +60,7 @@ def undisturbed(pipeline, tmp_path_factory):
 
 
 @pytest.mark.parametrize("extents", [
-    (1, 4, 2, 3), *(pytest.param(each, marks=pytest.mark.long)
+    (1, 4, 2, 3), *(pytest.param(each, marks=pytest.mark.evidence)
                     for each in ((1, 1, 1, 1), (2, 3, 1, 2))),
 ])
 def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
@@ -71,7 +69,7 @@ def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
     assert same(url, undisturbed)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("workers", [1, 2])
 def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "run.zarr")
@@ -82,7 +80,6 @@ def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_pa
     assert open_store(url).finished
 
 
-@pytest.mark.usefixtures("no_child")
 def test_stopped_run_continues_and_finished_one_is_left_alone(
     pipeline, undisturbed, tmp_path
 ):
@@ -105,7 +102,6 @@ def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
     assert same(url, undisturbed)
 
 
-@pytest.mark.usefixtures("no_child")
 def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp_path):
     dataset = sweep.run(pipeline, store=tmp_path / "labelled.zarr")
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
@@ -124,19 +120,6 @@ def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp
         assert float(cost.detection_s.sum()) > 0
 
 
-def test_side_px_gives_the_distance_as_a_coordinate(tmp_path):
-    pipeline = Pipeline.from_text("[axes]\nside_px = [20, 40]\nsize_m = [0.01, 0.02]")
-    url = str(tmp_path / "side.zarr")
-    by_hand(url, pipeline, (2, 2))
-    with sweep.open(url) as dataset:
-        assert dataset.distance_m.dims == ("side_px", "size_m")
-        np.testing.assert_allclose(
-            dataset.distance_m.sel(side_px=40, size_m=0.02), 640 * 4 / 4.8 * 0.02 / 40, rtol=1e-15
-        )
-        np.testing.assert_array_equal(dataset.true_tvec_m.sel(xyz="z"), dataset.distance_m)
-
-
-@pytest.mark.usefixtures("no_child")
 def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
     url = str(tmp_path / "one.zarr")
     by_hand(url, pipeline, (2, 4, 2, 3))
@@ -179,7 +162,7 @@ GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 
 
 
 @pytest.mark.parametrize("settings", [
-    pytest.param(settings, id=name, marks=() if name in GROWN_SHORT else pytest.mark.long)
+    pytest.param(settings, id=name, marks=() if name in GROWN_SHORT else pytest.mark.evidence)
     for name, settings in GROWN.items()
 ])
 def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
@@ -206,7 +189,6 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_
     assert sum(part["estimates"] for part in computed) == total - shared
 
 
-@pytest.mark.usefixtures("no_child")
 def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
     part = str(tmp_path / "part.zarr")
     store = create_store(part, pipeline, (1, 4, 2, 3))
@@ -242,17 +224,7 @@ def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
     assert "x" in zarr.open_group(str(foreign), mode="r")
 
 
-def test_an_unwritable_path_is_told_in_a_line(tmp_path, capsys):
-    path = str(tmp_path / "p.toml")
-    Path(path).write_text(TEXT)
-    assert main(["run", path, "--store", "/proc/none/s.zarr"]) == 2
-    told = capsys.readouterr().err
-    assert told == "/proc/none/s.zarr: cannot be written: No such file or directory\n"
-    assert main(["run", path, "--workers", "0"]) == 2
-    assert capsys.readouterr().err == "--workers 0: expected at least 1\n"
-
-
-@pytest.mark.long
+@pytest.mark.evidence
 def test_two_clients_at_once_on_one_store_make_the_same_bits(pipeline, undisturbed, tmp_path):
     path, url = tmp_path / "twice.toml", tmp_path / "twice.zarr"
     path.write_text(TEXT)
@@ -270,40 +242,12 @@ def test_two_clients_at_once_on_one_store_make_the_same_bits(pipeline, undisturb
     assert same(str(url), undisturbed)
 
 
-def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweep.execution.on_cluster.ANSWER_S", 0.5)
-    with pytest.raises(
-        ArgumentError, match=r"^scheduler = tcp://127\.0\.0\.1:9: no answer within"
-    ):
-        execute(pipeline, tmp_path / "none.zarr", scheduler="tcp://127.0.0.1:9")
-    assert not (tmp_path / "none.zarr").exists()
-
-
-@pytest.mark.long
-def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "small.toml"
-    path.write_text(TEXT)
-    ran = command("run", path, "--json", cwd=tmp_path)
-    assert ran.returncode == 0, ran.stderr
-    assert ran.stderr == ""
-    told = json.loads(ran.stdout)
-    assert told["poses"] == 48
-    assert told["results"] == 192
-    assert told["store"] == "runs/small.zarr"
-    monkeypatch.chdir(tmp_path)
-    assert main(["status", "runs/small.zarr", "--json"]) == 0
-    state = json.loads(capsys.readouterr().out)
-    assert state["finished"]
-    assert state["poses_done"] == 48
-    assert sum(state["detection"].values()) == 96
-    assert sum(state["estimate"].values()) == 192
-
-
 LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("workers", [
-    [], pytest.param(["--workers", "2"], marks=pytest.mark.long)], ids=["small", "cluster"])
+    [], pytest.param(["--workers", "2"], marks=pytest.mark.evidence)], ids=["small", "cluster"])
 def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys):
     path = tmp_path / "long.toml"
     path.write_text(LONG if workers else LONG.replace("40000", "1500"))
@@ -334,16 +278,6 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys
     state = json.loads(capsys.readouterr().out)
     assert not state["being_written"]
     assert state["blocks_done"] == done
-
-
-@pytest.mark.long
-def test_running_scheduler_with_two_workers_gives_the_same(
-    pipeline, undisturbed, cluster, tmp_path
-):
-    url = str(tmp_path / "external.zarr")
-    summary = execute(pipeline, url, scheduler=cluster.scheduler_address, block_s=0.02)
-    assert summary.computed_scenes == 48
-    assert same(url, undisturbed)
 
 
 def test_template_says_what_the_kernel_makes(pipeline):
@@ -401,18 +335,6 @@ def test_task_of_a_replaced_store_writes_nothing(pipeline, tmp_path):
     with pytest.raises(StoreError, match="replaced by another run"):
         compute_block(url, old.run_id, block)
     assert committed(new) == set()
-
-
-@pytest.mark.long
-def test_damaged_receipts_are_told(pipeline, tmp_path):
-    url = tmp_path / "damaged.zarr"
-    by_hand(str(url), pipeline, (2, 4, 2, 3))
-    for path in (url / "commits" / "receipt" / "c").iterdir():
-        path.write_bytes(b"garbage")
-    ran = command("status", url)
-    assert ran.returncode == 2
-    assert "the receipt of block 0 is damaged" in ran.stderr
-    assert "Traceback" not in ran.stderr
 
 
 REUSED_WITHOUT_SCENE_AXES = """

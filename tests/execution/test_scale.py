@@ -75,7 +75,7 @@ def run_synthetic(folder, trials):
         return {**json.loads(ran.stdout), "scheduler": grown, "store": store}
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_memory_of_client_and_scheduler_does_not_grow_with_the_grid(tmp_path):
     small = run_synthetic(tmp_path, 10)
     large = run_synthetic(tmp_path, 1000)

@@ -116,10 +116,10 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("how", [
-    "client of the caller", pytest.param("all of the caller's", marks=pytest.mark.long),
-    pytest.param("embedded", marks=pytest.mark.long)])
+    "client of the caller", pytest.param("all of the caller's", marks=pytest.mark.evidence),
+    pytest.param("embedded", marks=pytest.mark.evidence)])
 def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(how, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

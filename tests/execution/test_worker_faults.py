@@ -81,6 +81,7 @@ def test_block_that_a_machine_failed_is_not_committed(fault, tmp_path):
     assert committed(store) == set()
 
 
+@pytest.mark.system
 def test_blocks_of_a_worker_whose_machine_is_at_fault_are_computed_by_others(
     tmp_path, undisturbed, two_workers, capfd
 ):
@@ -104,30 +105,6 @@ def test_blocks_of_a_worker_whose_machine_is_at_fault_are_computed_by_others(
     assert "MemoryError" in line
 
 
-@pytest.mark.long
-def test_blocks_of_a_worker_that_cannot_write_the_store_are_computed_by_others(
-    tmp_path, undisturbed, two_workers, capfd
-):
-    faulty, sound = two_workers.nthreads()
-    url = tmp_path / "one.zarr"
-    two_workers.run(machine_faults.inject, "disk", "set", 5, workers=[faulty])
-    assert run_on(two_workers, url) == 0
-    assert same(url, undisturbed)
-    assert not list(url.glob("commits/receipt/begun/*"))
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith(f"worker {faulty}: machine fault on ")
-    assert ": cannot be written: No space left on device" in line
-    # Nobody is left to whom blocks could be given.
-    two_workers.run(machine_faults.inject, "disk", "set", 0, workers=[sound])
-    with pytest.raises(RunError) as raised:
-        run_on(two_workers, tmp_path / "none.zarr")
-    (line,) = str(raised.value).splitlines()
-    assert ": cannot be written: No space left on device" in line
-    two_workers.run(machine_faults.clear, workers=[sound])
-    assert run_on(two_workers, tmp_path / "none.zarr") == 0
-    assert same(tmp_path / "none.zarr", undisturbed)
-
-
 def outcome(client, url):
     """Return the error of a run, empty if it finished, and how many scenes are flagged failed."""
     try:
@@ -136,7 +113,7 @@ def outcome(client, url):
         return str(error), 0
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("runs", [10, 200])
 def test_random_faults_of_one_of_two_machines_change_no_bit(runs, tmp_path, undisturbed):
     generator = random.Random(SEED)

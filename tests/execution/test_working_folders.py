@@ -72,7 +72,7 @@ def test_a_new_store_is_written_where_its_path_led_at_first(here, monkeypatch):
     assert (here / "new.zarr/zarr.json").exists()
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_workers_in_another_folder_read_and_write_the_same_store(here, elsewhere):
     (here / "first.toml").write_text(TEXT)
     first = sweep.run("first.toml", store="runs/first.zarr", client=elsewhere)
@@ -85,7 +85,7 @@ def test_workers_in_another_folder_read_and_write_the_same_store(here, elsewhere
     assert not list(Path("elsewhere").iterdir())
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_files_of_a_pipeline_are_found_from_another_folder(elsewhere):
     Path("files").mkdir()
     cv2.imwrite("files/grey.png", np.full((480, 640), 128, dtype=np.uint8))

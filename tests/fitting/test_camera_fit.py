@@ -14,7 +14,7 @@ def found(tmp_path_factory):
     return fitted(tmp_path_factory.mktemp("fit"), EFFECTS, 7, 6)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
     terms = terms_of(found)
     for name, value in TRUTH.items():
@@ -30,7 +30,7 @@ def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
     assert np.allclose(deviations[1::2], 2.0, rtol=0.1)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
     path = tmp_path / "scene.toml"
     path.write_text(found.text)
@@ -41,7 +41,7 @@ def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
     assert "# Fitted to 36 markers in 6 photographs" in found.text
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path):
     plain = fitted(tmp_path, PLAIN, 8, 4, 4)
     terms = terms_of(plain)
@@ -52,17 +52,6 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
     for name in absent:
         assert f"#   left out: {terms[name].name}: {terms[name].reason}\n" in plain.text
         assert name not in plain.found.scene
-
-
-@pytest.mark.long
-def test_one_photograph_gives_values_without_intervals(tmp_path):
-    one = fitted(tmp_path, EFFECTS, 9, 1, 4)
-    terms = terms_of(one)
-    assert terms["white"].estimate.value == pytest.approx(175.0, abs=2.0)
-    assert np.isnan(terms["white"].estimate.low)
-    assert terms["sharpening"].reason == "too few photographs to judge"
-    assert not terms["geometry_px"].kept
-    assert "from 4 on" in one.found.lines[0]
 
 
 @pytest.mark.parametrize(("change", "message"), [

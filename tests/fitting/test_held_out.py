@@ -39,7 +39,7 @@ def test_an_effect_is_left_out_where_errors_are_clearly_nearer_to_those_of_photo
         "nearer": True, "idle": True, "open": True, "moved": False}
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_scene_is_checked_against_photographs_that_were_not_fitted(tmp_path, capsys):
     # The shifts are so large that their absence is seen: with 0.15 px, as in EFFECTS, ten
     # photographs do not always tell that they matter.

@@ -42,7 +42,7 @@ def photograph(generator):
     return Residuals(np.zeros(2), fields), squares
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_intervals_of_size_and_reach_hold_what_was_drawn():
     generator = np.random.default_rng(3)
     photographs = [photograph(generator) for _ in range(8)]

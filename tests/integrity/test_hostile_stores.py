@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import sweep
-from support.store_files import edit_receipt, edit_root
+from support.store_files import edit_root
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import SweepError
@@ -98,16 +98,6 @@ def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_
         assert f"{copied}: store format {number}" in said
         assert "sweep run PIPELINE --store NEW" in said
         assert said.count("\n") == 1
-
-
-def test_failures_steer_no_terminal(copied, capsys):
-    failure = {"at": "trial=0", "kind": "failed", "stage": "detection",
-               "text": "Error: \x1b[2J\x1b]0;title\x07"}
-    edit_receipt(copied, 0, lambda content: content.update(failures=[failure]))
-    assert main(["status", str(copied)]) == 0
-    said = capsys.readouterr()
-    assert "Error" in said.out
-    assert all(line.isprintable() for line in (said.out + said.err).splitlines())
 
 
 def test_store_that_is_a_link_is_a_store(copied, tmp_path):

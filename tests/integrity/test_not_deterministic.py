@@ -1,14 +1,13 @@
 """A plug-in whose answers change is named; verify and repair do not take it for damage in turns."""
 
 import json
-from pathlib import Path
 from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
 
-from support.here import Here, calls_here
+from support.here import Here
 from sweep import cli
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
@@ -85,17 +84,17 @@ def made(tmp_path):
         store = tmp_path / "grid.zarr"
         execute(Pipeline.from_toml(tmp_path / "grid.toml"), store, workers=None)
         return str(store)
-    with calls_here(), mock.patch("sweep.isolation.crash_isolation.Child", Here):
+    with mock.patch("sweep.isolation.crash_isolation.Child", Here):
         yield run
 
 
 @pytest.mark.parametrize(("detector", "solvers", "named"), [
     ("opencv", ["ippe_square", "mine:random"], "mine:random"),
     ("opencv", ["mine:counting", "mine:right"], "mine:counting"),
-    pytest.param("opencv", ["mine:batched"], "mine:batched", marks=pytest.mark.long),
+    pytest.param("opencv", ["mine:batched"], "mine:batched", marks=pytest.mark.evidence),
     pytest.param("opencv", ["mine:random", "mine:counting"], "mine:random, mine:counting",
-                 marks=pytest.mark.long),
-    pytest.param("mine:search", ["mine:right"], "mine:search", marks=pytest.mark.long),
+                 marks=pytest.mark.evidence),
+    pytest.param("mine:search", ["mine:right"], "mine:search", marks=pytest.mark.evidence),
 ])
 def test_what_changes_from_call_to_call_is_named_and_no_block_is_damaged(
     detector, solvers, named, made, capsys
@@ -110,13 +109,6 @@ def test_what_changes_from_call_to_call_is_named_and_no_block_is_damaged(
     out = capsys.readouterr().out
     assert f"not deterministic: {named}" in out
     assert "damaged" not in out
-
-
-def test_damage_beside_it_is_still_damage(made):
-    store = made("opencv", "mine:random")
-    flags = next(path for path in Path(store, "detection/c").rglob("*") if path.is_file())
-    flags.write_bytes(b"nothing")
-    assert any(each.where.startswith("detection/c") for each in verify(store).damage)
 
 
 def test_a_changed_number_of_a_plug_in_that_is_deterministic_is_damage(made, monkeypatch):

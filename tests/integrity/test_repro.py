@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,15 +10,12 @@ import pytest
 import xarray as xr
 import zarr
 
-from support.poison import Poison, poisoned
+from support.stores import by_hand
 from sweep.cli import main
 from sweep.evaluation.results import Failure
-from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.store.blocks import begin_block
-from sweep.store.lifecycle import create_store
 from sweep.store.outcome import MAX_CHARACTERS, recorded
 
 TEXT = """
@@ -42,45 +38,14 @@ trial = 3
 EXTENTS = (1, 1, 3)
 """Block k has the scenes 3 k to 3 k + 2."""
 
-POISONS = [
-    Poison(4, "scene", "raise"),
-    Poison(7, "detection", "raise", (("cornerRefinementMethod", "subpix"),)),
-    Poison(8, "estimation", "abort", (), (("solver", "iterative"),)),
-]
-
-"""The scene 8, which ends its process."""
-
 NEAR = "distance_m=0.2,distortion=[],cornerRefinementMethod=subpix,solver=iterative,trial=1"
 """The scene 1, in which the marker is found."""
 
 
-@contextmanager
-def poison(folder):
-    """Have children of this process poisoned."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in poisoned(POISONS, folder / "notes.jsonl").items():
-            patch.setenv(name, value)
-        yield
-
-
 @pytest.fixture(scope="module")
-def pipeline():
-    return Pipeline.from_text(TEXT, name="seen")
-
-
-@pytest.fixture(scope="module")
-def finished(pipeline, tmp_path_factory):
-    """A store of which three scenes failed or crashed."""
-    folder = tmp_path_factory.mktemp("seen")
-    url = str(folder / "seen.zarr")
-    store = create_store(url, pipeline, EXTENTS)
-    for number, block in enumerate(store.blocks):
-        if number in (1, 2):
-            # What was begun before is computed in a child, which is poisoned.
-            begin_block(store, block)
-        with poison(folder):
-            compute_block(url, store.run_id, block)
-    close(store)
+def finished(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("seen") / "seen.zarr")
+    close(by_hand(url, Pipeline.from_text(TEXT, name="seen"), EXTENTS))
     return Path(url)
 
 
@@ -89,7 +54,6 @@ def copied(finished, tmp_path):
     return Path(shutil.copytree(finished, tmp_path / "copied.zarr"))
 
 
-@pytest.mark.long
 def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, capsys):
     out, pipeline = tmp_path / "scene.png", tmp_path / "seen.toml"
     pipeline.write_text(TEXT)
@@ -120,7 +84,6 @@ def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, caps
     np.testing.assert_array_equal(image, cv2.imread(str(shown), cv2.IMREAD_UNCHANGED))
 
 
-@pytest.mark.long
 def test_number_that_was_changed_is_named(copied, tmp_path, capsys):
     array = zarr.open_array(f"{copied}/normal_error_deg", mode="r+")
     assert array.shape == (2, 2, 2, 2, 3)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import sweep
-from support.here import calls_here
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus
 
@@ -14,16 +13,16 @@ from sweep.measure.flags import DetectionStatus
 @pytest.mark.parametrize(
     ("pose", "axes"),
     [pytest.param({}, {"distance_m": [0.01, 0.3], "tilt_deg": [0, 80, 180]},
-                  marks=pytest.mark.long),
+                  marks=pytest.mark.evidence),
      ({"camera_yaw_deg": 180}, {"marker_x_m": [-0.3, 0, 0.3]}),
      pytest.param({"marker_yaw_deg": 180, "jitter_px": 1},
                   {"camera_x_m": [0, 0.3, 0.6], "marker_x_m": [0.3], "trial": 2},
-                  marks=pytest.mark.long)],
+                  marks=pytest.mark.evidence)],
     ids=["a corner behind", "the marker behind", "at the camera's centre"],
 )
 def test_a_store_with_markers_behind_the_camera_is_sound(pose, axes, tmp_path):
     url = str(tmp_path / "behind.zarr")
-    with calls_here(), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("error")
         results = sweep.run({"marker": {"size_m": 0.05}, "pose": pose, "axes": axes}, store=url)
     flags = results["detection"].to_numpy()

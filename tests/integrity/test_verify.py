@@ -6,7 +6,6 @@ import random
 import shutil
 import subprocess
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,7 @@ import zarr
 
 import sweep
 from support.flags_and_numbers import contradictions
-from support.lengths import lengths
-from support.poison import Poison, poisoned
+from support.poison import Poison, poisoned, raising
 from support.store_files import edit_receipt, editable, files, see_same
 from support.stores import by_hand
 from sweep.errors import StoreError
@@ -52,8 +50,6 @@ EXTENTS = (2, 2)
 
 FAILED = Poison(12, "scene", "raise")
 """A scene of block 4."""
-
-FAILED_BLOCK = 4
 
 RECEIPT = "commits/receipt/c"
 
@@ -103,28 +99,14 @@ def pipeline():
     return Pipeline.from_text(TEXT, name="small")
 
 
-@contextmanager
-def poison(log, poisons=(FAILED,)):
-    """Have children of this process poisoned."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in poisoned(poisons, log).items():
-            patch.setenv(name, value)
-        yield
-
-
 @pytest.fixture(scope="session")
 def sound(pipeline, tmp_path_factory):
     """A finished store with a scene that raised; nobody writes to it."""
     folder = tmp_path_factory.mktemp("sound")
     url = str(folder / "sound.zarr")
     store = create_store(url, pipeline, EXTENTS)
-    for number, block in enumerate(store.blocks):
-        if number == FAILED_BLOCK:
-            # What was begun before is computed in a child, which is poisoned.
-            begin_block(store, block)
-            with poison(folder / "notes.jsonl"):
-                compute_block(url, store.run_id, block)
-        else:
+    with raising([FAILED], folder / "notes.jsonl"):
+        for block in store.blocks:
             compute_block(url, store.run_id, block)
     close(store)
     return Path(url)
@@ -141,11 +123,9 @@ def here(monkeypatch, tmp_path):
     computed = []
 
     def recompute(store, numbers, **_):
-        for number in numbers:
-            computed.append(number)
-            with poison(tmp_path / "notes.jsonl"):
-                if number == FAILED_BLOCK:
-                    begin_block(store, store.blocks[number])
+        with raising([FAILED], tmp_path / "notes.jsonl"):
+            for number in numbers:
+                computed.append(number)
                 compute_block(store.url, store.run_id, store.blocks[number])
 
     monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
@@ -228,15 +208,13 @@ def test_sound_store_is_sound_and_every_file_is_accounted_for(sound):
 
 
 def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
-    with poison(tmp_path / "notes.jsonl"):
+    with raising([FAILED], tmp_path / "notes.jsonl"):
         found = verify(str(sound), 40)
     assert (found.damage, found.not_sampled) == ([], "")
     assert 8 <= found.sampled <= 15
 
 
-@pytest.mark.parametrize("manner", [
-    delete, pytest.param(spoil, marks=pytest.mark.long), pytest.param(shorten,
-                                                                      marks=pytest.mark.long)])
+@pytest.mark.parametrize("manner", [delete, spoil, shorten])
 def test_many_damages_at_once_are_named_and_mended(manner, sound, copied, here):
     generator = random.Random(2)
     wanted = set(KINDS.values())
@@ -261,7 +239,6 @@ def test_store_whose_root_is_lost_is_run_again(change, copied):
         assert "\n" not in str(told.value)
 
 
-@pytest.mark.long
 def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, here, tmp_path):
     wanted = set()
     # Two exchanged.
@@ -286,46 +263,6 @@ def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, h
     see_repaired(copied, sound, wanted, here)
 
 
-@pytest.mark.long
-def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
-    extra = [
-        f"{RECEIPT}/6", f"{RECEIPT}/4000", f"{RECEIPT}/00", f"{RECEIPT}/x",
-        "detection/c/0/0/0.0123456789ab.partial", "detection/c/7/0/0", "cost/0123.partial",
-        "commits/receipt/begun/3",
-    ]
-    for key in extra:
-        (copied / key).parent.mkdir(exist_ok=True, parents=True)
-        shutil.copy(copied / RECEIPT / "0", copied / key)
-    found = verify(str(copied), 0)
-    assert found.damage == []
-    assert set(found.left_over) == set(extra)
-    see_repaired(copied, sound, set(), here)
-
-
-@pytest.mark.long
-def test_attributes_and_coordinates_that_were_changed_are_named_and_mended(
-    sound, copied, here
-):
-    group = zarr.open_group(str(copied), mode="r+", zarr_format=3, use_consolidated=False)
-    group["detection"].attrs["long_name"] = "something else"
-    group["side_px"].attrs["units"] = "m"
-    group.attrs["title"] = "Another"
-    group["side_px"][1] = 61.0
-    group["solver"][:] = np.array(["p3p", "sqpnp"], dtype=object)
-    wanted = {
-        (key, None) for key in (
-            "detection/zarr.json", "side_px/zarr.json", "zarr.json", "side_px/c/0", "solver/c/0",
-        )
-    }
-    assert named(verify(str(copied), 0)) == wanted
-    see_repaired(copied, sound, wanted, here)
-    assert json.loads((copied / "zarr.json").read_text())["attributes"]["title"] == (
-        "Größen, klein"
-    )
-    for key in ("detection/zarr.json", "side_px/zarr.json"):
-        assert json.loads((copied / key).read_text()) == json.loads((sound / key).read_text())
-
-
 def test_metadata_in_one_place_is_checked(copied):
     # xarray.open_zarr reads these in place of the arrays' own.
     root = json.loads((copied / "zarr.json").read_text())
@@ -334,7 +271,6 @@ def test_metadata_in_one_place_is_checked(copied):
     assert named(verify(str(copied), 0)) == {("zarr.json", None)}
 
 
-@pytest.mark.long
 def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, tmp_path, here):
     url = tmp_path / "begun.zarr"
     store = create_store(str(url), pipeline, EXTENTS)
@@ -355,9 +291,7 @@ def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, t
     mended = repair(str(url), 0)
     assert (mended.damage, here, mended.blocks_done) == ([], [3], 3)
     for number in (2, 4, 1):
-        if number == FAILED_BLOCK:
-            begin_block(store, store.blocks[number])
-        with poison(tmp_path / "notes.jsonl"):
+        with raising([FAILED], tmp_path / "notes.jsonl"):
             compute_block(str(url), store.run_id, store.blocks[number])
     close(open_store(str(url), "r+"))
     found = verify(str(url), 0)
@@ -393,13 +327,13 @@ def elsewhere(urls, log):
     return json.loads(ran.stdout)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
     sound, copied, tmp_path
 ):
     edit_values(copied, "rotation_error_rad", lambda values: 1.01 * values, receipts_too=True)
     assert verify(str(copied), 0).damage == []
-    with poison(tmp_path / "notes.jsonl"):
+    with raising([FAILED], tmp_path / "notes.jsonl"):
         damage = verify(str(copied), 40).damage
     assert damage
     assert all(one.where.startswith("--at ") for one in damage)
@@ -418,7 +352,7 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
 SMALL = Path(__file__).parents[2] / "pipelines"
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize(
     "path",
     [pytest.param(path, id=path.stem)
@@ -446,8 +380,7 @@ def test_stores_of_all_pipelines_are_sound(path, tmp_path):
     assert contradictions(store) == []
 
 
-@pytest.mark.long
-@lengths(8, 80)
+@pytest.mark.parametrize("count", [8, pytest.param(80, marks=pytest.mark.evidence)])
 def test_random_damages_are_all_found_and_all_mended(count, sound, tmp_path, here):
     seed = int(os.environ.get("SWEEP_SEED", random.SystemRandom().randrange(1 << 32)
                               if count > 8 else "20"))
@@ -474,3 +407,18 @@ def test_random_damages_are_all_found_and_all_mended(count, sound, tmp_path, her
         shutil.rmtree(url)
     assert found_in_all == count
     print(f"{count} damages among {len(every)} files: all found, all mended")
+
+
+def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
+    extra = [
+        f"{RECEIPT}/6", f"{RECEIPT}/4000", f"{RECEIPT}/00", f"{RECEIPT}/x",
+        "detection/c/0/0/0.0123456789ab.partial", "detection/c/7/0/0", "cost/0123.partial",
+        "commits/receipt/begun/3",
+    ]
+    for key in extra:
+        (copied / key).parent.mkdir(exist_ok=True, parents=True)
+        shutil.copy(copied / RECEIPT / "0", copied / key)
+    found = verify(str(copied), 0)
+    assert found.damage == []
+    assert set(found.left_over) == set(extra)
+    see_repaired(copied, sound, set(), here)

@@ -2,16 +2,15 @@
 
 import json
 
-import numpy as np
 import pytest
 import xarray as xr
 
-from support.blocks import run_cells
 from support.commands import command
-from sweep.errors import MachineFaultError
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+
+pytestmark = pytest.mark.system
+
 
 PLUGINS = '''
 import os
@@ -82,32 +81,7 @@ def pipeline_of(folder, *detectors, solver="iterative"):
     return Pipeline.from_toml(folder / "grid.toml")
 
 
-def isolated(pipeline):
-    (settings,) = (len(axis) for axis in pipeline.axes if axis.name == "detector")
-    need = np.ones((3, settings, 2), dtype=bool)
-    return run_cells_isolated(pipeline, [np.arange(3)], need, 200.0)
-
-
-@pytest.mark.long
-def test_death_that_does_not_come_again_is_no_result(tmp_path):
-    cells = isolated(pipeline_of(tmp_path, "second"))
-    assert cells.failures == []
-    assert all((column == DetectionStatus.detected).all() for column in cells.columns["detection"])
-    assert all((column == EstimateStatus.solved).all() for column in cells.columns["estimate"])
-    undisturbed = run_cells(pipeline_of(tmp_path), [np.arange(3)])
-    for variable, columns in undisturbed.columns.items():  # OpenCV's, which come first
-        for column, other in zip(columns, cells.columns[variable], strict=False):
-            assert column.tobytes() == other.tobytes(), variable
-
-
-@pytest.mark.long
-def test_beside_a_death_by_chance_none_is_called_a_crash(tmp_path):
-    with pytest.raises(MachineFaultError, match=r"not deterministic: --at .*detector=") as no:
-        isolated(pipeline_of(tmp_path, "always", "third"))
-    assert "SIGABRT, and not when it was repeated" in str(no.value)
-
-
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize(("detectors", "solver"), [(["second"], "iterative"),
                                                    ([], "chance:SOLVER")])
 def test_a_run_with_a_plug_in_that_dies_by_chance_keeps_all_of_opencv_s(

@@ -14,6 +14,8 @@ from sweep.errors import PipelineError, StoreError
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 
+pytestmark = pytest.mark.system
+
 
 def test_child_calls_functions_and_tells_what_they_raise():
     with Child() as child:
@@ -34,10 +36,10 @@ def test_child_calls_functions_and_tells_what_they_raise():
     ("function", "arguments", "limit_s", "how"),
     [
         (signal.raise_signal, (signal.SIGSEGV,), 60, "SIGSEGV"),
-        pytest.param(os.abort, (), 60, "SIGABRT", marks=pytest.mark.long),
+        pytest.param(os.abort, (), 60, "SIGABRT", marks=pytest.mark.evidence),
         (signal.raise_signal, (signal.SIGKILL,), 60, "SIGKILL"),
         (os._exit, (3,), 60, "exit status 3"),
-        pytest.param(time.sleep, (600,), 0.5, "time limit of 0.5 s", marks=pytest.mark.long),
+        pytest.param(time.sleep, (600,), 0.5, "time limit of 0.5 s", marks=pytest.mark.evidence),
         # It keeps the interpreter's lock.
         (pow, (3, 10**9), 0.5, "time limit of 0.5 s"),
     ],
@@ -46,13 +48,6 @@ def test_child_calls_functions_and_tells_what_they_raise():
 def test_child_that_dies_says_how(function, arguments, limit_s, how):
     with Child() as child, pytest.raises(ChildDiedError, match=how):
         child.call(function, *arguments, limit_s=limit_s)
-
-
-def test_child_that_is_gone_is_told_too():
-    child = Child()
-    child.close()
-    with pytest.raises(ChildDiedError):
-        child.call(pow, 2, 2, limit_s=60)
 
 
 def test_child_runs_nothing_that_lies_in_the_current_folder(tmp_path):

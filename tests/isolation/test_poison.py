@@ -18,6 +18,9 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store
 
+pytestmark = pytest.mark.system
+
+
 TEXT = """
 title = "Scenes of which some are poisoned"
 seed = 11
@@ -230,7 +233,7 @@ MANY = [
 ]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     pipeline, clean, tmp_path
 ):
@@ -251,7 +254,7 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     see_status(url, pipeline, poisons)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean, tmp_path):
     url = str(tmp_path / "poisoned.zarr")
     # It keeps the interpreter's lock, so that no other thread of its process can act.
@@ -314,7 +317,7 @@ def thousands(tmp_path_factory):
         return pipeline, opened.load(), seconds
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("poisons", AMONG_THOUSANDS.values(), ids=AMONG_THOUSANDS)
 def test_poison_among_ten_thousand_scenes_costs_itself_alone(poisons, thousands, tmp_path):
     pipeline, reference, undisturbed_s = thousands

@@ -1,7 +1,7 @@
 """Which cells of a small upright marker the detector misreads, and where markers are lost for it.
 
 Against OpenCV: its warp of rendered squares, its detector, and sweeps that the model was not made
-from (``pytest -m long -s tests/measure/test_bit_reading.py``:
+from (``pytest -m evidence -s tests/measure/test_bit_reading.py``:
 576,000 poses). Draws are functions of the pipeline's seed: no test here is up to chance.
 """
 

@@ -67,13 +67,6 @@ def test_a_fault_is_one_line(folder, tmp_path, name, options, expected):
     assert "\n" not in str(caught.value)
 
 
-def test_a_camera_of_another_resolution_is_refused(folder, tmp_path):
-    path = tmp_path / "large.json"
-    path.write_text(camera((720, 540), (840.0, 840.0, 360.0, 265.0)))
-    with pytest.raises(ArgumentError, match="holds for 720 x 540, but the photographs are 360"):
-        prepare([folder / "shots"], path, board=folder / "board.toml", home=tmp_path)
-
-
 def test_what_is_left_out_and_converted_is_said(folder, tmp_path):
     shots = tmp_path / "shots"
     shots.mkdir()

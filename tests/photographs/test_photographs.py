@@ -6,7 +6,6 @@ import pytest
 
 import sweep
 from support.board_photographs import BOARD, POSES, SIZE, VIEW, board, marker_poses, write_set
-from support.here import calls_here
 from sweep.analysis import error_statistics
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
@@ -22,11 +21,10 @@ def made(tmp_path_factory):
     cv2.fillConvexPoly(first, np.rint(pixels).astype(np.int32), 210)
     cv2.imwrite(str(shots / "shot0.png"), first)
     (shots / "notes.txt").write_text("not a photograph")
-    with calls_here():
-        results = sweep.photos(
-            shots, camera=folder / "camera.json", board=folder / "board.toml",
-            settings=['cornerRefinementMethod=["none", "subpix"]'], store=folder / "shots.zarr",
-        )
+    results = sweep.photos(
+        shots, camera=folder / "camera.json", board=folder / "board.toml",
+        settings=['cornerRefinementMethod=["none", "subpix"]'], store=folder / "shots.zarr",
+    )
     return folder, results.load()
 
 
@@ -37,7 +35,7 @@ def true_corners(number):
     return points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
     _, results = made
     errors = []
@@ -104,7 +102,7 @@ def test_corners_and_poses_are_those_of_a_plain_loop_over_the_files(made):
     assert compared == shown - 2  # the covered marker
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_photograph_is_the_draw_of_every_interval(made):
     _, results = made
     table = error_statistics(results, per="cornerRefinementMethod")
@@ -121,7 +119,6 @@ def test_a_photograph_is_the_draw_of_every_interval(made):
         assert np.isclose(table.range_bias_percent_high[j] - mean, half, rtol=1e-6)
 
 
-@pytest.mark.long
 def test_the_photographs_are_verified_by_their_digests(made):
     folder, _ = made
     store = str(folder / "shots.zarr")

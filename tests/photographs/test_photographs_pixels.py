@@ -9,7 +9,6 @@ from scipy.stats import chi2
 
 import sweep
 from support.board_photographs import POSES, board, marker_poses, write_set
-from support.here import calls_here
 from sweep.errors import PluginError
 from sweep.experiment.photographs import read_record
 from sweep.measure.flags import EstimateStatus
@@ -23,12 +22,11 @@ NUMBERS = (1, 2)
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pixels")
     shots = write_set(folder, [POSES[number] for number in NUMBERS])
-    with calls_here():
-        results = sweep.photos(
-            shots, camera=folder / "camera.json", board=folder / "board.toml",
-            settings=['solver="photometric_real"', 'cornerRefinementMethod="subpix"'],
-            store=folder / "shots.zarr",
-        )
+    results = sweep.photos(
+        shots, camera=folder / "camera.json", board=folder / "board.toml",
+        settings=['solver="photometric_real"', 'cornerRefinementMethod="subpix"'],
+        store=folder / "shots.zarr",
+    )
     return folder, results.load()
 
 
@@ -51,7 +49,7 @@ def squared_errors(results):
     return np.array(rows)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
     """Each of the six components, whose squares are those of a normal distribution."""
     _, results = made
@@ -63,7 +61,7 @@ def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
     assert (squares.sum(axis=0) > chi2.ppf(ALARM / 6, len(squares))).all()
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_the_board_is_in_the_record(made, tmp_path):
     folder, _ = made
     path = folder / "shots.photographs.npz"

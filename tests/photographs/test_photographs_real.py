@@ -15,7 +15,7 @@ from sweep.photographs.truth import stereo_of_file
 FOLDER = os.environ.get("SWEEP_PHOTOS", "")
 
 pytestmark = [
-    pytest.mark.long,
+    pytest.mark.evidence,
     pytest.mark.skipif(
         not Path(FOLDER, "charuco_480").is_dir(),
         reason="SWEEP_PHOTOS does not name the folder of the sets of photographs",

@@ -3,15 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-import xarray as xr
 
 from support.blocks import run_cells
 from support.board_photographs import POSES, SIZE, VIEW, board, write_set
 from support.board_scenes import BoardPose, board_scene, levels_of
-from support.here import calls_here
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import scene_image
-from sweep.execution.runner import execute
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.photographs import read_record
@@ -19,7 +16,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.photographs.prepare import prepare
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.store.lifecycle import open_dataset
 
 SCENE = {
     "black": 35, "white": 210, "blur_px": {"normal": [0.6, 0.05]}, "noise_grey": 2.0,
@@ -99,18 +95,6 @@ def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_i
     cv2.fillConvexPoly(inside, np.rint(pixels).astype(np.int32), 1)
     difference = np.abs(scene_image(twin, whole_frame=True) - whole)[inside > 0]
     assert difference.max() < 1.0  # rounding
-
-
-@pytest.mark.long
-def test_blocks_of_any_size_give_the_same_store_without_the_photographs(prepared, tmp_path):
-    twins = twin_pipeline(prepared, SCENE)
-    with calls_here():
-        stores = [tmp_path / "small.zarr", tmp_path / "large.zarr"]
-        for store, block_s in zip(stores, (0.01, None), strict=True):
-            execute(twins, str(store), workers=1, block_s=block_s)
-    small, large = (open_dataset(str(store)).load() for store in stores)
-    xr.testing.assert_identical(small.drop_attrs(), large.drop_attrs())
-    assert small.photograph.values.tolist() == ["shot0.png", "shot1.png", "shot2.png"]
 
 
 def test_a_scene_of_another_resolution_is_said(prepared, tmp_path, capsys):

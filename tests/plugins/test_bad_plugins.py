@@ -8,13 +8,10 @@ import time
 import numpy as np
 import pytest
 
-import sweep
 from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
 from sweep.execution.block_task import other_here
-from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child
 from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.loading import call
@@ -122,12 +119,6 @@ def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
         signal.signal(signal.SIGINT, before)
 
 
-def test_what_a_plug_in_prints_does_not_mix_with_results(pipeline, capfd):
-    cells = run_cells(pipeline("prints"), [])
-    assert not cells.failures
-    assert capfd.readouterr() == ("", "found nothing\n")
-
-
 @pytest.mark.parametrize(("name", "told"), [
     ("never_made", "raises ZeroDivisionError: division by zero"),
     ("no_function", "make returns a int, not a function"),
@@ -136,20 +127,6 @@ def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, name, told):
     with pytest.raises(PluginError) as refused:
         check_plugins(Here(), pipeline(name))
     assert str(refused.value) == f"bad:{name}: {told}"
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "told"), [
-    ("dies", "SIGABRT"), ("sleeps", "time limit of 2 s"),
-])
-def test_a_detector_that_ends_its_process_or_never_returns_refuses_the_run(pipeline, name, told):
-    with Child() as child:
-        with pytest.raises(PluginError) as refused:
-            check_plugins(child, pipeline(name), limit_s=2)
-        assert str(refused.value) == (
-            f"detector bad:{name}: ends its process before the first pose: {told}"
-        )
-        assert child.call(pow, 2, 10, limit_s=60) == 1024  # it was started again
 
 
 @pytest.mark.parametrize(("source", "told"), [
@@ -292,15 +269,6 @@ E = EffectPlugin(apply=lambda light, patch: {result}, settings=Settings)
     assert told in failure.text.splitlines()[-1]
 
 
-def test_what_compiled_code_prints_on_import_goes_to_the_standard_error(tmp_path, capfd):
-    (tmp_path / "loud.py").write_text(
-        'import os\nos.write(1, b"compiled\\n")\nprint("python")\nD = print\n'
-    )
-    text = '[pose]\nside_px = 24\n[detector]\ndetector = "loud:D"\n'
-    assert Pipeline.from_text(text, folder=tmp_path).plugins
-    assert capfd.readouterr() == ("", "compiled\npython\n")
-
-
 def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
     (tmp_path / "mine.py").write_text("def D(settings, family): return lambda image: ([], [])\n")
     text = '[pose]\nside_px = 24\n[axes]\ndetector = ["opencv", "mine:D"]\n'
@@ -319,15 +287,3 @@ def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
     (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
     (line,) = other_here(bad, begun)
     assert "bad.py as it was when the run began" in line
-
-
-@pytest.mark.long
-def test_of_several_detectors_the_one_that_aborts_loses_only_its_own_cells(tmp_path):
-    (tmp_path / "bad.py").write_text(DETECTORS)
-    text = GRID.format(name="aborts").replace('["opencv", ', '["opencv", "bad:prints", ')
-    (tmp_path / "grid.toml").write_text(text + "tilt_deg = [0, 20, 40]\n")
-    execute(Pipeline.from_toml(tmp_path / "grid.toml"), tmp_path / "grid.zarr", workers=2)
-    flags = sweep.open(tmp_path / "grid.zarr").detection.transpose("detector", ...).values
-    assert (flags[0] == DetectionStatus.detected).all()
-    assert (flags[1] == DetectionStatus.no_candidate).all()
-    assert (flags[2] == DetectionStatus.crashed).all()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from support.blocks import run_cells
 from support.solving import of_markers
@@ -19,7 +18,6 @@ from sweep.model.scene import build_scenes
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
 
-GUIDE = (FOLDER / "README.md").read_text()
 
 SCENE = """
 [camera]
@@ -40,13 +38,6 @@ roll_deg = 12
 
 def pipeline_of(text, **options):
     return Pipeline.from_text(text, folder=FOLDER, **options)
-
-
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.[pt]*")), ids=lambda path: path.name)
-def test_the_guide_links_it_and_shows_what_it_holds(path):
-    assert f"]({path.name})" in GUIDE
-    if f"<!-- file: {path.name} -->\n" in GUIDE:
-        assert path.read_text() + "```\n" in GUIDE
 
 
 def test_the_pipeline_runs_with_all_four():

@@ -16,7 +16,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from tests.plugins.test_detector_plugins import MINE
-from tests.support.here import calls_here
 from tests.support.stores import by_hand
 
 TEXT = """
@@ -41,8 +40,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plugged")
     (folder / "mine.py").write_text(MINE)
     (folder / "grid.toml").write_text(TEXT)
-    with calls_here():
-        execute(Pipeline.from_toml(folder / "grid.toml"), folder / "grid.zarr", workers=None)
+    execute(Pipeline.from_toml(folder / "grid.toml"), folder / "grid.zarr", workers=None)
     return folder
 
 
@@ -97,20 +95,7 @@ def test_a_store_is_read_without_its_plug_in(without, capsys):
         Pipeline.from_toml(without / "grid.toml")
 
 
-@pytest.mark.long
-def test_a_store_is_reported_and_verified_without_its_plug_in(without, capsys):
-    store = str(without / "grid.zarr")
-    with calls_here():
-        assert main(["report", store, "--format", "md", "-o", str(without / "report.md")]) == 0
-        capsys.readouterr()
-        assert main(["verify", store]) == 0
-        assert "no scene recomputed" in capsys.readouterr().out
-        assert main(["repro", store]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "expected the file mine.py in" in line
-
-
-@pytest.mark.long
+@pytest.mark.evidence
 def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
     store = str(made / "grid.zarr")
     assert main(["verify", store, "--sample", "2"]) == 0

@@ -25,7 +25,7 @@ def told_apart(seed, trials, normal):
     return overall(differences_of(first, second))
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("trials", [30, 100, 400])
 @pytest.mark.parametrize("law", DRAWS)
 def test_two_equal_configurations_are_seldom_told_apart(law, trials):

@@ -1,8 +1,6 @@
 """Files that commands write: whole, through links, and never in place of a device."""
 
-import os
 import stat
-import threading
 from pathlib import Path
 
 import pytest
@@ -59,19 +57,6 @@ def test_a_device_is_written_into_and_stays(tmp_path):
             write_output_file(path, b"text")
         assert path.is_char_device()
     assert full.is_symlink()
-
-
-def test_a_pipe_is_written_into(tmp_path):
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    read = []
-    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
-    reader.start()
-    content = bytes(300_000)
-    check_output_file(pipe)
-    write_output_file(pipe, content)
-    reader.join(10)
-    assert read == [content]
 
 
 def test_what_cannot_be_written_is_told_in_a_line(tmp_path):

@@ -9,12 +9,11 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report.answer import Answer, Tile
 from sweep.report.figure import Figure as ReportFigure
-from sweep.report.figure import Panel, Series, value_scale
+from sweep.report.figure import Panel, Series
 from sweep.report.figures import interval_note
-from sweep.report.scenes import FAILURES, Scene
+from sweep.report.scenes import Scene
 from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
 from sweep.report.write_report import page
 
@@ -47,15 +46,6 @@ def test_all_text_of_a_store_is_escaped():
 
 
 # Flags.
-
-def test_every_flag_of_a_counted_pose_that_is_not_solved_is_a_kind_of_scene():
-    assert [(type(flag), flag.name) for flag in FAILURES] == [
-        *((DetectionStatus, name)
-          for name in ("wrong_id", "rejected", "no_candidate", "failed", "crashed")),
-        *((EstimateStatus, name) for name in (
-            "solver_failed", "not_converged", "not_explained", "too_few_points", "failed",
-            "crashed")),
-    ]
 
 
 # Tables.
@@ -135,6 +125,15 @@ def test_names_are_rows_of_dots_never_joined_and_marked_ones_are_diamonds():
             ("o", [10.0]), ("D", [30.0])]
 
 
+def test_intervals_are_said_to_be_over_what_was_drawn():
+    for coordinates, words in (
+        ({}, "over the random draws, conditional on the grid"),
+        ({"photographs": "shots"}, "over the photographs, each with all its markers one draw"),
+    ):
+        data = SimpleNamespace(results=xr.Dataset(coords=coordinates))
+        assert words in interval_note(data)
+
+
 @pytest.mark.parametrize(("values", "scale"), [
     (np.geomspace(0.05, 1, 8), "log"), (np.array([0.5, 1, 2, 4]), "log"),
     (np.linspace(3, 57, 10), "linear"), (np.linspace(0, 60, 4), "linear"),
@@ -144,21 +143,3 @@ def test_values_that_grow_by_factors_are_on_a_logarithmic_axis(values, scale):
     axes = Figure().subplots()
     Panel("", [Series.of("", values, np.ones(len(values)))], "x", RATE).draw(axes)
     assert axes.get_xscale() == scale
-
-
-def test_errors_of_rounding_do_not_compress_the_others():
-    y = Series.of("", np.arange(4.0), [1e-14, 0.02, 0.5, 3.0])
-    logarithmic, (low, high) = value_scale([y], share=False)
-    assert logarithmic
-    assert 1e-3 < low < 0.02
-    assert 3 < high < 10
-    assert not value_scale([y], share=False, level=0.0)[0]
-
-
-def test_intervals_are_said_to_be_over_what_was_drawn():
-    for coordinates, words in (
-        ({}, "over the random draws, conditional on the grid"),
-        ({"photographs": "shots"}, "over the photographs, each with all its markers one draw"),
-    ):
-        data = SimpleNamespace(results=xr.Dataset(coords=coordinates))
-        assert words in interval_note(data)

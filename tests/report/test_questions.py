@@ -60,7 +60,7 @@ def asked(name, folder, trials):
     return json.loads(out)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_the_first_sentence_answers_the_question(name, tmp_path):
     shown = asked(name, tmp_path, 8 if name == "focal_length" else 150)

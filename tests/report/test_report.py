@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import xarray as xr
 
 from support.reports import CAMERA, FULL, command, made
 from sweep.analysis import (
@@ -30,7 +29,7 @@ from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.scenes import scenes_of
 from sweep.report.table import number
 from sweep.report.write_report import write_report
-from sweep.store.lifecycle import open_dataset, open_store, write_group
+from sweep.store.lifecycle import open_dataset, open_store
 
 ODD = {
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
@@ -146,27 +145,14 @@ def test_the_page_needs_nothing_else(page):
     assert "http" not in re.sub(r"http-equiv|<pre.*?</pre>", "", page, flags=re.DOTALL)
 
 
-def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
-    read = Page(page)
-    assert '<html lang="en">' in page
-    assert "<title>All &lt;axes&gt; &amp; &#34;kinds&#34; of $figures$</title>" in page
-    assert read.images
-    for tag, attributes in read.images:
-        assert tag == "img"
-        assert attributes.get("alt")
-    assert read.tables
-    assert None not in read.tables
-    assert page.count("<h1>") == 1
-
-
 def kinds(url):
     return [figure.name for figure in figures_of(opened(url))]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", [
     name if name in ("nothing visible", "distances drawn")
-    else pytest.param(name, marks=pytest.mark.long) for name in ODD
+    else pytest.param(name, marks=pytest.mark.evidence) for name in ODD
 ])
 def test_odd_stores_have_a_report_without_a_warning(name, odd, tmp_path):
     url = odd(name)
@@ -244,16 +230,6 @@ def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
 
 # Scenes.
 
-@pytest.mark.long
-def test_scenes_looked_at_again_are_what_the_store_holds(full):
-    scenes = list(scenes_of(opened(full)))
-    assert len(scenes) >= 4
-    for scene in scenes:
-        assert scene.problem == ""
-        image = cv2.imdecode(np.frombuffer(scene.picture, np.uint8), cv2.IMREAD_COLOR)
-        assert min(image.shape[:2]) > 100
-        assert scene.command.startswith("sweep show full.toml --at ")
-
 
 def test_a_scene_s_command_shows_it(full, tmp_path):
     pipeline = tmp_path / "full.toml"
@@ -267,30 +243,8 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
 
 # Trade, Markdown, files.
 
-def small_trade():
-    names = ["ippe", "iterative"]
-    shape = ("side_px", "treatment")
-    values = np.array([[0.2, 0.3], [0.4, 0.6]])
-    columns = {"cost_ms": values, "rotation_p95_deg": 1 / values, "rotation_median_deg": values,
-               "solved_rate": values, "detection_rate": values}
-    return xr.Dataset({name: (shape, column) for name, column in columns.items()},
-                      {"side_px": [20.0, 40.0], "treatment": np.array(names, dtype=object)})
 
-
-@pytest.mark.long
-def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
-    url = shutil.copytree(odd("no draws"), str(tmp_path / "trade.zarr"))
-    write_group(open_store(url, "r+"), "cost/tradeoff", small_trade())
-    output = tmp_path / "report.html"
-    assert command("report", url, "-o", output)[::2] == (0, "")
-    text = output.read_text(encoding="utf-8")
-    assert 'id="trade"' in text
-    assert f"sweep tradeoff {url} --per side_px" in text
-    rows = Page(text).tables["Cost and accuracy, the cheapest first, with 95 % intervals"]
-    assert [row[1] for row in rows[1:3]] == small_trade()["treatment"].values.tolist()
-
-
-@pytest.mark.long
+@pytest.mark.evidence
 def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(full, tmp_path):
     output, folder, mine = (tmp_path / name for name in ("answer.md", "pictures", "mine"))
     folder.mkdir()
@@ -322,7 +276,7 @@ def test_the_pipeline_can_be_taken_from_the_page(full, page):
 
 # What cannot be.
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_report_is_never_written_into_a_store(tmp_path):
     url = made(tmp_path, ODD["single pose"], "one")
     other = made(tmp_path, ODD["single pose"], "other")
@@ -365,7 +319,7 @@ def test_poses_that_are_missing_are_told(odd, tmp_path):
     assert not output.exists()
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
     output = tmp_path / "report.html"
     output.write_text("the one before")
@@ -387,3 +341,16 @@ def test_results_without_poses_are_refused(full, tmp_path):
     with pytest.raises(StoreError, match="there are no results"):
         write_report(empty, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
+    read = Page(page)
+    assert '<html lang="en">' in page
+    assert "<title>All &lt;axes&gt; &amp; &#34;kinds&#34; of $figures$</title>" in page
+    assert read.images
+    for tag, attributes in read.images:
+        assert tag == "img"
+        assert attributes.get("alt")
+    assert read.tables
+    assert None not in read.tables
+    assert page.count("<h1>") == 1

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import re
-import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,8 +20,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
-from sweep.report.figures import figures_of
-from sweep.report.report_data import Configurations, ReportData, read_report_data
+from sweep.report.report_data import Configurations, ReportData
 from sweep.report.table import number
 from sweep.store.lifecycle import open_dataset
 
@@ -335,18 +333,6 @@ def test_page_markdown_json_and_terminal_have_the_same_answer(small, tmp_path):
         assert f"**{each['text']}**" in written
 
 
-@pytest.mark.long
-def test_origin_stands_last_and_the_command_is_the_one_that_was_given(small, tmp_path):
-    page = tmp_path / "a report.html"
-    given = ["report", small, "--require", "detection >= 0.5", "--per", "side_px", "-o", page]
-    assert command(*given)[0] == 0
-    text = page.read_text(encoding="utf-8")
-    commands = re.search(r"<pre[^>]*><code>(sweep run.*?)</code>", text, re.DOTALL)[1]
-    expected = shlex.join(["sweep", *map(str, given)]).replace("'", "&#39;").replace(">", "&gt;")
-    assert commands.splitlines()[-1] == expected
-    assert text.index('id="source"') > text.index('id="scenes"') > text.index('id="figures"')
-
-
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--require", "detectoin >= 0.9"], "--require detectoin >= 0.9: "),
     (["--require", "detection >= 1.2"], "--require detection >= 1.2: "),
@@ -356,10 +342,3 @@ def test_what_cannot_be_required_is_told_in_one_line(arguments, message, small, 
     code, out, err = command("report", small, *arguments, "-o", tmp_path / "r.html")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(message)
-
-
-def test_every_kind_of_axis_has_a_figure(small):
-    names = [figure.name for figure in figures_of(read_report_data(small))]
-    assert names[:3] == ["detection", "errors", "bias"]
-    beliefs = synthetic(np.ones((4, 2, 2)), believed_focal_scale=[0.99, 1.0, 1.01])
-    assert "effect-believed_focal_scale" in [figure.name for figure in figures_of(beliefs)]

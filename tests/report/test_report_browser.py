@@ -6,14 +6,12 @@ import shutil
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from benchmarks.bench_analysis import write_store
 from support.reports import FULL, command, made
 
-PIPELINES = Path(__file__).parents[2] / "pipelines"
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -77,25 +75,12 @@ def check(page, folder, schemes=tuple(SCHEMES)):
             assert told["drawings"]
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 def test_the_report_is_right_wide_and_narrow_light_and_dark(scheme, tmp_path):
     page = tmp_path / "report.html"
     assert command("report", made(tmp_path, FULL, "full"), "-o", page)[0] == 0
     check(page, tmp_path, [scheme])
-
-
-@pytest.mark.long
-def test_a_page_that_asked_for_something_would_be_told(tmp_path):
-    page = tmp_path / "report.html"
-    assert command("report", made(
-        tmp_path, "seed = 1\n[pose]\nside_px = 40\n", "one"), "-o", page)[0] == 0
-    asking = page.read_text(encoding="utf-8").replace(
-        "</main>", '<img src="http://192.0.2.1/picture.png" alt="none"></main>')
-    page.write_text(asking, encoding="utf-8")
-    console = browse(page)[1]
-    assert len(console) == 1
-    assert "Content Security Policy" in console[0]
 
 
 KINDS = {
@@ -133,7 +118,7 @@ trial = 40
 }
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("name", KINDS)
 def test_reports_of_other_kinds_are_right_and_print(name, tmp_path):
     page, paper = tmp_path / "report.html", tmp_path / "report.pdf"
@@ -149,7 +134,7 @@ def test_reports_of_other_kinds_are_right_and_print(name, tmp_path):
     assert paper.stat().st_size > 20_000
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_a_report_of_a_million_poses_is_written_and_opened_in_time(tmp_path):
     """Times are of two quiet cores; the start of the browser is that of an empty page."""
     url, results = write_store(tmp_path, 2 * 10**6)

@@ -2,7 +2,6 @@
 
 import random
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -87,7 +86,7 @@ def test_blocks_whose_chunks_are_missing_are_found(count, written, tmp_path):
         shutil.rmtree(copied)
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
     pipeline, written, finished, tmp_path, capsys
 ):
@@ -100,12 +99,3 @@ def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
     assert f"{len(lost)} committed blocks lack chunks, such as" in said
     assert same(copied, finished)
     assert verify(str(copied), 0).damage == []
-
-
-def test_store_without_scene_axes_has_its_chunks(tmp_path):
-    single = Pipeline.from_text("[pose]\nside_px = 40", name="single")
-    url = str(tmp_path / "single.zarr")
-    store = by_hand(url, single, ())
-    assert missing_chunks(store, [0]) == {}
-    Path(url, "true_rvec/c/0").unlink()
-    assert missing_chunks(store, [0]) == {0: "true_rvec/c/0"}

@@ -120,11 +120,6 @@ def test_labels_are_lazy_and_those_of_any_part(results):
     assert float(rates.sel(side_px=5)) == 0
 
 
-def test_a_value_of_a_later_version_is_unknown(results):
-    later = results.detection.copy(data=np.full(results.detection.shape, 77, dtype="u1"))
-    assert (sweep.decode_flags(later) == "unknown").all()
-
-
 def test_what_is_no_flag_is_unknown_not_another_flag(results):
     meaned = results.detection.copy(data=results.detection.astype(float) + 0.5)
     assert (sweep.decode_flags(meaned) == "unknown").all()
@@ -147,10 +142,3 @@ def test_what_has_no_flags_to_decode_is_refused_in_a_line(given):
     with pytest.raises(ArgumentError, match="expected a dataset") as error:
         sweep.decode_flags(given)
     assert "\n" not in str(error.value)
-
-
-def test_cf_xarray_reads_the_flags(results):
-    pytest.importorskip("cf_xarray")
-    found = results.detection.cf == "detected"
-    assert (found.values == (results.detection == 1).values).all()
-    assert results.estimate.cf.isin(["solved", "no_detection"]).shape == results.estimate.shape

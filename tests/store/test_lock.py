@@ -47,14 +47,6 @@ def test_writers_exclude_nobody_who_writes_and_refuse_all_changes(store, pipelin
     assert list(Path(store.url).parent.iterdir()) == []
 
 
-def test_one_process_changes_a_store_and_others_are_refused(store):
-    with changing(store.url, store.storage):
-        assert is_written(store.storage)
-        for other in (writing, changing):
-            with pytest.raises(StoreError, match="is writing it"), other(store.url, store.storage):
-                pass
-
-
 def test_of_two_processes_that_make_a_store_the_later_one_is_told(store, pipeline):
     with pytest.raises(StoreError, match="another process has made it meanwhile; run it again"):
         create_store(store.url, pipeline, (4,))
@@ -110,6 +102,7 @@ def test_of_many_changes_of_an_object_store_at_once_one_at_most_is_inside(anothe
     assert len(most) + len(refused) == 40
 
 
+@pytest.mark.system
 def test_the_lock_of_a_process_that_was_killed_is_free_at_once(store):
     script = (
         "import sys, time; from sweep.store.lifecycle import open_store; "

@@ -56,7 +56,7 @@ def see_no_flag_without_its_numbers(values):
     assert (values["detection"][solved.any(axis=1)] != 0).all()
 
 
-@pytest.mark.long
+@pytest.mark.evidence
 @pytest.mark.parametrize("work", ["write", "drop"])
 def test_reader_between_any_two_writes_of_a_block_sees_no_flag_without_its_numbers(
     work, pipeline, tmp_path, monkeypatch

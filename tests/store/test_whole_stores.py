@@ -107,12 +107,6 @@ def test_readers_name_a_coordinate_that_was_rewritten(name, values, copied, caps
     assert name in {damage.where.partition("/")[0] for damage in verify(str(copied), 0).damage}
 
 
-def test_a_coordinate_that_is_gone_is_named(copied):
-    shutil.rmtree(copied / "side_px/c")
-    with pytest.raises(StoreError, match=r"side_px/c/0: missing"):
-        sweep.open(copied)
-
-
 def computed_elsewhere(url):
     """Change a store as if another processor had computed it: last digits, and its features."""
     for key, content in (

@@ -3,6 +3,8 @@
 import contextlib
 from unittest import mock
 
+from sweep.isolation.child_process import Child
+
 
 class Here:
     """In the place of `sweep.isolation.child_process.Child`."""
@@ -29,13 +31,13 @@ class Here:
 
 @contextlib.contextmanager
 def calls_here():
-    """Small runs and measurements of what they take start no process while this is entered.
+    """No child process is started while this is entered: unit tests run so.
 
     A busy machine does not make a small run a large one, which would start others.
     """
+    own = {name: getattr(Here, name) for name in ("__init__", "call", "close", "restart")}
     with (
-        mock.patch("sweep.isolation.child_process.Child", Here),
-        mock.patch("sweep.execution.runner.Child", Here),
+        mock.patch.multiple(Child, **own),
         mock.patch("sweep.execution.runner.SMALL_RUN_S", 300.0),
         mock.patch("sweep.execution.forecast.SMALL_RUN_S", 300.0),
         mock.patch("sweep.execution.executors.SMALL_RUN_LIMIT_S", 300.0),

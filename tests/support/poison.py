@@ -1,9 +1,16 @@
 """An environment in which chosen scenes raise, crash or stall the process that computes them."""
 
+import contextlib
 import dataclasses
 import json
 import os
 from pathlib import Path
+from unittest import mock
+
+from support.poisoned.sitecustomize import _Poison
+from sweep.evaluation import block, search
+from sweep.experiment.experiment import Experiment
+from sweep.measure import detectors
 
 POISONED = Path(__file__).parent / "poisoned"
 
@@ -34,3 +41,18 @@ def poisoned(poisons, log):
     given = {"log": str(log), "poisons": [poison.written() for poison in poisons]}
     path = os.pathsep.join(filter(None, [str(POISONED), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path, "SWEEP_POISON": json.dumps(given)}
+
+
+WRAPPED = [(search, "build_scenes"), (search, "render_all"), (block, "detections_for"),
+           (block, "build"), (Experiment, "scene_values"), (detectors, "Detector")]
+
+
+@contextlib.contextmanager
+def raising(poisons, log):
+    """Have scenes raise in this process while this is entered."""
+    assert not any(poison.deadly for poison in poisons)
+    with contextlib.ExitStack() as stack:
+        for owner, name in WRAPPED:
+            stack.enter_context(mock.patch.object(owner, name, getattr(owner, name)))
+        _Poison(block, search, [poison.written() for poison in poisons], str(log))
+        yield

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import wrong_beliefs, wrong_configurations
+from sweep.experiment.same_meaning import wrong_beliefs
 from sweep.tradeoff.pareto import WRONG_BELIEF, mark_front
 
 TEXT = """seed = 1
@@ -31,11 +31,6 @@ def test_a_belief_is_wrong_where_it_differs_from_the_truth():
     assert flags('solver = ["ippe", "iterative"]') == [False, False]
     assert flags('pair = { zip = { believed_focal_scale = [1.0, 1.1], solver = ["ippe", "ap3p"]'
                  " } }") == [False, True]
-
-
-def test_where_no_belief_is_true_none_is_marked():
-    pipeline = Pipeline.from_text(f"{TEXT}believed_focal_scale = [0.9, 1.1]")
-    assert wrong_configurations(pipeline, pipeline.axes) == [False, False]
 
 
 def test_what_is_wrong_is_not_on_the_front():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -35,26 +34,31 @@ class Axis:
     ----------
     name
         A parameter's, ``trial``, or a name of the user's own if parameters go together along it.
-    values
-        Its values, without repeats; labels if parameters go together.
-    zipped
-        The parameters that go together, each with its values; empty for an axis of one parameter.
+    columns
+        Parameter (or ``trial``) -> its values along the axis.
     parameters
         Its parameters; none of ``trial``.
+    labels
+        A label of each combination of parameters that go together; empty for a single one.
     """
 
     name: str
-    values: Sequence[Any]
-    zipped: tuple[tuple[str, Sequence[Any]], ...] = ()
+    columns: Mapping[str, Sequence[Any]]
     parameters: tuple[Parameter, ...] = field(default=(), compare=False)
+    labels: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.values)
 
     @property
-    def columns(self) -> dict[str, Sequence[Any]]:
-        """Parameter (or ``trial``) -> its values along the axis."""
-        return dict(self.zipped) or {self.name: self.values}
+    def zipped(self) -> bool:
+        """Whether parameters go together along it."""
+        return bool(self.labels)
+
+    @property
+    def values(self) -> Sequence[Any]:
+        """Its values, without repeats; labels if parameters go together."""
+        return self.labels or self.columns[self.name]
 
     def at(self, index: int) -> dict[str, Any]:
         """Return the value of each of its parameters at an index."""
@@ -62,23 +66,13 @@ class Axis:
 
     def index_of(self, wanted: Mapping[str, Any]) -> int | None:
         """Return the first index at which its parameters have the wanted values; None without."""
-        columns = [
-            (values, wanted[name]) for name, values in self.columns.items() if name in wanted
-        ]
-        if len(columns) == 1:
-            values, value = columns[0]
-            return values.index(value) if value in values else None
+        names = self.columns.keys() & wanted.keys()
+        if names == {self.name}:  # also of a long range
+            values = self.values
+            return values.index(wanted[self.name]) if wanted[self.name] in values else None
         rows = range(len(self))
-        return next((i for i in rows if all(values[i] == value for values, value in columns)), None)
-
-    def replaced(self, name: str, value: Any) -> Axis:
-        """Return the axis with one value in place of all those of a parameter."""
-        same = (value,) * len(self)
-        if not self.zipped:
-            return dataclasses.replace(self, values=same)
-        return dataclasses.replace(self, zipped=tuple(
-            (other, same if other == name else values) for other, values in self.zipped
-        ))
+        return next(
+            (i for i in rows if all(self.columns[name][i] == wanted[name] for name in names)), None)
 
     @property
     def stage(self) -> Stage:
@@ -98,27 +92,24 @@ class Axis:
         return self.parameters[0].declaration.meaning if self.parameters else "number of the draw"
 
     @property
-    def labelled(self) -> bool:
-        """Whether its coordinates are strings: its values are not all numbers, or all booleans."""
-        if self.zipped:
-            return True
-        if isinstance(self.values, range):
-            return False
-        return {type(value) for value in self.values} not in ({bool}, {int}, {float})
+    def kind(self) -> type:
+        """Type of its coordinates: of its values, if all are booleans or numbers; else strings."""
+        kinds = {int} if isinstance(self.values, range) else set(map(type, self.values))
+        return kinds.pop() if kinds in ({bool}, {int}, {float}) else str
 
     @property
     def is_numeric(self) -> bool:
         """Whether its values are numbers, and not labels or switches."""
-        return not self.labelled and not isinstance(self.values[0], bool)
+        return self.kind in (int, float)
 
     def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return the values [start, stop) as coordinates: numbers, booleans or strings."""
         part = self.values[start:stop]
         if isinstance(part, range):
             return np.arange(part.start, part.stop, part.step, dtype=np.int64)
-        if self.labelled:
+        if self.kind is str:
             return np.array([label(value) for value in part], dtype=np.dtypes.StringDType())
-        return np.array(part, dtype=type(self.values[0]))
+        return np.array(part, dtype=self.kind)
 
 
 MAX_DEVIATIONS = 8.3
@@ -149,12 +140,57 @@ class Distribution:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
 
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form in which the values of an axis are generated.
+
+    Attributes
+    ----------
+    expected
+        The numbers of the form, in words.
+    lengths
+        How many there may be.
+    count
+        Returns how many values they make; 0 for numbers that make none.
+    values
+        Returns the values.
+    """
+
+    expected: str
+    lengths: tuple[int, ...]
+    count: Callable[..., int]
+    values: Callable[..., Any]
+
+
+def _range(*ends: int) -> range:
+    sound = 0 not in ends[2:] and all(isinstance(end, int) and abs(end) < 2**62 for end in ends)
+    return range(*ends) if sound else range(0)
+
+
+def _steps(start: float, stop: float, step: float) -> int:
+    steps = (float(stop) - float(start)) / step if step else 0.0
+    # Half-open also if the last step misses the stop only by rounding.
+    return math.ceil(min(max(steps, 0.0), 2.0 * MAX_VALUES) - 1e-9)
+
+
+def _stepped(*ends: float) -> Sequence[float]:
+    if all(isinstance(end, int) for end in ends):
+        return range(*map(int, ends))
+    start, _, step = map(float, ends)
+    return [start + step * i for i in range(_steps(*ends))]
+
+
+def _spaced(_first: float, _last: float, count: float) -> int:
+    return count if isinstance(count, int) else 0
+
+
 AXIS_FORMS = {
-    "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
-    "arange": "[start, stop, step], half-open",
-    "linspace": "[first, last, count], both inclusive",
-    "geom": "[first, last, count], both inclusive, above 0",
-    "values": "a list",
+    "range": Form("[start, stop] or [start, stop, step], whole numbers, half-open", (2, 3),
+                  lambda *ends: len(_range(*ends)), _range),
+    "arange": Form("[start, stop, step], half-open", (3,), _steps, _stepped),
+    "linspace": Form("[first, last, count], both inclusive", (3,), _spaced, np.linspace),
+    "geom": Form("[first, last, count], both inclusive, above 0", (3,),
+                 lambda *ends: _spaced(*ends) if min(ends) > 0 else 0, np.geomspace),
 }
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
 
@@ -167,12 +203,13 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     ValueError
         The expectation, if the table is not a distribution of the parameter.
     """
-    forms = " or ".join(f"{{ {kind} = {form} }}" for kind, form in DISTRIBUTION_FORMS.items())
-    if len(table) != 1 or next(iter(table)) not in DISTRIBUTION_FORMS:
-        if next(iter(table), None) in AXIS_FORMS:
+    ends: Any
+    kind, ends = next(iter(table.items()), ("", []))
+    if len(table) != 1 or kind not in DISTRIBUTION_FORMS:
+        if kind in (*AXIS_FORMS, "values"):
             raise ValueError("one value here; more than one goes under [axes]")
+        forms = " or ".join(f"{{ {each} = {form} }}" for each, form in DISTRIBUTION_FORMS.items())
         raise ValueError(f"{parameter.expected()}, or {forms}")
-    kind, ends = next(iter(table.items()))
     if not parameter.declaration.drawable:
         drawable = ", ".join(p.name for p in PARAMETERS.values() if p.declaration.drawable)
         raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
@@ -198,7 +235,7 @@ def parse_trial(value: Any) -> Axis:
     """Return the axis of ``trial = N``; ValueError with the expectation if N is not a count."""
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_VALUES:
         raise ValueError(f"a whole number from 1 to {MAX_VALUES:,}: how many draws")
-    return Axis(TRIAL, range(value))
+    return Axis(TRIAL, {TRIAL: range(value)})
 
 
 def parse_axis(
@@ -227,44 +264,52 @@ def parse_axis(
     >>> parse_axis(PARAMETERS["tilt_deg"], {"linspace": [0, 60, 3]}).values
     (0.0, 30.0, 60.0)
     """
-    forms = ", ".join(AXIS_FORMS)
-    if isinstance(given, list):
-        form, ends = "values", given
-    elif isinstance(given, dict) and len(given) == 1:
-        form, ends = next(iter(given.items()))
-    else:
-        raise ValueError(f"a list, or a table with one of {forms}")
+    table = {"values": given} if isinstance(given, list) else given
+    form, ends = next(iter(table.items()), ("", [])) if isinstance(table, dict) else ("", [])
     if form == "zip":
         raise ValueError(
             f"an axis of {parameter.name} alone; parameters that go together need a name of "
             "your own, such as pair = { zip = { ... } }"
         )
-    if form not in AXIS_FORMS:
-        if form in DISTRIBUTION_FORMS:
-            raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
-        raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
+    if form in DISTRIBUTION_FORMS:
+        raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
+    known = [*AXIS_FORMS, "values"]
+    if form not in known or len(table) != 1:
+        raise ValueError(f"a list, or a table with one of {', '.join(known)}{nearest(form, known)}")
+    if form in AXIS_FORMS:
+        return Axis(parameter.name, {parameter.name: _generated(parameter, form, ends, quota)},
+                    (parameter,))
     if not isinstance(ends, list):
-        raise ValueError(f"{form} = {AXIS_FORMS[form]}")  # noqa: TRY004  (a fault of the file)
-    values = ends if form == "values" else _expand(form, ends, quota)
-    if len(values) == 0:
+        raise ValueError(f"{form} = a list")  # noqa: TRY004  (a fault of the file)
+    if len(ends) > quota:
+        raise ValueError(TOO_MANY)
+    if not ends:
         raise ValueError("at least one value")
-    if isinstance(values, range) and parameter.types == (int,):
-        for end in (values[0], values[-1]):
-            parameter.check(end)
-        return Axis(parameter.name, values, parameters=(parameter,))
-    if len(values) > quota:
-        raise _too_many()
-    if form != "values" and float in parameter.types:
-        # All are numbers: if the least and the largest are admitted, all are.
-        for end in (min(values), max(values)):
-            _checked(parameter, end)
-        checked = list(map(float, values))
-    else:
-        checked = [_checked(parameter, value) for value in values]
-    counts = collections.Counter(checked)
-    if not repeats and len(counts) < len(checked):
-        raise ValueError(f"each value once ({shown(counts.most_common(1)[0][0])} is repeated)")
-    return Axis(parameter.name, tuple(checked), parameters=(parameter,))
+    values = tuple(_checked(parameter, value) for value in ends)
+    value, count = collections.Counter(values).most_common(1)[0]
+    if count > 1 and not repeats:
+        raise ValueError(f"each value once ({shown(value)} is repeated)")
+    return Axis(parameter.name, {parameter.name: values}, (parameter,))
+
+
+def _generated(parameter: Parameter, name: str, ends: Any, quota: int) -> Sequence[Any]:
+    """Return the values of a form that generates them."""
+    form = AXIS_FORMS[name]
+    sound = isinstance(ends, list) and len(ends) in form.lengths and _are_numbers(ends)
+    count = form.count(*ends) if sound else 0
+    if count < 1:
+        raise ValueError(f"{name} = {form.expected}, at least one value")
+    is_whole = parameter.types == (int,)
+    if count > (MAX_VALUES if is_whole and name == "range" else quota):
+        raise ValueError(f"at most {MAX_VALUES:,} values" if name == "range" else TOO_MANY)
+    values: Sequence[Any] = form.values(*ends)
+    # All are numbers: if the least and the largest are admitted, all are.
+    for end in (values[0], values[-1]):
+        _checked(parameter, end)
+    return values if is_whole else tuple(map(float, values))
+
+
+TOO_MANY = f"at most {MAX_LISTED:,} values, all axes together"
 
 
 def zipped_axis(
@@ -284,25 +329,21 @@ def zipped_axis(
     >>> zipped_axis("lens", {"fx_px": (600.0, 800.0), "fy_px": (600.0, 802.5)}).values
     ('600, 600', '800, 802.5')
     """
-    lengths = {parameter: len(values) for parameter, values in columns.items()}
-    if len(set(lengths.values())) > 1:
-        counts = ", ".join(f"{parameter} has {length:,}" for parameter, length in lengths.items())
+    together = tuple(parameters[key] for key in columns)
+    if len({len(values) for values in columns.values()}) > 1:
+        counts = ", ".join(f"{key} has {len(values):,}" for key, values in columns.items())
         raise ValueError(f"equally many values of each parameter: {counts}")
-    stages = {parameter: parameters[parameter].stage.name for parameter in columns}
-    if len(set(stages.values())) > 1:
-        listed = ", ".join(f"{parameter} is of the {stage}" for parameter, stage in stages.items())
+    if len({each.stage for each in together}) > 1:
+        listed = ", ".join(f"{each.name} is of the {each.stage.name}" for each in together)
         raise ValueError(f"parameters of one stage: {listed}")
-    rows = collections.Counter(zip(*columns.values(), strict=True))
+    rows = list(zip(*columns.values(), strict=True))
     labels = tuple(", ".join(map(_short, row)) for row in rows)
-    if len(rows) < next(iter(lengths.values())):
-        repeated = labels[list(rows.values()).index(max(rows.values()))]
-        raise ValueError(f"each combination once ({plain(repeated)} is repeated)")
+    row, count = collections.Counter(rows).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"each combination once ({plain(labels[rows.index(row)])} is repeated)")
     if len(set(labels)) < len(labels):
         labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
-    return Axis(
-        name, labels, tuple((key, tuple(values)) for key, values in columns.items()),
-        tuple(parameters[key] for key in columns),
-    )
+    return Axis(name, {key: tuple(values) for key, values in columns.items()}, together, labels)
 
 
 def _short(value: Any) -> str:
@@ -317,46 +358,6 @@ def _checked(parameter: Parameter, value: Any) -> Any:
     except ValueError as error:
         expected, semicolon, hint = str(error).partition("; did you mean")
         raise ValueError(f"{expected} (not {shown(value)}){semicolon}{hint}") from None
-
-
-def _too_many() -> ValueError:
-    return ValueError(f"at most {MAX_LISTED:,} values, all axes together")
-
-
-def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
-    """Return the values of a form that generates them."""
-    sound = len(ends) in ((2, 3) if form == "range" else (3,)) and _are_numbers(ends)
-    if not sound or not _SOUND[form](*ends):
-        raise ValueError(f"{form} = {AXIS_FORMS[form]}")
-    if form == "range":
-        if len(values := range(*ends)) > MAX_VALUES:
-            raise ValueError(f"at most {MAX_VALUES:,} values")
-        return values
-    if form == "arange":
-        start, stop, step = (float(end) for end in ends)
-        steps = (stop - start) / step
-        if steps > quota:
-            raise _too_many()
-        # Half-open also if the last step misses the stop only by rounding.
-        count = math.ceil(steps - 1e-9) if steps > 0 else 0
-        if all(isinstance(end, int) for end in ends):
-            return range(*ends)
-        return [start + step * i for i in range(count)]
-    if ends[2] > quota:
-        raise _too_many()
-    spaced = np.linspace if form == "linspace" else np.geomspace
-    return list(map(float, spaced(*ends)))
-
-
-_SOUND: dict[str, Callable[..., bool]] = {
-    "range": lambda *ends: ends[2:] != (0,) and all(
-        isinstance(end, int) and abs(end) <= 2**62 for end in ends),
-    "arange": lambda _start, _stop, step: step != 0,
-    "linspace": lambda _first, _last, count: isinstance(count, int) and count >= 1,
-    "geom": lambda first, last, count: (
-        isinstance(count, int) and count >= 1 and first > 0 and last > 0),
-}
-"""Form of an axis -> whether its numbers, as many as it has, can be."""
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:

@@ -41,7 +41,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
         chosen |= axis.at(index or 0)
     chosen |= named
     trial = chosen.pop(TRIAL, 0)
-    axes = (Axis(TRIAL, range(trial, trial + 1)),)
+    axes = (Axis(TRIAL, {TRIAL: range(trial, trial + 1)}),)
     for other in displaced_by(named):
         chosen.pop(other, None)
     return dataclasses.replace(pipeline.fixed_at(chosen), axes=axes)

@@ -198,7 +198,7 @@ class ReportData:
         expected = {*SIZE_AXES, *ANGLES}
         reasons = {*VIEW_PARAMETERS, *WORLD, *expected, "yaw_deg", "pitch_deg", "size_m"}
         varied = {axis.name for axis in self.pipeline.axes if len(axis) > 1} - expected
-        varied |= {name for axis in self.pipeline.axes for name, _ in axis.zipped}
+        varied |= {name for axis in self.pipeline.axes if axis.zipped for name in axis.columns}
         if not (varied | self.pipeline.distributions.keys()) & reasons or not self.areas.size:
             return False
         return bool(self.areas.max() > AREA_RATIO * self.areas.min())

@@ -186,8 +186,8 @@ def _coordinate(
 
 def _axis(axis: Axis) -> list[PlannedArray]:
     """Return the coordinates of a dimension, and those of the parameters that go together there."""
-    together = [Axis(name, values, parameters=(parameter,)) for parameter, (name, values)
-                in zip(axis.parameters, axis.zipped, strict=False)]
+    together = [Axis(each.name, {each.name: axis.columns[each.name]}, (each,))
+                for each in axis.parameters if axis.zipped]
     return [
         _coordinate(each.name, (axis.name,), each.coordinates(), {
             "long_name": each.meaning,

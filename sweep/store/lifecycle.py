@@ -396,7 +396,8 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
                 dataset = xr.open_zarr(
                     store.storage, chunks=_together(store), consolidated=False, zarr_format=3)
             # Short, and asked for one by one.
-            together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
+            together = [
+                name for axis in store.pipeline.axes if axis.zipped for name in axis.columns]
             dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})
         # Much of xarray and pandas does not support NumPy's strings of variable length.
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)

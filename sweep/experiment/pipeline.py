@@ -484,5 +484,4 @@ def _checked(
         "given": frozenset(reading.given), "axes": tuple(reading.axes),
         "folder": str(Path(reading.folder).resolve()),
     }, name=name, title=reading.title, text=text, stopping=stopping, source=reading.source,
-        requirements=required.requirements, require_per=required.per or (),
-        budget_ms=required.budget_ms)
+        **required)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import operator
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
-from sweep.declaration import TablesError
+from sweep.declaration import Declaration, Declared, TablesError, check_table
 from sweep.experiment.axes import TRIAL, Axis, parse_trial
-from sweep.experiment.document import REQUIRE, SEARCH, Reading
+from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.parameters import Stage
 from sweep.messages import plain, shown
@@ -103,32 +102,16 @@ class StoppingRule:
         return self.kind == "largest"
 
     @property
+    def stated(self) -> dict[str, Any]:
+        """What it states, by the keys that messages name: each precision apart."""
+        stated = dataclasses.asdict(self)
+        widths = stated.pop("precision")
+        return stated | {f"precision.{name}": width for name, width in widths}
+
+    @property
     def ends(self) -> tuple[int, ...]:
         """Numbers of trials at which waves end, and decisions are made."""
         return wave_ends(self.max_trials, self.unit)
-
-    def looser(self, begun: StoppingRule) -> str:
-        """Return why a store that was begun under another rule cannot be continued.
-
-        Empty if this rule asks for at least as much of every condition, so that nothing that was
-        computed is in vain.
-        """
-        ours = dict(self.precision)
-        for field in dataclasses.fields(self):
-            here, there = getattr(self, field.name), getattr(begun, field.name)
-            if here != there and field.name != "precision":
-                return (f"{SEARCH}.{field.name}: the store has {_text(there)}, "
-                        f"this run {_text(here)}")
-        for name, width in begun.precision:
-            if ours.get(name, math.inf) > width:
-                own = f"{ours[name]:g}" if name in ours else "none"
-                return (f"{SEARCH}.precision.{name}: the store has {width:g}, this run {own}, "
-                        "which is looser")
-        return ""
-
-
-def _text(value: Any) -> str:
-    return (", ".join(value) or "none") if isinstance(value, tuple) else str(value)
 
 
 def digest_of(rule: StoppingRule) -> str:
@@ -141,14 +124,28 @@ def digest_of(rule: StoppingRule) -> str:
 
 
 def not_continued(ours: StoppingRule | None, begun: StoppingRule | None) -> str:
-    """Return why a run cannot continue a store begun under another rule; empty if it can."""
-    if ours == begun:
-        return ""
+    """Return why a run cannot continue a store that was begun under another rule.
+
+    Empty if it can: ours asks for at least as much of every condition, so that nothing that was
+    computed is in vain.
+    """
     if ours is None or begun is None:
-        names: Sequence[str] = [f"[{SEARCH}]" if rule is not None else "a fixed number of trials"
-                                for rule in (begun, ours)]
-        return f"trials: the store has {names[0]}, this run {names[1]}"
-    return ours.looser(begun)
+        names = [f"[{SEARCH}]" if rule is not None else "a fixed number of trials"
+                 for rule in (begun, ours)]
+        return "" if ours is begun else f"trials: the store has {names[0]}, this run {names[1]}"
+    for name, there in begun.stated.items():
+        here = ours.stated.get(name)
+        if name.startswith("precision."):
+            if here is None or here > there:
+                return (f"{SEARCH}.{name}: the store has {there:g}, this run "
+                        f"{'none' if here is None else f'{here:g}'}, which is looser")
+        elif here != there:
+            return f"{SEARCH}.{name}: the store has {_text(there)}, this run {_text(here)}"
+    return ""
+
+
+def _text(value: Any) -> str:
+    return (", ".join(value) or "none") if isinstance(value, tuple) else str(value)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -277,39 +274,35 @@ def _precision(value: Any) -> tuple[tuple[str, float], ...]:
     return tuple(widths)
 
 
-Keys = Mapping[str, Callable[[Any], Any]]
+def _keys(**readers: Callable[[Any], Any]) -> dict[str, Declared]:
+    """Return keys by their names, each with what reads its value."""
+    return {name: Declared(name, (), None, Declaration(name, reads=reads))
+            for name, reads in readers.items()}
 
-REQUIRE_KEYS: Keys = {
-    "all": _texts('["detection >= 0.99"]', least=1), "per": _texts('["distance_m"]'),
-}
+
+REQUIRE_KEYS = _keys(all=_texts('["detection >= 0.99"]', least=1), per=_texts('["distance_m"]'))
 """Texts that all must hold, and the axes whose values are conditions at which they must."""
 
-SEARCH_KEYS: Keys = {
-    "along": _axis_name, "smallest": _axis_name, "largest": _axis_name, "cheapest": _true,
-    "precision": _precision, "per": _texts('["distance_m"]'),
-    "among": _texts('["dictionary", "solver"]'), MAX_TRIALS: parse_trial,
-}
+SEARCH_KEYS = _keys(
+    along=_axis_name, smallest=_axis_name, largest=_axis_name, cheapest=_true,
+    precision=_precision, per=_texts('["distance_m"]'),
+    among=_texts('["dictionary", "solver"]'), max_trials=parse_trial,
+)
 
 
-def _read_section(reading: Reading, section: str, keys: Keys) -> dict[str, Any]:
+def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) -> dict[str, Any]:
     """Return the values of a section's keys; those at fault are noted and left out."""
     table = reading.document.get(section, {})
-    values: dict[str, Any] = {}
     if not isinstance(table, dict):
         reading.fault(section, table, f"a table: [{section}]")
-        return values
-    for key, value in table.items():
+        return {}
+    for key in table:
         if key not in keys:
             reading.unknown_key(section, key, [*keys], f"; expected {', '.join(keys)}")
-            continue
-        try:
-            values[key] = keys[key](value)
-        except TablesError as error:
-            for line in error.lines:
-                reading.note(f"{section}.{key}{line.partition(': ')[0]}", line.partition(": ")[2])
-        except ValueError as error:
-            reading.fault(f"{section}.{key}", value, str(error))
-    return values
+    values, lines = check_table(
+        keys, {key: value for key, value in table.items() if key in keys}, "")
+    reading.faults.extend(f"{reading.source}: {section}.{line}" for line in lines)
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def _scene_axes(reading: Reading) -> list[Axis]:
@@ -332,12 +325,11 @@ _NO_CONDITION = {
 def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> Axis | None:
     """Return an axis, of the scene or any but ``trial``, by name, or note why there is none."""
     axis, together = reading.axis(name), reading.axis_of(name)
+    parameter = reading.parameters.get(name)
     of_trials, of_settings = _NO_CONDITION[path.partition(".")[0]]
-    where = f"expected an axis of the {'scene' if scene else 'grid'}"
     if name == TRIAL:
         problem = of_trials
-    elif scene and (axis.stage is not Stage.scene if axis is not None
-                    else name in reading.parameters and not _is_of_scene(reading, name)):
+    elif scene and (owner := axis or parameter) is not None and owner.stage is not Stage.scene:
         problem = of_settings
     elif axis is not None:
         return axis
@@ -347,15 +339,15 @@ def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> A
         problem = f"it is drawn for each trial: give {name} values under [axes]"
     elif name in reading.table("axes"):
         return None  # its own fault says why it is none
-    elif name in reading.parameters:
+    elif parameter is not None:
         problem = f"it has one value: list the values of {name} under [axes]"
     else:
-        known = [each.name for each in (_scene_axes(reading) if scene else reading.axes)]
-        if path == f"{REQUIRE}.per":  # an axis of this grid, or of one that --set makes
-            known += [each for each in reading.parameters if _is_of_scene(reading, each)]
+        known = [*(each.name for each in reading.axes),
+                 *(each for each in reading.parameters if not scene or _is_of_scene(reading, each))]
         reading.unknown(path, f"{name}: no such axis", name, known)
         return None
-    reading.note(path, f"{name}: {problem}; {where}")
+    where = "scene" if scene else "grid"
+    reading.note(path, f"{name}: {problem}; expected an axis of the {where}")
     return None
 
 
@@ -380,27 +372,11 @@ def _ordered_axis(reading: Reading, path: str, name: str) -> str:
 # What a requirement may be of is known to the analysis alone (`sweep.analysis.requirements`),
 # which checks the names.
 
-@dataclass(frozen=True, slots=True)
-class Required:
-    """What the results must fulfil.
+def read_required(reading: Reading) -> dict[str, Any]:
+    """Return what the section says, as fields of a pipeline, and note its faults.
 
-    Attributes
-    ----------
-    requirements
-        Texts that all must hold; no budget.
-    per
-        Names of the axes whose values are conditions at which they must; None if none are listed.
-    budget_ms
-        The most milliseconds of a frame; None without a budget.
+    The axes have been read.
     """
-
-    requirements: tuple[str, ...] = ()
-    per: tuple[str, ...] | None = None
-    budget_ms: float | None = None
-
-
-def read_required(reading: Reading) -> Required:
-    """Return what the section says, and note its faults; the axes have been read."""
     table = _read_section(reading, REQUIRE, REQUIRE_KEYS)
     budgets: list[float] = []
     for text in table.get("all", ()):
@@ -415,14 +391,12 @@ def read_required(reading: Reading) -> Required:
     if "per" in table and "all" not in reading.table(REQUIRE):
         reading.fault(REQUIRE, reading.table(REQUIRE),
                       'what is required, too: all = ["detection >= 0.99"]')
-    for name in table.get("per", ()):
+    conditions = tuple(dict.fromkeys(table.get("per", ())))
+    for name in conditions:
         if not _is_of_scene(reading, name):
             _axis_at(reading, f"{REQUIRE}.per", name)
-    return Required(
-        tuple(without_budget(table.get("all", ()))),
-        tuple(dict.fromkeys(table["per"])) if "per" in table else None,
-        budgets[0] if budgets else None,
-    )
+    return {"requirements": tuple(texts_in(reading.document)), "require_per": conditions,
+            "budget_ms": budgets[0] if budgets else None}
 
 
 def _budget(reading: Reading, given: RequirementText) -> float:
@@ -435,22 +409,18 @@ def _budget(reading: Reading, given: RequirementText) -> float:
     return given.limit
 
 
-def without_budget(required: Iterable[str]) -> list[str]:
-    """Return the texts of requirements that are no budget.
+def texts_in(document: Mapping[str, Any]) -> list[str]:
+    """Return the requirements of a document that may have faults, as texts, without a budget.
 
-    >>> without_budget(["detection >= 0.99", "budget_ms<=2"])
+    >>> texts_in({"require": {"all": ["detection >= 0.99", "budget_ms<=2"]}})
     ['detection >= 0.99']
     """
-    return [text for text in required
-            if (form := _FORM.fullmatch(text)) is None or form["name"] != BUDGET]
-
-
-def texts_in(document: Mapping[str, Any]) -> list[str]:
-    """Return the requirements' texts of a document that may have faults elsewhere."""
     table = document.get(REQUIRE)
     listed = table.get("all") if isinstance(table, dict) else None
-    return without_budget(
-        each for each in listed if isinstance(each, str)) if isinstance(listed, list) else []
+    return [
+        text for text in (listed if isinstance(listed, list) else ()) if isinstance(text, str)
+        if (form := _FORM.fullmatch(text)) is None or form["name"] != BUDGET
+    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -464,19 +434,20 @@ def texts_in(document: Mapping[str, Any]) -> list[str]:
 # Conditions at all of which requirements must hold are [require] per. Names of quantities are known
 # to the analysis alone; the rules that sample (`sweep.sampling.searches`) check them.
 
-def read_search(reading: Reading, required: Required) -> StoppingRule | None:
+def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule | None:
     """Return what is searched, and make the axis ``trial``; the other axes have been read.
 
-    None without the section, or with faults in it, which are noted.
+    ``required`` is what :func:`read_required` returned. None without the section, or with faults
+    in it, which are noted.
     """
     if SEARCH not in reading.document:
         return None
-    faults = len(reading.faults)
-    table, given = _read_section(reading, SEARCH, SEARCH_KEYS), reading.table(SEARCH)
+    faults, given = len(reading.faults), reading.table(SEARCH)
+    table = _read_section(reading, SEARCH, SEARCH_KEYS)
     if reading.document[SEARCH] is not given:
         return None  # it is no table
-    kinds = [kind for kind in KINDS if kind in given]
     _make_trials(reading, table)
+    kinds = [kind for kind in KINDS if kind in given]
     if len(kinds) != 1:
         others = f", not {' and '.join(kinds)}" if kinds else ""
         reading.fault(SEARCH, given, f"one of {', '.join(KINDS)}{others}")
@@ -484,39 +455,79 @@ def read_search(reading: Reading, required: Required) -> StoppingRule | None:
     kind, = kinds
     value = table.get(kind)
     along = _ordered_axis(reading, f"{SEARCH}.{kind}", value) if isinstance(value, str) else ""
-    precision = value if kind == "precision" and value else ()
-    for name in given["precision"] if kind == "precision" and value else ():
-        if name in reading.parameters:
-            reading.unknown_key(f"{SEARCH}.precision", name, ())
-    if kind != "precision" and not required.requirements:
+    if kind != "precision" and not required["requirements"]:
         reading.note(SEARCH, f'expected what must be met: [{REQUIRE}] all = ["detection >= 0.99"]')
-    axes = [axis.name for axis in _scene_axes(reading)]
-    among: tuple[str, ...] = ()
-    per: tuple[str, ...] = ()
-    if kind in CHOICES:
-        among = _among(reading, table, along, required.per or ())
-        at_all = [name for name in axes if required.per is None or name in required.per]
-        if "per" in given:
-            reading.fault(f"{SEARCH}.per", given["per"],
-                          f"conditions under [{REQUIRE}] per, where something is chosen")
-    else:
-        per = _conditions(reading, table, along)
-        at_all = [name for name in axes if kind != "precision" and name in (required.per or ())
-                  and not ("per" in given and name in per)]
-        if "among" in given:
-            reading.fault(
-                f"{SEARCH}.among", given["among"], f"it beside {', '.join(CHOICES)} alone")
-    at_all = [name for name in at_all if name not in (*among, along)]
-    per = tuple(name for name in per if name not in at_all)
+    _check_names(reading, table, kind, along)
+    conditions = required["require_per"] if "per" in reading.table(REQUIRE) else None
+    roles = {
+        axis.name: _role(axis, kind, along, table, conditions)
+        for axis in reading.axes if axis.name != TRIAL
+    }
+    if kind == "cheapest" and math.prod(
+            len(axis) for axis in reading.axes if roles.get(axis.name) == "among") < 2:
+        reading.fault(SEARCH, given, (
+            'something to choose: smallest = "size_m", with its values under [axes], or '
+            'among = ["solver"], of which the cheapest is chosen'))
+    for name in conditions or () if kind in CHOICES else ():
+        if roles.get(name) in ("along", "among"):
+            reading.fault(f"{REQUIRE}.per", list(conditions or ()),
+                          f"conditions; {name} is what [{SEARCH}] chooses")
     trial = reading.axis(TRIAL)
     if len(reading.faults) > faults or trial is None:
         return None
-    pooled = math.prod(len(axis) for axis in _scene_axes(reading)
-                       if axis.name not in (*per, *at_all, *among, along))
+    among, per, at_all = (tuple(name for name, own in roles.items() if own == role)
+                          for role in ("among", "per", "at_all"))
+    pooled = math.prod(len(axis) for axis in reading.axes if roles.get(axis.name) == "pooled")
     draws = COARSE_DRAWS if kind == "along" else FIRST_DRAWS
     return StoppingRule(
         kind, len(trial), min(max(2, math.ceil(draws / pooled)), len(trial)), along, among, per,
-        tuple(at_all), required.requirements if kind != "precision" else (), precision)
+        at_all, required["requirements"] if kind != "precision" else (),
+        value if kind == "precision" and value else ())
+
+
+def _check_names(reading: Reading, table: Mapping[str, Any], kind: str, along: str) -> None:
+    """Note the faults of the axes that ``per`` and ``among`` list.
+
+    A fixed parameter is a condition of one value.
+    """
+    given = reading.table(SEARCH)
+    if "per" in given and kind in CHOICES:
+        reading.fault(f"{SEARCH}.per", given["per"],
+                      f"conditions under [{REQUIRE}] per, where something is chosen")
+    if "among" in given and kind not in CHOICES:
+        reading.fault(
+            f"{SEARCH}.among", given["among"], f"it beside {', '.join(CHOICES)} alone")
+    key = "among" if kind in CHOICES else "per"
+    for name in dict.fromkeys(table.get(key, ())):
+        if along and name == along:
+            reading.fault(
+                f"{SEARCH}.{key}", name, f"other axes than {along}, which is searched along")
+        elif key == "among" or name not in reading.fixed or not _is_of_scene(reading, name):
+            _axis_at(reading, f"{SEARCH}.{key}", name, scene=key == "per")
+
+
+def _role(
+    axis: Axis, kind: str, along: str, table: Mapping[str, Any], conditions: Sequence[str] | None
+) -> str:
+    """Return what a search does with an axis: :class:`StoppingRule` says what its roles mean.
+
+    ``conditions`` are those of the section [require]; None if it lists none. An axis that nothing
+    names is a condition of a precision or a limit (``per``), and one at which what is chosen must
+    meet the requirements (``at_all``).
+    """
+    if axis.name == along:
+        return "along"
+    if axis.stage is not Stage.scene:
+        return "among" if kind in CHOICES else "configuration"
+    if kind in CHOICES:
+        if axis.name in table.get("among", ()):
+            return "among"
+        return "at_all" if conditions is None or axis.name in conditions else "pooled"
+    if axis.name in table.get("per", ()):
+        return "per"
+    if kind == "along" and axis.name in (conditions or ()):
+        return "at_all"
+    return "pooled" if "per" in table else "per"
 
 
 def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
@@ -542,44 +553,6 @@ def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
         )
 
 
-def _conditions(reading: Reading, table: Mapping[str, Any], along: str) -> tuple[str, ...]:
-    """Return the scene axes that ``per`` lists, in the grid's order; the others' faults are noted.
-
-    All but the axis ``along`` by default. A fixed parameter is a condition of one value.
-    """
-    path, axes = f"{SEARCH}.per", [axis.name for axis in _scene_axes(reading)]
-    names = table.get("per", axes if "per" not in reading.table(SEARCH) else [])
-    for name in dict.fromkeys(names if "per" in table else ()):
-        if along and name == along:
-            reading.fault(path, name, f"other axes than {along}, which is searched along")
-        elif name not in reading.fixed or not _is_of_scene(reading, name):
-            _axis_at(reading, path, name)
-    return tuple(name for name in axes if name in names and name != along)
-
-
-def _among(
-    reading: Reading, table: Mapping[str, Any], along: str, conditions: Sequence[str]
-) -> tuple[str, ...]:
-    """Return the axes of alternatives, those of configurations among them, in the grid's order."""
-    path, names = f"{SEARCH}.among", table.get("among", ())
-    if along and along in names:
-        reading.fault(path, names, f"{along} once: it is sought along already")
-    for name in names:
-        if name != along:
-            _axis_at(reading, path, name, scene=False)
-    chosen = [axis for axis in reading.axes if axis.name != TRIAL and (
-        axis.name in names or axis.stage is not Stage.scene)]
-    if "cheapest" in table and math.prod(map(len, chosen)) < 2:
-        reading.fault(SEARCH, reading.table(SEARCH), (
-            'something to choose: smallest = "size_m", with its values under [axes], or '
-            'among = ["solver"], of which the cheapest is chosen'))
-    for name in conditions:
-        if name in (along, *(axis.name for axis in chosen)):
-            reading.fault(f"{REQUIRE}.per", list(conditions),
-                          f"conditions; {name} is what [{SEARCH}] chooses")
-    return tuple(axis.name for axis in chosen)
-
-
 def search_settings(
     require: Sequence[str] = (), along: str = "", per: Sequence[str] | None = None,
     at_all: Sequence[str] | None = None, max_trials: int | None = None,
@@ -589,20 +562,14 @@ def search_settings(
     >>> search_settings(["detection >= 0.9"], "distance_m", max_trials=600)
     ['require.all=["detection >= 0.9"]', 'search.along="distance_m"', 'search.max_trials=600']
     """
-    given = {
+    given: dict[str, Any] = {
         f"{REQUIRE}.all": _listed(require) or None, f"{SEARCH}.along": along or None,
-        f"{SEARCH}.per": None if per is None else _listed(per),
-        f"{REQUIRE}.per": None if at_all is None else _listed(at_all),
+        f"{SEARCH}.per": _listed(per), f"{REQUIRE}.per": _listed(at_all),
         f"{SEARCH}.{MAX_TRIALS}": max_trials,
     }
-    return [f"{key}={json.dumps(value, ensure_ascii=False, default=_whole)}"
+    return [f"{key}={toml_item(value).as_string()}"
             for key, value in given.items() if value is not None]
 
 
-def _listed(texts: Sequence[str]) -> list[str]:
-    return [texts] if isinstance(texts, str) else list(texts)
-
-
-def _whole(value: Any) -> int | str:
-    """Return a whole number of NumPy's; of anything else its text, which is refused as such."""
-    return operator.index(value) if hasattr(value, "__index__") else str(value)
+def _listed(texts: Sequence[str] | None) -> Sequence[str] | None:
+    return [texts] if isinstance(texts, str) else texts

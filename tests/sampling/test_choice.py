@@ -13,7 +13,7 @@ from sweep.analysis.requirements import Decision, ErrorShares
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import StoppingRule
+from sweep.experiment.sampling import StoppingRule, not_continued
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
@@ -49,7 +49,7 @@ FAULTS = [
     ({"search": {"smallest": "trial"}}, "trials are what is counted"),
     ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
     ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
-    ({"search": {"among": ["size_m"]}}, "size_m once: it is sought along already"),
+    ({"search": {"among": ["size_m"]}}, "other axes than size_m, which is searched along"),
     ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
     ({"search": {"max_trials": 0}}, "search.max_trials = 0: expected"),
     ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
@@ -235,8 +235,8 @@ def test_pipelines_are_read_again_from_their_text():
 def test_another_choice_does_not_continue_a_store():
     rule = Pipeline.from_dict(DOCUMENT).stopping
     other = Pipeline.from_dict(changed(search={"max_trials": 500})).stopping
-    assert other.looser(rule) == "search.max_trials: the store has 400, this run 500"
-    assert not rule.looser(rule)
+    assert not_continued(other, rule) == "search.max_trials: the store has 400, this run 500"
+    assert not not_continued(rule, rule)
 
 
 @pytest.mark.long

@@ -28,7 +28,7 @@ from sweep.measure.intrinsics import (
     Intrinsics,
     calibrate,
 )
-from sweep.measure.solver import guarded_poses
+from sweep.measure.solver import GuardedPoints
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -339,7 +339,7 @@ def _position_errors(
         pixels = camera.project(transform_points(target[None], rotation, position[None]))[0]
         if not np.isfinite(pixels).all():
             continue
-        poses = guarded_poses(target, pixels, assumed, cv2.SOLVEPNP_IPPE)
+        poses = GuardedPoints.of(target, pixels, assumed).poses(cv2.SOLVEPNP_IPPE)
         if poses:
             errors[k] = poses[0][1] - position
     return errors

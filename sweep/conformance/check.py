@@ -275,7 +275,7 @@ def trial_scenes(pipeline: Pipeline) -> TrialScenes:
     frames = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     images = render_all(scenes, rows, marker_boxes(scenes), frames)
     return TrialScenes(
-        pipeline.experiment.detectors[0], scenes.dictionary[0], np.array(scenes.marker_id),
+        pipeline.experiment.detectors[0], scenes.dictionary[0], scenes.marker_id,
         scenes.corners_px, [np.ascontiguousarray(image) for image in images],
     )
 

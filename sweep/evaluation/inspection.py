@@ -133,9 +133,9 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         output = source(0, image[y0 - top : y1 - top, x0 - left : x1 - left])
     ids = () if output.ids is None else output.ids.ravel()
     true_markers, length = targets.corners_px[0], float(scenes.size_m[0])
-    error = "corner_error_px" if targets.are_markers else "marker_corner_error_px"
+    error = "corner_error_px" if targets.targets.are_markers else "marker_corner_error_px"
     chessboard = np.zeros((0, 2))
-    if not targets.are_markers:
+    if not targets.targets.are_markers:
         length = float(np.ptp(targets.targets[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
         if "chessboard_corner_error_px" in columns:
             chessboard = targets.chessboard_px[0] + columns["chessboard_corner_error_px"]

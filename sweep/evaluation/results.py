@@ -115,11 +115,11 @@ class CellsResult:
     @staticmethod
     def not_run(experiment: Experiment, count: int) -> CellsResult:
         """Return the result of ``count`` cells of which nothing was computed."""
-        grid = experiment.grid
+        grid, shapes = experiment.grid, experiment.cell_shapes
         return CellsResult(
             {
                 variable.name: np.full(
-                    (variable.configurations(grid), count, *variable.inner_shape), variable.fill,
+                    (shapes[variable.name][0], count, *shapes[variable.name][1:]), variable.fill,
                     dtype=np.float64 if variable.flags is None else variable.dtype,
                 )
                 for variable in experiment.variables

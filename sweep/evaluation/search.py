@@ -150,14 +150,19 @@ class ImageSearch:
     scenes: Scenes
     targets: TargetScenes
     needs_images: bool = True
+    _sides: list[int] = field(init=False)
     _last: tuple[Grey, str, SearchOutput] | None = None
+
+    def __post_init__(self) -> None:
+        self._sides = self.scenes.frame.max(axis=1).tolist()
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
         """Return what is found in an image of scene ``row``."""
-        dictionary, target = self.scenes.targets[row].dictionary, self.targets.targets[row]
+        target = self.targets.targets[row]
+        dictionary = target.dictionary
         if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
             return self._last[2]  # another marker of a photograph
-        found = self.find(image, dictionary, int(self.scenes.frame[row].max()))
+        found = self.find(image, dictionary, self._sides[row])
         output = (
             SearchOutput(*found) if target.is_marker
             else self.boards.complete(image, target, found)
@@ -400,7 +405,7 @@ def search(
     """
     scenes, widest = batch.scenes, common_windows(cuts)
     passes = [
-        _Pass(source, k, cut.tolist(), widest.tolist(), keep, failures, np.zeros(len(scenes)))
+        _Pass(source, k, cut, widest, keep, failures, np.zeros(len(scenes)))
         for k, (source, cut) in enumerate(zip(sources, cuts, strict=True))
     ]
     imaged = wanted & np.array([keep or source.needs_images for source in sources])
@@ -410,14 +415,13 @@ def search(
         images = images_of(render_all, batch, rows, widest, failures)
         row_s[rows] = (time.perf_counter() - begun) / len(rows)
         for each in passes:
-            for row, image in zip(rows.tolist(), images, strict=True):
-                if imaged[row, each.number]:
-                    each.search(row, image)
+            some = np.flatnonzero(imaged[rows, each.number])
+            each.search(rows[some], [images[i] for i in some.tolist()])
     for each in passes:
-        for row in np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number]).tolist():
-            each.search(row, _UNSEEN)
+        unseen = np.flatnonzero(wanted[:, each.number] & ~imaged[:, each.number])
+        each.search(unseen, [_UNSEEN] * len(unseen))
     row_s += np.sum([each.row_s for each in passes], axis=0)
-    return [each.result(batch.targets, cut) for each, cut in zip(passes, cuts, strict=True)], row_s
+    return [each.result(batch.targets) for each in passes], row_s
 
 
 _UNSEEN = np.empty((0, 0), dtype=np.uint8)
@@ -426,15 +430,15 @@ _UNSEEN = np.empty((0, 0), dtype=np.uint8)
 
 @dataclass(slots=True)
 class _Pass:
-    """The search by one source: its windows, those that are rendered, and its outputs by row.
+    """The search by one source: its windows (N, 4), those that are rendered, its outputs by row.
 
     ``row_s`` (N,) are the seconds spent on each scene, ``failed`` the rows that raised.
     """
 
     source: DetectionSource
     number: int
-    cuts: list[list[int]]
-    rendered: list[list[int]]
+    cuts: Integers
+    rendered: Integers
     keep: bool
     failures: list[Failure]
     row_s: Floats
@@ -442,29 +446,32 @@ class _Pass:
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
 
-    def search(self, row: int, image: Grey | None) -> None:
-        """Search the rendered image of a scene; None is one that was not rendered."""
-        begun = time.perf_counter()
-        if image is None:
-            self.failed.append(row)
-            return
-        if image is not _UNSEEN and self.cuts[row] != self.rendered[row]:
-            (x0, y0, x1, y1), (left, top, _, _) = self.cuts[row], self.rendered[row]
-            image = image[y0 - top : y1 - top, x0 - left : x1 - left]
-        if self.keep:
-            self.images[row] = image
-        try:
-            self.outputs[row] = self.source(row, image)
-        except Exception as error:
-            if self.source.needs_images:
-                raise_machine_fault(error)
-            note_failure(self.failures, row, "detection", self.number)
-            self.failed.append(row)
-        self.row_s[row] = time.perf_counter() - begun
+    def search(self, rows: NDArray[np.intp], images: Sequence[Grey | None]) -> None:
+        """Search the rendered images of scenes ``rows`` (n,); None is one that was not rendered."""
+        cut = self.cuts[rows] - np.tile(self.rendered[rows, :2], 2)
+        cropped = (self.cuts[rows] != self.rendered[rows]).any(axis=1)
+        for i, (row, image) in enumerate(zip(rows.tolist(), images, strict=True)):
+            if image is None:
+                self.failed.append(row)
+                continue
+            begun = time.perf_counter()
+            if cropped[i] and image is not _UNSEEN:
+                left, top, right, bottom = cut[i].tolist()
+                image = image[top:bottom, left:right]  # noqa: PLW2901
+            if self.keep:
+                self.images[row] = image
+            try:
+                self.outputs[row] = self.source(row, image)
+            except Exception as error:
+                if self.source.needs_images:
+                    raise_machine_fault(error)
+                note_failure(self.failures, row, "detection", self.number)
+                self.failed.append(row)
+            self.row_s[row] = time.perf_counter() - begun
 
-    def result(self, targets: TargetScenes, cuts: Integers) -> SearchResult:
-        """Return what was found in the windows ``cuts`` (N, 4)."""
-        begun, origins = time.perf_counter(), cuts[:, :2]
+    def result(self, targets: TargetScenes) -> SearchResult:
+        """Return what was found in the windows."""
+        begun, origins = time.perf_counter(), self.cuts[:, :2]
         offset = origins if self.source.needs_images else np.zeros_like(origins)
         found = classify(targets, self.outputs, offset.astype(np.float64))
         flags = found.flags.copy()

@@ -72,7 +72,7 @@ def target_areas_px(scenes: Scenes, targets: TargetScenes) -> Floats:
 
     Of a marker alone the area of its square, seen or not.
     """
-    if targets.are_markers:
+    if targets.targets.are_markers:
         return areas_px(scenes)
     on_board = targets.marker_id >= 0
     unseen = ~on_board | (targets.flags == DetectionStatus.not_visible)

@@ -242,7 +242,7 @@ class TruthTables:
                 "image": np.where(
                     batch.visible, [f"{name}.png" for name in batch.names], "").astype(object),
                 "true_corners_px": (
-                    targets.corners_px[:, 0] if targets.are_markers else targets.corners_px
+                    targets.corners_px[:, 0] if targets.targets.are_markers else targets.corners_px
                 ),
                 **{each.name: drawn_values[each.drawn_as].broadcast(len(batch))
                    for each in drawn},

@@ -173,11 +173,19 @@ class Experiment:
         """Those of them that hold what is drawn for each scene."""
         return drawn_variables(self.grid)
 
+    @cached_property
+    def cell_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Variable -> its configurations, then the lengths of its inner dimensions."""
+        return {
+            variable.name: (variable.configurations(self.grid), *variable.inner_shape)
+            for variable in self.variables
+        }
+
     def bytes_of(self, scenes: int) -> int:
         """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
         return scenes * sum(
-            variable.configurations(self.grid) * math.prod(variable.inner_shape)
-            * np.dtype(variable.dtype).itemsize for variable in self.variables)
+            math.prod(self.cell_shapes[variable.name]) * np.dtype(variable.dtype).itemsize
+            for variable in self.variables)
 
     @cached_property
     def _constants(self) -> dict[str, Column]:

@@ -183,7 +183,7 @@ def scene_document(
     scenes, shown = taken.scenes, taken.shown
     first = int(np.flatnonzero(shown)[0])
     marker: dict[str, Any] = {
-        "dictionary": scenes.dictionary[first], "marker_id": scenes.marker_id[first],
+        "dictionary": scenes.dictionary[first], "marker_id": int(scenes.marker_id[first]),
         "size_m": float(scenes.size_m[first]),
     }
     if board is not None:

@@ -14,9 +14,10 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.board import Board, unseen_markers
 from sweep.model.exposure import solid_planes
 from sweep.model.extent import outside_of_frame
+from sweep.model.polygon import following
 from sweep.model.pose import transform_points
-from sweep.model.scene import Scenes
-from sweep.typing import Floats, Integers, Masks
+from sweep.model.scene import Scenes, Targets
+from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
 # The targets of scenes: where the images of their squares and corners are.
@@ -28,7 +29,7 @@ class TargetScenes:
     Attributes
     ----------
     targets
-        Each scene's: a marker, which has one square, or a board.
+        Markers, which have one square, or boards.
     marker_id
         (N, M) IDs; -1 beyond a target's squares.
     corners_px, chessboard_px
@@ -37,16 +38,11 @@ class TargetScenes:
         (N, M) why a square is not searched; ``not_run`` for those that are.
     """
 
-    targets: Sequence[Board]
+    targets: Targets
     marker_id: Integers
     corners_px: Floats
     chessboard_px: Floats
     flags: NDArray[np.uint8]
-
-    @property
-    def are_markers(self) -> bool:
-        """Whether each target is a marker alone."""
-        return all(target.is_marker for target in self.targets)
 
 
 def target_scenes(
@@ -61,16 +57,16 @@ def target_scenes(
     count, (most, corners) = len(scenes), shape
     if boards is None:
         return TargetScenes(
-            [scenes.target(row) for row in range(count)],
-            np.array(scenes.marker_id, dtype=np.int64)[:, None], scenes.corners_px[:, None],
+            scenes.targets, scenes.marker_id[:, None], scenes.corners_px[:, None],
             np.empty((count, 0, 2)), visibility[:, None],
         )
     ids = np.full((count, most), -1, dtype=np.int64)
     corners_px = np.full((count, most, 4, 2), np.nan)
     chessboard_px = np.full((count, corners, 2), np.nan)
     flags = np.full((count, most), DetectionStatus.not_on_board, dtype=np.uint8)
-    for board in dict.fromkeys(boards):
-        rows = np.flatnonzero([each is board for each in boards])
+    targets = Targets.of(boards)
+    for number, board in enumerate(targets.boards):
+        rows = np.flatnonzero(targets.number == number)
         size = len(board)
         points = np.concatenate([board.corners_m.reshape(-1, 3), board.chessboard_m])
         pixels = scenes.cameras.take(rows).project(transform_points(
@@ -87,7 +83,7 @@ def target_scenes(
             if scenes.solid[row]:
                 unseen = unseen_markers(board, solid_planes(scenes, row))
                 flags[row, :size][unseen] = DetectionStatus.not_visible
-    return TargetScenes(boards, ids, corners_px, chessboard_px, flags)
+    return TargetScenes(targets, ids, corners_px, chessboard_px, flags)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -145,8 +141,8 @@ _NEAREST = (
 _TURNS = np.array([np.roll(np.arange(4), -turn) for turn in range(4)])
 """The corners' order after each quarter turn, (4, 4)."""
 
-_MOST_PAIRS = 1 << 17
-"""Pairs of a square and a quadrilateral that are compared at a time."""
+_MOST_PAIRS = 1 << 12
+"""Pairs of a square and a quadrilateral that are compared at a time: they fit a cache."""
 
 
 def classify(
@@ -211,22 +207,21 @@ def classify(
 
 
 def _found_squares(
-    targets: Sequence[Board], decoded: Quads, flags: NDArray[np.uint8], corners: Floats
+    targets: Targets, decoded: Quads, flags: NDArray[np.uint8], corners: Floats
 ) -> tuple[Integers, Integers, Floats]:
     """Return the squares that estimators get: target, number and corners of each, by target.
 
     Of a marker its detection; of a board all that have an ID of it, wherever they lie.
     """
-    numbers = {
-        board: {each: k for k, each in enumerate(board.marker_ids)}
-        for board in dict.fromkeys(each for each in targets if not each.is_marker)
-    }
-    if not numbers:
+    if targets.are_markers:
         rows = np.flatnonzero(flags == DetectionStatus.detected)
         return rows, np.zeros(len(rows), dtype=np.int64), corners[rows, 0]
+    numbers = [
+        {each: k for k, each in enumerate(board.marker_ids)} for board in targets.boards
+    ]
     square = np.array([
-        numbers[targets[row]].get(each, -1)
-        for row, each in zip(decoded.owner.tolist(), decoded.ids.tolist(), strict=True)
+        numbers[of].get(each, -1) for of, each in
+        zip(targets.number[decoded.owner].tolist(), decoded.ids.tolist(), strict=True)
     ], dtype=np.int64)
     known = np.flatnonzero(square >= 0)
     known = known[np.argsort(decoded.owner[known], kind="stable")]
@@ -250,31 +245,22 @@ def _in_frame(
 
 
 def _at_squares(quads: Quads, first: Integers, number: Integers, true_px: Floats) -> Quads:
-    """Return each quadrilateral at each square of its scene in which its centre lies.
+    """Return each quadrilateral at each true, convex square of its scene in which its centre lies.
 
-    Row r has the squares ``first[r]`` to ``first[r] + number[r]`` of those with corners ``true_px``
-    (S, 4, 2).
+    A centre on a square's edge lies in it. Row r has the squares ``first[r]`` to
+    ``first[r] + number[r]`` of those with corners ``true_px`` (S, 4, 2).
     """
-    pairs = number[quads.owner]
-    parts = []
-    for some in np.split(
-        np.arange(len(pairs)), np.flatnonzero(np.diff(np.cumsum(pairs) // _MOST_PAIRS)) + 1
-    ):
+    pairs, centres = number[quads.owner], quads.corners_px.mean(axis=1)
+    edges = following(true_px) - true_px
+    parts = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
+    at_a_time = np.flatnonzero(np.diff(np.cumsum(pairs) // _MOST_PAIRS)) + 1
+    for some in np.split(np.arange(len(pairs)), at_a_time) if len(pairs) else ():
         quad = np.repeat(some, pairs[some])
         before = np.cumsum(pairs[some]) - pairs[some]
         square = np.arange(len(quad)) + np.repeat(first[quads.owner[some]] - before, pairs[some])
-        inside = _is_at_square(quads.corners_px[quad], true_px[square])
+        edge, to_centre = edges[square], centres[quad][:, None] - true_px[square]
+        turn = edge[..., 0] * to_centre[..., 1] - edge[..., 1] * to_centre[..., 0]
+        inside = (turn >= 0).all(axis=1) | (turn <= 0).all(axis=1)
         parts.append((square[inside], quad[inside]))
     square, quad = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Quads(square, quads.corners_px[quad], quads.ids[quad])
-
-
-def _is_at_square(quads: Floats, truth: Floats) -> Masks:
-    """Return (M,) whether a quadrilateral's centre lies in the true, convex one or on its edge.
-
-    Both (M, 4, 2).
-    """
-    edge = np.roll(truth, -1, axis=1) - truth
-    to_centre = quads.mean(axis=1)[:, None, :] - truth
-    turn = edge[..., 0] * to_centre[..., 1] - edge[..., 1] * to_centre[..., 0]
-    return np.asarray((turn >= 0).all(axis=1) | (turn <= 0).all(axis=1))

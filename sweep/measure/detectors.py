@@ -246,24 +246,20 @@ class Detector:
 
     def __init__(self, setting: DetectorSetting) -> None:
         self._setting = setting
-        self._parameters = opencv_parameters(setting)
-        self._searches: dict[tuple[str, int, int], SearchFunction] = {}
+        self._search = lru_cache(maxsize=4096)(self._new_search)
 
     def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> DetectorOutput:
         """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
-        key = dictionary, max(image.shape), frame_side
-        return (self._searches.get(key) or self._search(*key))(image)
+        return self._search(dictionary, max(image.shape), frame_side)(image)
 
-    def _search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
-        """Return OpenCV's search for images of larger side ``side``; one for each size is kept."""
+    def _new_search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
+        """Return OpenCV's search for images of larger side ``side``."""
         low, high = perimeter_rates(self._setting, side, frame_side)
-        parameters = self._parameters
+        parameters = opencv_parameters(self._setting)
         parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
         detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
         # OpenCV's stubs have neither the element types nor that the IDs may be None.
-        search = cast("SearchFunction", detector.detectMarkers)
-        self._searches[dictionary, side, frame_side] = search
-        return search
+        return cast("SearchFunction", detector.detectMarkers)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -530,8 +526,9 @@ FindFunction = Callable[[NDArray[np.uint8], str, int], DetectorOutput]
 markers of a dictionary."""
 
 
+@lru_cache(maxsize=256)
 def make_detector(setting: AnyDetectorSetting) -> FindFunction:
-    """Return the search that a setting describes; those of plug-ins are kept by the process.
+    """Return the search that a setting describes; kept by the process.
 
     Raises
     ------
@@ -542,7 +539,8 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
         return Detector(setting).find
     if is_recording(setting.plugin.name):
         return _find_nothing
-    return _kept_plugin(setting).find
+    record: DetectorPlugin = setting.record()
+    return PluggedDetector(setting.plugin.name, record, setting.instance()).find
 
 
 def make_board_detector(
@@ -558,12 +556,6 @@ def _find_nothing(
 ) -> DetectorOutput:
     """Return no marker: recorded detections are read, whatever the image."""
     return [], None, []
-
-
-@lru_cache(maxsize=1024)
-def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
-    record: DetectorPlugin = setting.record()
-    return PluggedDetector(setting.plugin.name, record, setting.instance())
 
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:

@@ -15,12 +15,12 @@ from sweep.compilation import compiled
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import pose_covariance, solve_positive
 from sweep.measure.surroundings import BoardMarker
-from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.coverage import POSE, velocity
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import Optics, side_lengths
 from sweep.model.pose import angle_between, mirrored, transform_points, vector_of_rotation
+from sweep.model.scene import Targets
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -67,7 +67,7 @@ class Detections:
     size_m: Floats
     noise_grey: Floats
     blur_px: Floats
-    targets: Sequence[Board]
+    targets: Targets
     images: Sequence[Grey]
     origins: Integers
     owner: Integers
@@ -83,14 +83,9 @@ class Detections:
         return len(self.origins)
 
     @property
-    def are_markers(self) -> bool:
-        """Whether each target is a marker, upright at the origin of its frame."""
-        return all(target.is_marker for target in self.targets)
-
-    @property
     def objects_m(self) -> Floats:
         """(K, 4, 3) the found squares' corners in their targets' frames, of the assumed size."""
-        if self.are_markers:
+        if self.targets.are_markers:
             return marker_corners(self.size_m)
         corners = [
             target.corners_m[self.square[self.owner == row]] * self.scale[row]
@@ -131,11 +126,11 @@ class Detections:
         def of_rows(values: Any) -> Any:
             if values is None or isinstance(values, np.ndarray):
                 return None if values is None else values[rows]
-            return [values[row] for row in rows] if len(values) else []
+            return [values[row] for row in rows.tolist()] if len(values) else []
 
         return Detections(
             self.corners[squares], self.cameras.take(rows), self.size_m[rows],
-            self.noise_grey[rows], self.blur_px[rows], of_rows(self.targets),
+            self.noise_grey[rows], self.blur_px[rows], self.targets.take(rows),
             of_rows(self.images), self.origins[rows], np.repeat(np.arange(len(rows)), counts),
             self.square[squares], self.scale[rows], self.chessboard_px[rows],
             of_rows(self.beside), of_rows(self.recorded_rotation),

@@ -58,9 +58,9 @@ from sweep.measure.photograph import (
 )
 from sweep.measure.solver import (
     MIN_POINTS,
+    GuardedPoints,
     Pose,
     both_planar_solutions,
-    guarded_poses,
     poses_of_each_marker,
     reprojection_px,
 )
@@ -379,7 +379,7 @@ def found_targets(detections: Detections) -> Iterator[Found]:
     """Yield what was found of each target."""
     planar = both_planar_solutions(
         detections.corners, detections.cameras, detections.size_m
-    ) if detections.are_markers else None
+    ) if detections.targets.are_markers else None
     for i, target in enumerate(detections.targets):
         one, scale = detections.take(np.array([i])), float(detections.scale[i])
         size_m = scale * unit_m(target) * module_count(target.dictionary)
@@ -411,8 +411,8 @@ def first_poses(found: Found, *, refined: bool) -> list[Pose]:
     poses = []
     for corners in (found.corners, refined_corners(found)) if refined else (found.corners,):
         points, pixels = found.objects_m.reshape(-1, 3), corners.reshape(-1, 2)
-        for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_ITERATIVE):
-            poses += guarded_poses(points, pixels, found.cameras, method)
+        guard = GuardedPoints.of(points, pixels, found.cameras)
+        poses += guard.poses(cv2.SOLVEPNP_IPPE) + guard.poses(cv2.SOLVEPNP_ITERATIVE)
         if len(corners) > 1:
             each = poses_of_each_marker(points, pixels, found.cameras)
             away = [_typical_error_px(pose, found, corners) for pose in each]

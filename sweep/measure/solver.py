@@ -194,7 +194,7 @@ def _guarded(
     right = points[:, 1] + points[:, 2] - points[:, 0] - points[:, 3]
     roll = np.arctan2(right[:, 1], right[:, 0])
     turns = np.nan_to_num(np.round(roll / (np.pi / 2))).astype(np.int64) % 4
-    matrices = np.array([cameras.matrix(i) for i in range(len(points))]).reshape(-1, 3, 3)
+    matrices = cameras.matrices
 
     rotation, translation = _solve_turned(points, matrices, turns, method)
     pinhole = Cameras(cameras.view, cameras.lenses, np.zeros(len(points), dtype=bool))
@@ -359,16 +359,10 @@ def poses_of_each_marker(
     ]
 
 
-def plain_poses(
-    objects: Floats, pixels: Floats, cameras: Cameras, method: int
-) -> list[Pose]:
-    """Call ``cv2.solvePnPGeneric`` plainly: the board's frame, metres, OpenCV's lens inverse."""
-    return _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
-
-
 def _called(
     objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int
 ) -> list[Pose]:
+    """Call ``cv2.solvePnPGeneric``; no pose if it fails."""
     try:
         success, vectors, positions, _ = cv2.solvePnPGeneric(
             np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, flags=method
@@ -391,40 +385,68 @@ about it open, and SQPnP and EPnP return any."""
 _Z_IN = np.diag([1.0, -1.0, -1.0])
 
 
-def guarded_poses(
-    objects: Floats, pixels: Floats, cameras: Cameras, method: int
-) -> list[Pose]:
-    """Solve in a stable frame: undistorted pixels, points of unit size, z in, roll within 45°.
+class GuardedPoints(NamedTuple):
+    """Points of a target in a stable frame: unit size, z in, roll within 45°; undistorted pixels.
 
     For the reasons that the guard of a single marker has (:mod:`sweep.measure.solver`).
+
+    Attributes
+    ----------
+    points, pixels, matrix
+        (k, 3), (k, 2), and OpenCV's camera matrix (3, 3); no points if they have no pose.
+    turn, size, middle
+        (3, 3), metres and (3,) metres: from the target's frame to the stable one.
+    to_target
+        The pose of the points' plane on the target, if it lies across the target's.
     """
-    flat = pixels
-    if cameras.distorted[0]:
-        view = cameras.view[0]
-        flat = cameras.normalise(pixels[None])[0] * view[:2] + view[2:]
-    middle = objects.mean(axis=0)
-    size = float(np.sqrt(((objects - middle) ** 2).sum(axis=1).mean()))
-    if not size > 0 or not np.isfinite(flat).all():
-        return []
-    unit = (objects - middle) / size @ _Z_IN
-    if np.linalg.svd(unit[:, :2], compute_uv=False)[1] < COLLINEAR:
-        _, extents, axes = np.linalg.svd(objects - middle, full_matrices=False)
-        if extents[1] < COLLINEAR * size:
-            return []
-        # In a plane across the board's, such as one face of a cube: solved in their own.
-        axes *= np.sign(np.linalg.det(axes))
-        own = guarded_poses((objects - middle) @ axes.T, pixels, cameras, method)
-        return [of_board(*pose, (axes.T, middle)) for pose in own]
-    planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
-    (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
-    turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4
-    cosine, sine = (1.0, 0.0, -1.0, 0.0)[turn], (0.0, 1.0, 0.0, -1.0)[turn]
-    back = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    poses = []
-    for rotation, position in _called(unit @ back.T, flat, cameras.matrix(0), None, method):
-        turned = rotation @ back @ _Z_IN
-        poses.append((turned, position * size - turned @ middle))
-    return poses
+
+    points: Floats
+    pixels: Floats
+    matrix: Floats
+    turn: Floats
+    size: float
+    middle: Floats
+    to_target: Pose | None = None
+
+    @staticmethod
+    def of(objects: Floats, pixels: Floats, cameras: Cameras) -> GuardedPoints:
+        """Return points (k, 3) in metres and their pixels (k, 2) in the first camera."""
+        flat, matrix = pixels, cameras.matrix(0)
+        if cameras.distorted[0]:
+            view = cameras.view[0]
+            flat = cameras.normalise(pixels[None])[0] * view[:2] + view[2:]
+        middle = objects.mean(axis=0)
+        size = float(np.sqrt(((objects - middle) ** 2).sum(axis=1).mean()))
+        none = GuardedPoints(np.empty((0, 3)), np.empty((0, 2)), matrix, np.eye(3), size, middle)
+        if not size > 0 or not np.isfinite(flat).all():
+            return none
+        unit = (objects - middle) / size @ _Z_IN
+        if np.linalg.svd(unit[:, :2], compute_uv=False)[1] < COLLINEAR:
+            _, extents, axes = np.linalg.svd(objects - middle, full_matrices=False)
+            if extents[1] < COLLINEAR * size:
+                return none
+            # In a plane across the target's, such as one face of a cube: solved in their own.
+            axes *= np.sign(np.linalg.det(axes))
+            own = GuardedPoints.of((objects - middle) @ axes.T, pixels, cameras)
+            return own._replace(to_target=(axes.T, middle))
+        planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
+        (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
+        turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4
+        cosine, sine = (1.0, 0.0, -1.0, 0.0)[turn], (0.0, 1.0, 0.0, -1.0)[turn]
+        back = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return GuardedPoints(unit @ back.T, flat, matrix, back, size, middle)
+
+    def poses(self, method: int) -> list[Pose]:
+        """Return the target's poses by a method of ``cv2.solvePnPGeneric``."""
+        found = []
+        if len(self.points):
+            for rotation, position in _called(
+                self.points, self.pixels, self.matrix, None, method
+            ):
+                turned = rotation @ self.turn @ _Z_IN
+                pose = turned, position * self.size - turned @ self.middle
+                found.append(pose if self.to_target is None else of_board(*pose, self.to_target))
+        return found
 
 
 # --------------------------------------------------------------------------------------------------
@@ -476,7 +498,7 @@ class PointSolver:
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with covariances if the corners' noise is given."""
-        if not detections.are_markers:
+        if not detections.targets.are_markers:
             out = Estimates.none(len(detections), EstimateStatus.solver_failed)
             for i in range(len(detections)):
                 self._estimate(detections.take(np.array([i])), i, out)
@@ -531,20 +553,24 @@ class PointSolver:
 
         ``side_px`` is the mean side of the detected markers.
         """
-        cameras, used, solve = one.cameras, None, plain_poses
+        cameras, used, guard = one.cameras, None, None
+        method = OPENCV_SOLVERS[self.solver].method
         if self.points == "largest_marker":
             poses = self._of_marker(objects, pixels, cameras)
         elif self.points == "each_marker":
             poses = poses_of_each_marker(objects, pixels, cameras)
             used = np.repeat(objects.reshape(-1, 4, 3), 2, axis=0)
+        elif self.guarded:
+            guard = GuardedPoints.of(objects, pixels, cameras)
+            poses = guard.poses(method)
         else:
-            solve = guarded_poses if self.guarded else plain_poses
-            poses = solve(objects, pixels, cameras, OPENCV_SOLVERS[self.solver].method)
+            poses = _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
         ordered = _by_error(poses, objects, pixels, cameras, used)
-        if solve is guarded_poses and self.solver == "iterative":
-            ordered = _least_of(ordered, objects, pixels, cameras, side_px)
-        if solve is guarded_poses and self.solver != "epnp":
-            ordered = _or_others(ordered, objects, pixels, cameras, CREDIBLE_SHARE * side_px)
+        if guard is not None and self.solver == "iterative":
+            ordered = _least_of(ordered, guard, objects, pixels, cameras, side_px)
+        if guard is not None and self.solver != "epnp":
+            ordered = _or_others(
+                ordered, guard, objects, pixels, cameras, CREDIBLE_SHARE * side_px)
         if self.refine != "none" and ordered:
             ordered[0] = _refined(ordered[0], self.refine, objects, pixels, cameras)
         return ordered[:2]
@@ -578,24 +604,23 @@ def _refined(
 
 
 def _least_of(
-    ordered: list[_Solution], objects: Floats, pixels: Floats, cameras: Cameras,
-    side_px: float,
+    ordered: list[_Solution], guard: GuardedPoints, objects: Floats, pixels: Floats,
+    cameras: Cameras, side_px: float,
 ) -> list[_Solution]:
     """Return ITERATIVE's solutions, or other solvers' refined where it missed the least error.
 
     As for single markers, and about as often if one marker of the board is detected.
     """
+    if ordered and ordered[0].error_px <= ASTRAY_SHARE * side_px:
+        return ordered
     starts = _by_error(
-        [pose for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP)
-         for pose in guarded_poses(objects, pixels, cameras, method)],
+        [*guard.poses(cv2.SOLVEPNP_IPPE), *guard.poses(cv2.SOLVEPNP_SQPNP)],
         objects, pixels, cameras,
     )
     if not starts:
         return ordered
-    credible = max(
-        ASTRAY_RATIO[cv2.SOLVEPNP_ITERATIVE] * starts[0].error_px, ASTRAY_SHARE * side_px
-    )
-    if ordered and ordered[0].error_px <= credible:
+    least = starts[0].error_px
+    if ordered and ordered[0].error_px <= ASTRAY_RATIO[cv2.SOLVEPNP_ITERATIVE] * least:
         return ordered
     refined = [_refined(each, "lm", objects, pixels, cameras) for each in starts]
     return [min([*refined, *starts], key=lambda each: each.error_px)]
@@ -616,8 +641,8 @@ def _by_error(
 
 
 def _or_others(
-    ordered: list[_Solution], objects: Floats, pixels: Floats, cameras: Cameras,
-    credible_px: float,
+    ordered: list[_Solution], guard: GuardedPoints, objects: Floats, pixels: Floats,
+    cameras: Cameras, credible_px: float,
 ) -> list[_Solution]:
     """Return solutions, or those of ITERATIVE or IPPE where the best is not credible.
 
@@ -627,9 +652,7 @@ def _or_others(
     if ordered and ordered[0].error_px <= credible_px:
         return ordered
     for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE):
-        others = _by_error(
-            guarded_poses(objects, pixels, cameras, method), objects, pixels, cameras
-        )
+        others = _by_error(guard.poses(method), objects, pixels, cameras)
         if others and not (
             ordered and ordered[0].error_px <= CREDIBLE_RATIO * others[0].error_px
         ):

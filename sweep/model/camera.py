@@ -187,6 +187,14 @@ class Cameras:
         """Return one camera as compiled functions take it."""
         return Optics(self.view[row], self.lenses[row], bool(self.distorted[row]))
 
+    @property
+    def matrices(self) -> NDArray[np.float64]:
+        """OpenCV's camera matrices (N, 3, 3)."""
+        out = np.zeros((len(self.view), 3, 3))
+        out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = self.view[:, 0], self.view[:, 1], 1.0
+        out[:, :2, 2] = self.view[:, 2:]
+        return out
+
     def matrix(self, row: int) -> NDArray[np.float64]:
         """Return OpenCV's camera matrix (3, 3) of one row."""
         fx, fy, cx, cy = self.view[row]
@@ -285,7 +293,11 @@ class Column:
     def broadcast(self, count: int, dtype: DTypeLike = np.float64) -> NDArray[Any]:
         """Return a contiguous array (count,) of the values; None becomes NaN."""
         column = np.asarray(self.values, dtype=dtype)
-        return np.ascontiguousarray(np.broadcast_to(column, (count,)))
+        if column.shape == (count,):
+            return np.ascontiguousarray(column)
+        spread = np.empty(count, dtype=column.dtype)
+        spread[...] = column
+        return spread
 
     def listed(self, count: int) -> list[Any]:
         """Return the values as a list of ``count``."""

@@ -89,7 +89,7 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     for row in np.flatnonzero(scenes.effects.active & np.isfinite(low).all(axis=1)).tolist():
         low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
     block = np.ones((len(scenes), 1))
-    for effect in scenes.effects.plugins.all_effects:
+    for effect in scenes.effects.present:
         if effect.reach_px or effect.block_px > 1:
             active = effect.is_active(scenes.effects[effect.switch])[:, None]
             low, high = low - effect.reach_px * active, high + effect.reach_px * active

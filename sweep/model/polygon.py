@@ -15,17 +15,22 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # Polygons: their sides and areas, and what a half plane leaves of them.
 
+def following(points: NDArray[Any]) -> NDArray[Any]:
+    """Return the next point of each point of polygons (N, M, D): the first after the last."""
+    return np.concatenate([points[:, 1:], points[:, :1]], axis=1)
+
+
 def side_lengths(points: NDArray[np.floating[Any] | np.integer[Any]]) -> Floats:
     """Return the lengths (N, M) of the sides of polygons (N, M, D), from each point to the next."""
-    return np.asarray(np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2))
+    return np.asarray(np.linalg.norm(following(points) - points, axis=2))
 
 
 def signed_areas(points: Floats) -> Floats:
     """Return the signed areas (N,) of polygons (N, M, 2)."""
     local = points - points[:, :1]
-    following = np.roll(local, -1, axis=1)
+    after = following(local)
     with np.errstate(over="ignore", invalid="ignore"):
-        doubled = local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]
+        doubled = local[..., 0] * after[..., 1] - local[..., 1] * after[..., 0]
         return np.asarray(0.5 * doubled.sum(axis=1))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -105,8 +105,28 @@ class Targets:
     boards: tuple[Board, ...]
     number: NDArray[np.int64]
 
+    @staticmethod
+    def of(each: Sequence[Board]) -> Targets:
+        """Return the targets that N scenes show, one of each."""
+        return Targets(*distinct(each))
+
+    def __len__(self) -> int:
+        return len(self.number)
+
     def __getitem__(self, row: int) -> Board:
         return self.boards[int(self.number[row])]
+
+    def __iter__(self) -> Iterator[Board]:
+        return (self.boards[number] for number in self.number.tolist())
+
+    @property
+    def are_markers(self) -> bool:
+        """Whether each target is a marker alone."""
+        return all(self.boards[number].is_marker for number in set(self.number.tolist()))
+
+    def take(self, rows: NDArray[np.intp]) -> Targets:
+        """Return the targets of the given rows."""
+        return Targets(self.boards, self.number[rows])
 
     def each(self, read: Callable[[Board], Any]) -> NDArray[Any]:
         """Return (N, ...) a property of each scene's target."""
@@ -124,8 +144,8 @@ class SceneEffects:
     coded
         Parameter of an effect that is text or a list -> the values that the numbers in ``values``
         stand for.
-    active
-        (N,) whether an effect is active.
+    present, active
+        The effects that a scene may have, and (N,) whether one is active.
     noise_key
         (N,) keys of the noise.
     plugins, settings
@@ -134,6 +154,7 @@ class SceneEffects:
 
     values: Mapping[str, Floats]
     coded: Mapping[str, Sequence[Any]]
+    present: Sequence[Effect]
     active: NDArray[np.bool_]
     noise_key: NDArray[np.uint64]
     plugins: ScenePlugins
@@ -159,8 +180,7 @@ class SceneEffects:
         if not self.active[row]:
             return []
         return [
-            each for each in self.plugins.all_effects
-            if each.is_active(self.values[each.switch][row])
+            each for each in self.present if each.is_active(self.values[each.switch][row])
         ]
 
     @property
@@ -185,7 +205,7 @@ class SceneEffects:
     def _any_active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
         """Return whether one of the effects that are concerned is active, (N,)."""
         active = np.zeros(len(self.active), dtype=bool)
-        for effect in filter(concerned, self.plugins.all_effects):
+        for effect in filter(concerned, self.present):
             active |= effect.is_active(self.values[effect.switch])
         return active
 
@@ -275,12 +295,12 @@ class Scenes:
     @property
     def dictionary(self) -> list[str]:
         """The dictionary of each scene's markers."""
-        return [self.targets[row].dictionary for row in range(len(self))]
+        return [board.dictionary for board in self.targets]
 
     @property
-    def marker_id(self) -> list[int]:
-        """The ID of each scene's first marker."""
-        return [self.targets[row].marker_ids[0] for row in range(len(self))]
+    def marker_id(self) -> NDArray[np.int64]:
+        """The ID of each scene's first marker, (N,)."""
+        return self.targets.each(lambda board: board.marker_ids[0])
 
     @property
     def solid(self) -> NDArray[np.bool_]:
@@ -400,7 +420,7 @@ def build_scenes(
         "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
         "occlusion",
     )
-    targets = Targets(*distinct(keys))
+    targets = Targets.of(keys)
     modules = targets.each(lambda board: extent_of(board).modules)
     sheet = targets.each(lambda board: extent_of(board).sheet)
     side = sides_m(targets.boards, targets.number, size)
@@ -444,8 +464,9 @@ def build_scenes(
     for name in CODED:
         coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
         effects[name] = number[1:].astype(np.float64)
+    present = [each for each in plugins.all_effects if column(each.switch).differs_from(each.off)]
     active = np.zeros(count, dtype=bool)
-    for each in plugins.all_effects:
+    for each in present:
         active |= each.is_active(effects[each.switch])
     return Scenes(
         cameras=cameras,
@@ -461,8 +482,8 @@ def build_scenes(
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),
         effects=SceneEffects(
-            effects, coded, active, column("noise_key").broadcast(count, np.uint64), plugins,
-            {name: numbers(name) for name in plugins.settings},
+            effects, coded, present, active, column("noise_key").broadcast(count, np.uint64),
+            plugins, {name: numbers(name) for name in plugins.settings},
         ),
     )
 

@@ -15,6 +15,7 @@ from sweep.measure.classify import TargetScenes, classify
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.board import single_marker
+from sweep.model.scene import Targets
 
 PLAIN = """
 seed = 9
@@ -230,7 +231,7 @@ def search_result(row, *found):
 def markers(truth, marker_id):
     """N visible markers with corners (N, 4, 2) and IDs (N,)."""
     return TargetScenes(
-        [single_marker("DICT_4X4_50", each, 1.0) for each in marker_id],
+        Targets.of([single_marker("DICT_4X4_50", each, 1.0) for each in marker_id]),
         np.array(marker_id)[:, None],
         truth[:, None], np.empty((len(truth), 0, 2)), np.zeros((len(truth), 1), dtype=np.uint8),
     )

@@ -114,8 +114,8 @@ def test_perimeter_limits_come_to_the_same_pixels_in_a_window_as_in_the_frame(
     detector = Detector(
         DetectorSetting(minMarkerPerimeterRate=rates[0], maxMarkerPerimeterRate=rates[1])
     )
-    detector.find(np.full((8, side), 128, dtype=np.uint8), "DICT_4X4_50", frame_side)
-    held = detector._parameters
+    search = detector._search("DICT_4X4_50", side, frame_side)
+    held = search.__self__.getDetectorParameters()
     assert int(held.minMarkerPerimeterRate * side) == int(rates[0] * frame_side)
     assert int(held.maxMarkerPerimeterRate * side) == int(rates[1] * frame_side)
 

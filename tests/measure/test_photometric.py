@@ -36,6 +36,7 @@ from sweep.measure.likelihood import (
 from sweep.measure.photometric import Photometric, explains, found_targets, window_of
 from sweep.model.board import single_marker
 from sweep.model.coverage import LEVELS, POSE, work_space
+from sweep.model.scene import Targets
 
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""
@@ -585,7 +586,8 @@ def test_nonsense_is_not_solved(monkeypatch):
     plain = dataclasses.replace(seen, images=[np.full_like(one, 120) for one in seen.images])
     turned = dataclasses.replace(seen, corners=np.roll(seen.corners, 1, axis=1))
     mirrored = dataclasses.replace(seen, corners=seen.corners[:, ::-1])
-    other = dataclasses.replace(seen, targets=[single_marker("DICT_5X5_50", 1, 1.0)] * 5)
+    unlike = Targets.of([single_marker("DICT_5X5_50", 1, 1.0)] * 5)
+    other = dataclasses.replace(seen, targets=unlike)
     for nonsense in (point, beside, plain, turned, mirrored, other):
         estimates = estimator(nonsense)
         assert (estimates.status != EstimateStatus.solved).all()

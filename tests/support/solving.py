@@ -7,6 +7,7 @@ import numpy as np
 from sweep.measure.estimation import Detections
 from sweep.measure.solver import OPENCV_SOLVERS, PointSolver
 from sweep.model.board import single_marker
+from sweep.model.scene import Targets
 
 BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.any_points)
 
@@ -15,7 +16,7 @@ def of_markers(corners, cameras, size_m, noise_grey, markers, images=()):
     """The detections of N markers whose corners (N, 4, 2) were all found, in whole frames."""
     count = len(corners)
     return Detections(
-        corners, cameras, size_m, noise_grey, np.zeros(count), markers, images,
+        corners, cameras, size_m, noise_grey, np.zeros(count), Targets.of(markers), images,
         np.zeros((count, 2), dtype=np.int64), np.arange(count), np.zeros(count, dtype=np.int64),
         np.ones(count), np.empty((count, 0, 2)),
     )
@@ -43,7 +44,7 @@ def detected(board, points, cameras):
     chessboard = np.full((1, len(board.chessboard_m), 2), np.nan)
     chessboard[0, points.chessboard] = points.chessboard_px
     return Detections(
-        points.corners_px, cameras, np.ones(1), np.zeros(1), np.zeros(1), [board], [],
+        points.corners_px, cameras, np.ones(1), np.zeros(1), np.zeros(1), Targets.of([board]), [],
         np.zeros((1, 2), dtype=np.int64), np.zeros(len(points.marker), dtype=np.int64),
         points.marker, np.ones(1), chessboard,
     )

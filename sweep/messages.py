@@ -16,7 +16,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -133,27 +133,32 @@ MAX_WORD_LENGTH = 60
 """Longer words are not compared with known ones."""
 
 
-def nearest(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
-    """Return "; did you mean ...?" with the most similar known word, or "" if none is similar.
+def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
+    """Return the most similar known word, or "" if none is similar.
 
     Letters' cases, underscores and hyphens do not count. ``cutoff``: least share of equal letters.
     The word itself is never suggested: it is known, and wrong for another reason.
-
-    >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
-    ('; did you mean tilt_deg?', '; did you mean marker_id?')
     """
     if len(word) > MAX_WORD_LENGTH:
         return ""
     known = [name for name in known if name != word]
+    simple = {_letters(name): name for name in known}
     close = [name for name in known if _letters(name) == _letters(word)]
     close = close or [name for name in known if word and name.startswith(word)]
-    simple = {_letters(name): name for name in known}
-    close = close or [
-        simple[each]
-        for each in difflib.get_close_matches(_letters(word), list(simple), n=1, cutoff=cutoff)
-    ]
+    close = close or [simple[each] for each in difflib.get_close_matches(
+        _letters(word), list(simple), n=1, cutoff=cutoff)]
     close = close or difflib.get_close_matches(word, known, n=1, cutoff=cutoff - 0.1)
-    return f"; did you mean {close[0]}?" if close else ""
+    return close[0] if close else ""
+
+
+def nearest(word: str, known: Collection[str]) -> str:
+    """Return "; did you mean ...?" with the most similar known word, or "".
+
+    >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
+    ('; did you mean tilt_deg?', '; did you mean marker_id?')
+    """
+    close = similar(word, known)
+    return f"; did you mean {close}?" if close else ""
 
 
 MAX_SIMILAR = 6

@@ -7,7 +7,7 @@ import itertools
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,10 @@ from sweep.experiment.parameters import (
     SECTIONS,
     Parameter,
     is_zip,
-    places,
     read_plugins,
     section_of_settings,
 )
-from sweep.messages import MAX_FAULTS, nearest, plain, shown
+from sweep.messages import MAX_FAULTS, nearest, plain, shown, similar
 from sweep.model.image_file import read_regular
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -193,14 +192,46 @@ def toml_item(value: Any) -> tomlkit.items.Item:
 # --------------------------------------------------------------------------------------------------
 # The keys of a document. All faults are gathered: a value that cannot be is left out of the grid.
 
-MAX_HOMES = 3
-"""Keys of an unknown section whose own sections are named."""
-
 REQUIRE = "require"
 """The section of what the results must fulfil (`sweep.experiment.sampling`)."""
 
 SEARCH = "search"
 """The section of what is searched (`sweep.experiment.sampling`)."""
+
+MAX_TITLE_LENGTH = 200
+
+
+def _title(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MAX_TITLE_LENGTH or not value.isprintable():
+        raise ValueError(f"a string: one line of at most {MAX_TITLE_LENGTH} characters")
+    return value
+
+
+def _effects(value: Any) -> list[str]:
+    if (
+        not isinstance(value, list) or len({*map(str, value)}) < len(value)
+        or not all(isinstance(name, str) and name for name in value)
+    ):
+        raise ValueError('a list of plug-ins, each once, such as ["haze"]')
+    return value
+
+
+HEADER = {
+    declared.name: declared for declared in (
+        Declared("title", (str,), "", Declaration("title", reads=_title)),
+        Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
+        Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
+        Declared(EFFECTS_KEY, (list,), (), Declaration("plug-ins", reads=_effects)),
+    )
+}
+"""Keys that stand above the sections."""
+
+
+def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
+    """Return the section that a parameter belongs under; empty for an unknown name."""
+    if name == TRIAL:
+        return "axes"
+    return parameters[name].section if name in parameters else ""
 
 
 @dataclass(frozen=True)
@@ -236,30 +267,32 @@ class Reading(Grid):
         As the document says.
     recorded
         What a store has recorded of files and plug-ins.
+    written
+        Parameter -> where the document has it, and the value that stands there.
     unread
         Parameters that name plug-ins that cannot be used, and the sections of their settings: any
         key may be theirs.
     stated
         Values that a camera file has, by parameter: they are written into the document's text.
     faults
-        One line each: source, key, value, expectation.
+        One line each, once: source, key, value, expectation.
     """
 
     fixed: dict[str, Any]
-    given: set[str]
     axes: list[Axis]
     files: dict[str, str]
     document: Mapping[str, Any]
     source: str
     title: str
     recorded: Recorded
+    written: dict[str, tuple[str, Any]]
     unread: set[str] = field(default_factory=set)
     stated: dict[str, Any] = field(default_factory=dict)
-    faults: list[str] = field(default_factory=list)
+    faults: dict[str, None] = field(default_factory=dict)
 
     def note(self, key: str, problem: str) -> None:
         """Note a fault without a value."""
-        self.faults.append(f"{self.source}: {key}: {problem}")
+        self.faults[f"{self.source}: {key}: {problem}"] = None
 
     def fault(self, key: str, value: Any, expected: str) -> None:
         """Note a fault of a key's value."""
@@ -267,47 +300,36 @@ class Reading(Grid):
 
     def refuse(self, name: str, expected: str) -> None:
         """Note a fault of a parameter as the document has it."""
-        parameter = self.parameters[name]
-        path = next(iter(places(self.document, parameter)), f"{parameter.section}.{name}")
-        self.fault(path, self.written(name), expected)
+        path = f"{self.parameters[name].section}.{name}"
+        path, value = self.written.get(name, (path, self.fixed.get(name)))
+        self.fault(path, value, expected)
 
     def refuse_value(self, name: str, value: Any, expected: str) -> None:
         """Note a fault of one of a parameter's values."""
         self.fault(f"{self.parameters[name].section}.{name}", value, expected)
 
-    def refuse_values(self, name: str, expected: str, wrong: Callable[[Any], bool]) -> None:
-        """Note a fault of each value of a parameter on the grid that is wrong."""
-        for value in dict.fromkeys(filter(wrong, self.values_of(name))):
-            self.refuse_value(name, value, expected)
-
-    def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
+    def unknown(self, key: str, problem: str, word: str, known: Collection[str]) -> None:
         """Note an unknown key, with the nearest known one if the line will be printed."""
         hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
         self.note(plain(key), f"{problem}{hint}")
 
-    def unknown_key(self, section: str, key: str, known: Sequence[str], expected: str = "") -> None:
-        """Note a key that a section does not have, with the section where it or a similar one is.
+    def unknown_key(
+        self, section: str, key: str, known: Collection[str], expected: str = ""
+    ) -> None:
+        """Note a key that a section does not have, with the place of it or of a similar one.
 
         ``known`` are the section's keys; ``expected`` says so in words.
         """
-        homes = dict.fromkeys(known, "") | {
-            name: home for name in (*self.parameters, TRIAL, *HEADER)
-            if name not in known and (home := self._home_of(name))
-        }
         hint = ""
         if len(self.faults) < MAX_FAULTS:
-            hint = f"; it belongs {homes[key]}" if homes.get(key) else (
-                nearest(key, list(homes), 0.8) or nearest(key, known))
-            similar = hint.removeprefix("; did you mean ").removesuffix("?")
-            if homes.get(similar):
-                hint = f"{hint[:-1]} {homes[similar]}?"
-        self.note(plain(f"{section}.{key}"), f"unknown key{expected}{hint}")
-
-    def _home_of(self, name: str) -> str:
-        """Return where a key belongs, in words; empty for an unknown one."""
-        section = section_of(name, self.parameters)
-        return f"under [{section}]" if section else (
-            "at the top, above the sections" if name in HEADER else "")
+            homes = dict.fromkeys(HEADER, " at the top, above the sections") | {
+                name: f" under [{section_of(name, self.parameters)}]"
+                for name in (*self.parameters, TRIAL)} | dict.fromkeys(known, "")
+            close = similar(key, homes, 0.8) or similar(key, known)
+            hint = f"; it belongs{homes[key]}" if homes.get(key) else (
+                f"; did you mean {close}{homes[close]}?" if close else "")
+        path = f"{section}.{key}" if section else key
+        self.note(plain(path), f"unknown key{expected}{hint}")
 
     def table(self, name: str) -> Mapping[str, Any]:
         """Return a table of the document; an empty one where it is missing, or no table."""
@@ -319,62 +341,28 @@ class Reading(Grid):
         values, off = self.values_of(switch), self.parameters[switch].default
         return any(value != off for value in values) if values else switch in self.given
 
-    def together(self, *names: str) -> Iterator[tuple[Sequence[Any], ...]]:
-        """Yield values of some parameters, all of which meet on the grid.
+    def meeting(self, *names: str) -> Iterator[tuple[Any, ...]]:
+        """Yield values of some parameters that meet on the grid; none if one is at fault or drawn.
 
-        A set of values for each parameter: all its values, or of parameters that go together along
-        an axis one row after the other.
+        Of numbers that vary by themselves the least and the largest.
         """
-        columns = [
-            {name: axis.columns[name] for name in names if name in axis.columns}
-            for axis in self.axes
-        ]
-        joint = [each for each in columns if len(each) > 1]
-        rows = (dict.fromkeys(zip(*each.values(), strict=True)) for each in joint)
-        for chosen in itertools.product(*rows):
-            row = dict(zip(itertools.chain(*joint), itertools.chain(*chosen), strict=True))
-            yield tuple((row[name],) if name in row else self.values_of(name) for name in names)
-
-    def written(self, name: str) -> Any:
-        """Return the value that the document gives a parameter, for messages."""
-        given = places(self.document, self.parameters[name]).values()
-        return next(iter(given), self.fixed.get(name))
+        axes = [axis for axis in self.axes if not axis.columns.keys().isdisjoint(names)]
+        fixed = {name: self.fixed[name] for name in names if name in self.fixed}
+        for chosen in itertools.product(*(_rows(axis, names) for axis in axes)):
+            row = fixed | dict(itertools.chain(*chosen))
+            if len(row) == len(names):
+                yield tuple(row[name] for name in names)
 
 
-def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
-    """Return the section that a parameter belongs under; empty for an unknown name."""
-    if name == TRIAL:
-        return "axes"
-    return parameters[name].section if name in parameters else ""
-
-
-MAX_TITLE_LENGTH = 200
-
-
-def _title(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > MAX_TITLE_LENGTH or not value.isprintable():
-        raise ValueError(f"a string: one line of at most {MAX_TITLE_LENGTH} characters")
-    return value
-
-
-def _effects(value: Any) -> list[str]:
-    if (
-        not isinstance(value, list) or len({*map(str, value)}) < len(value)
-        or not all(isinstance(name, str) and name for name in value)
-    ):
-        raise ValueError('a list of plug-ins, each once, such as ["haze"]')
-    return value
-
-
-HEADER = {
-    declared.name: declared for declared in (
-        Declared("title", (str,), "", Declaration("title", reads=_title)),
-        Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
-        Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
-        Declared(EFFECTS_KEY, (list,), (), Declaration("plug-ins", reads=_effects)),
-    )
-}
-"""Keys that stand above the sections."""
+def _rows(axis: Axis, names: Collection[str]) -> Iterable[Sequence[tuple[str, Any]]]:
+    """Return the values of some parameters along an axis, each combination once."""
+    columns = {name: values for name, values in axis.columns.items() if name in names}
+    numbers, *others = columns.values()
+    if not others and all(type(value) in (int, float) for value in (
+            numbers[:1] if isinstance(numbers, range) else numbers)):
+        columns = dict.fromkeys(columns, sorted({min(numbers), max(numbers)}))
+    rows = dict.fromkeys(zip(*columns.values(), strict=True))
+    return [list(zip(columns, row, strict=True)) for row in rows]
 
 
 def read_keys(
@@ -387,24 +375,30 @@ def read_keys(
     header, lines = check_table(
         HEADER, {key: value for key, value in document.items() if key in HEADER}, "")
     plugins, faults = read_plugins(document, folder, recorded.plugins)
+    written: dict[str, tuple[str, Any]] = {}
     reading = Reading(
         seed=header["seed"], sampling=header["sampling"], title=header["title"], fixed={},
-        given=set(), distributions={}, axes=[], plugins=tuple(plugins), folder=folder,
-        files={each.file: each.digest for each in plugins if each.file},
+        given=written.keys(), written=written, distributions={}, axes=[], plugins=tuple(plugins),
+        folder=folder, files={each.file: each.digest for each in plugins if each.file},
         document=document, source=source, recorded=recorded,
-        faults=[f"{source}: {line}" for line in lines],
+        faults=dict.fromkeys(f"{source}: {line}" for line in lines),
     )
     for kind, key, name, expected in faults:
         reading.fault(key, name, expected)
         reading.unread.add(section_of_settings(kind))
         if kind in NAMED_BY:
             reading.unread.add(NAMED_BY[kind].name)
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
     for key, value in document.items():
-        if key in HEADER or key in (REQUIRE, SEARCH):
-            continue
-        if key != "axes" and key not in SECTIONS:
-            _refuse_key(reading, key, value)
-        elif not isinstance(value, dict):
+        if key not in known:
+            kind = "a section" if isinstance(value, dict) else "a key"
+            reading.unknown_key("", key, known, f"; expected {kind} of {', '.join(known)}")
+            # Keys of a section of another name are told where they belong.
+            if isinstance(value, dict) and len(reading.faults) < MAX_FAULTS and not similar(
+                    key, known):
+                for name in reading.parameters.keys() & value.keys():
+                    reading.unknown_key(key, name, ())
+        elif (key == "axes" or key in SECTIONS) and not isinstance(value, dict):
             reading.fault(key, value, f"a table: [{key}]")
     for section in SECTIONS:
         for key, value in reading.table(section).items():
@@ -416,42 +410,26 @@ def read_keys(
     return reading
 
 
-def _refuse_key(reading: Reading, key: str, value: Any) -> None:
-    """Note an unknown key, or section, that stands above all sections."""
-    if home := section_of(key, reading.parameters):
-        reading.fault(key, value, f"it under [{home}]")
-        return
-    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
-    kind = "a section" if isinstance(value, dict) else "a key"
-    homes = [f"{name} belongs under [{section_of(name, reading.parameters)}]"
-             for name in (value if isinstance(value, dict) else ())
-             if section_of(name, reading.parameters)][:MAX_HOMES]
-    reading.unknown(key, "; ".join([
-        f"unknown; expected {kind} of {', '.join(known)}",
-        *([] if nearest(key, known) else homes)]), key, known)
-
-
 def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
     """Read a key of a section: a value, or a distribution."""
     path = f"{section}.{key}"
     parameter = reading.parameters.get(key)
     if parameter is None or parameter.section != section:
-        if section in reading.unread and not section_of(key, reading.parameters):
-            return
         if is_zip(value):
             reading.fault(path, value, "parameters that go together under [axes]")
-        else:
+        elif section not in reading.unread or section_of(key, reading.parameters):
             reading.unknown_key(section, key, [
                 each.name for each in reading.parameters.values() if each.section == section])
         return
-    reading.given.add(key)
+    reading.written[key] = path, value
     try:
         if isinstance(value, dict):
             reading.distributions[key] = parse_distribution(parameter, value)
         else:
             reading.fixed[key] = parameter.check(value)
     except TablesError as error:
-        reading.faults.extend(f"{reading.source}: {path}{line}" for line in error.lines)
+        for line in error.lines:
+            reading.faults[f"{reading.source}: {path}{line}"] = None
     except ValueError as error:
         if key not in reading.unread:
             axis = "; several values are an axis: they go under [axes]" if (
@@ -483,21 +461,18 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
             return parse_trial(value)
         if key == TRIAL:
             raise ValueError("it as an axis of its own: every cell has the same trials")
-        if key in HEADER:
-            reading.unknown_key("axes", key, ())
-        elif key in reading.given:
-            other = next((other for other in places(reading.document, reading.parameters[key])
-                          if other != path), "it")
+        if key in reading.given:
+            other, _ = reading.written[key]
             reading.fault(path, value, f"it once: {other} is given too; delete one of them")
         elif key in reading.parameters:
-            reading.given.add(key)
+            reading.written[key] = path, value
             return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
         elif isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
             raise ValueError(
                 "parameters that go together as "
                 "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip")
-        elif not reading.unread:
-            reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
+        elif not reading.unread or key in HEADER:
+            reading.unknown_key(path.removesuffix(f".{key}"), key, [*reading.parameters, TRIAL])
     except ValueError as error:
         if key not in reading.unread:
             reading.fault(path, value, str(error))

@@ -144,37 +144,9 @@ def superseded(given: Collection[str]) -> set[str]:
     return {rival for name in given for rival in RIVALS.get(name, ())}
 
 
-def contradictions(given: Collection[str]) -> list[tuple[list[str], list[str]]]:
-    """Return pairs of ways, as the parameters given, of which only one can be, for each quantity.
-
-    >>> contradictions({"hfov_deg", "fx_px", "fy_px", "tilt_deg"})
-    [(['fx_px', 'fy_px'], ['hfov_deg'])]
-    """
-    pairs = []
-    for choice in CHOICES:
-        ways = [names for way in choice if (names := [name for name in way if name in given])]
-        pairs += [(ways[0], other) for other in ways[1:]]
-    return pairs
-
-
-# --------------------------------------------------------------------------------------------------
-# Where a document has a parameter: under its section, or along an axis, alone or with others.
-
 def is_zip(value: Any) -> bool:
     """Return whether a value under [axes] makes an axis of parameters that go together."""
     return isinstance(value, dict) and value.keys() == {"zip"} and isinstance(value["zip"], dict)
-
-
-def places(document: Mapping[str, Any], parameter: Parameter) -> dict[str, Any]:
-    """Return the value of each place of a document that gives a parameter, by its path."""
-    axes = document.get("axes")
-    tables = {parameter.section: document.get(parameter.section), "axes": axes} | {
-        f"axes.{key}": value["zip"]
-        for key, value in (axes if isinstance(axes, dict) else {}).items() if is_zip(value)
-    }
-    name = parameter.name
-    return {f"{path}.{name}": table[name] for path, table in tables.items()
-            if isinstance(table, dict) and name in table}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -197,10 +169,15 @@ def section_of_settings(kind: str) -> str:
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name and key of each plug-in that a document names, or means to, in its order."""
     installed = cache(installed_names)
+    axes = document.get("axes")
+    zips = {f"axes.{key}": value["zip"] for key, value in axes.items() if is_zip(value)
+            } if isinstance(axes, dict) else {}
     for kind, parameter in NAMED_BY.items():
         # Where there are several choices, another word is more likely one of them, misspelt.
         few = len(parameter.declaration.choices) == 1
-        for key, value in places(document, parameter).items():
+        tables = {parameter.section: document.get(parameter.section), "axes": axes, **zips}
+        for path, table in tables.items():
+            value = table.get(parameter.name) if isinstance(table, dict) else None
             listed = value.get("values") if isinstance(value, dict) else value
             for name in listed if isinstance(listed, list) else [listed]:
                 if not isinstance(name, str):
@@ -209,7 +186,7 @@ def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
                     parameter.check(name)
                 except ValueError:
                     if few or ":" in name or name in installed(kind):
-                        yield kind, name, key
+                        yield kind, name, f"{path}.{parameter.name}"
     effects = document.get(EFFECTS_KEY)
     for name in effects if isinstance(effects, list) else ():
         if isinstance(name, str):

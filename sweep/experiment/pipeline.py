@@ -471,7 +471,7 @@ def _checked(
     resolve_sensor(reading)
     check_rules(reading)
     if reading.faults:
-        raise refusal(reading.faults)
+        raise refusal([*reading.faults])
     if chosen or reading.stated:
         # Comments stay. A text that is refused never comes here: tomlkit is slow.
         written = tomlkit.parse(text)

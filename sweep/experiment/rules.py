@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from sweep.experiment.axes import MAX_DEVIATIONS, TRIAL
 from sweep.experiment.document import HEADER, SEARCH, Reading
 from sweep.experiment.draws import REPLICATES, SAMPLINGS
 from sweep.experiment.parameters import (
+    CHOICES,
     FIELDS_OF_VIEW,
     FOCAL_LENGTHS,
     IN_CAMERA,
@@ -29,29 +29,23 @@ from sweep.experiment.parameters import (
     STATED,
     WORLD,
     Stage,
-    contradictions,
 )
-from sweep.experiment.photographs import PhotographRecord, read_record
+from sweep.experiment.photographs import read_record
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV, DetectorSetting
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
-from sweep.messages import label, plain, shown
+from sweep.messages import plain, shown
 from sweep.model.board_kinds import (
     ARRANGING,
     NEEDED,
+    SINGLE,
     arranged_board,
     arrangement_faults,
     is_solid,
     used_by,
 )
-from sweep.model.calibration import (
-    MAX_BYTES,
-    Calibration,
-    CalibrationError,
-    calibration_of,
-    read_tree,
-)
+from sweep.model.calibration import MAX_BYTES, CalibrationError, calibration_of, read_tree
 from sweep.model.camera import DEFAULT_SENSOR_MM, VIEW_PARAMETERS, are_square, intrinsics
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular
@@ -67,7 +61,9 @@ from sweep.model.sensor import MAX_LEVEL, MIN_FRAME_PX
 from sweep.plugins.recording import is_recording
 
 # --------------------------------------------------------------------------------------------------
-# Values that cannot be, or cannot meet on a grid.
+# Two records: values that cannot meet on the grid, and parameters that have no place somewhere.
+#
+# A parameter whose own value is at fault is passed over: its fault is known already.
 
 @dataclass(frozen=True, slots=True)
 class Rule:
@@ -81,45 +77,60 @@ class Rule:
         Whether a value of each cannot meet. Of numbers it gets the least and the largest, and of
         IDs the largest alone: in each number it changes once.
     expected
-        What is expected in place of the first, given a value of each.
-    each
-        Whether every wrong value is named; else the parameter as the document has it.
+        What is expected in place of the first: text, or a function of a value of each.
     """
 
     names: tuple[str, ...]
     wrong: Callable[..., bool]
-    expected: Callable[..., str]
-    each: bool = False
+    expected: str | Callable[..., str]
 
     def check(self, reading: Reading) -> None:
-        """Note each expectation that is missed, once."""
-        told = set()
-        for group in reading.together(*self.names):
-            for values in itertools.product(*map(_ends, group)):
-                if self.wrong(*values):
-                    expected = self.expected(*values)
-                    fault = (values[0] if self.each else None, expected)
-                    if fault not in told:
-                        told.add(fault)
-                        if self.each:
-                            reading.refuse_value(self.names[0], values[0], expected)
-                        else:
-                            reading.refuse(self.names[0], expected)
+        """Note each value that cannot be, with what is expected."""
+        for values in reading.meeting(*self.names):
+            if self.wrong(*values):
+                reading.refuse_value(self.names[0], values[0], self.expected if isinstance(
+                    self.expected, str) else self.expected(*values))
 
 
-def _ends(values: Sequence[Any]) -> Sequence[Any]:
-    """Return the least and the largest of numbers; other values, each once."""
-    if isinstance(values, range):
-        return sorted({values[0], values[-1]})
-    if values and all(type(value) in (int, float) for value in values):
-        return sorted({min(values), max(values)})
-    return list(dict.fromkeys(values))
+@dataclass(frozen=True, slots=True)
+class Exclusion:
+    """Parameters that have no place where something holds.
+
+    Attributes
+    ----------
+    names
+        The parameters.
+    where
+        Whether it holds.
+    expected
+        What is expected in place of a parameter that is given.
+    active
+        Whether a neutral value is none that counts.
+    """
+
+    names: Iterable[str]
+    where: Callable[[Reading], Any]
+    expected: str
+    active: bool = False
+
+    def check(self, reading: Reading) -> None:
+        """Note each parameter that has no place."""
+        for name in self.names:
+            if name in reading.given and self.where(reading) and (
+                    reading.is_active(name) or not self.active):
+                reading.refuse(name, self.expected)
+
+
+def check_rules(reading: Reading) -> None:
+    """Add the faults of all rules to a reading, in the order of their messages."""
+    for rule in RULES:
+        rule(reading)
 
 
 def _is_no_noise_table(table: Sequence[float]) -> bool:
     levels, deviations = table[::2], table[1::2]
     return (
-        any(a >= b for a, b in itertools.pairwise(levels))
+        list(levels) != sorted(set(levels))
         or not all(0 <= level <= MAX_LEVEL for level in levels)
         or not all(0 <= deviation <= 1e6 for deviation in deviations)
     )
@@ -130,57 +141,105 @@ def _whole_frame(name: str, is_whole: Callable[[Any], bool]) -> Rule:
     return Rule(
         (name, "width_px", "height_px"),
         lambda value, width, height: width * height > MAX_PIXELS and is_whole(value),
-        lambda *_: f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels")
+        f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels")
 
 
-OF_VALUES = (
+def _is_calibrated(reading: Reading) -> bool:
+    """Return whether an estimator believes a calibration."""
+    return "calibration" in reading.values_of("believed")
+
+
+def _in_planes(*listed: Any) -> bool:
+    """Return whether prints, listed as parameters' values, lie in several planes."""
+    return any(map(is_solid, listed))
+
+
+SEVERAL_PLANES = "for prints with z_m or tilt_deg"
+
+OTHER_WAYS = (*IN_MM, *FIELDS_OF_VIEW)
+"""The ways to give a camera beside focal lengths in pixels, and beside a file."""
+
+RECORDS: tuple[Rule | Exclusion, ...] = (
     Rule(("marker_id", "dictionary"),
          lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
          lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
          f"{dictionary} has"),
-    Rule(("renderer", "dictionary"),
-         lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
-         lambda *_: "exact for STag's markers, which have circles"),
     Rule(("noise_table",), _is_no_noise_table,
-         lambda _: "level, standard deviation, level, standard deviation, ...: levels that ascend "
-         f"from 0 to {MAX_LEVEL:g}, deviations of at least 0", each=True),
+         "level, standard deviation, level, standard deviation, ...: levels that ascend from 0 "
+         f"to {MAX_LEVEL:g}, deviations of at least 0"),
     *(Rule((name, "bayer"),
            lambda length, bayer: length < MIN_FRAME_PX and bayer != "none",
-           lambda *_: f"at least {MIN_FRAME_PX}, for bayer to be demosaiced")
+           f"at least {MIN_FRAME_PX}, for bayer to be demosaiced")
       for name in ("width_px", "height_px")),
     Rule(("adaptiveThreshWinSizeMax", "adaptiveThreshWinSizeMin"),
-         lambda largest, smallest: largest < smallest,
-         lambda *_: "at least adaptiveThreshWinSizeMin"),
+         lambda largest, smallest: largest < smallest, "at least adaptiveThreshWinSizeMin"),
     _whole_frame("window", lambda value: value == "full"),
     _whole_frame("useAruco3Detection", bool),
     _whole_frame("adaptiveThreshConstant", lambda value: value < 1),
     _whole_frame("aprilTagQuadDecimate", lambda value: value > 1),
-)
-
-BOARD_SOLVERS = tuple(name for name, each in SOLVERS.items() if each.of_boards)
-
-OF_BOARDS = (
-    Rule(("renderer",), lambda renderer: not is_renderer(renderer),
-         lambda _: f"{RENDERERS}, for boards", each=True),
+    # Renderers.
+    Rule(("renderer", "dictionary"),
+         lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
+         "exact for STag's markers, which have circles"),
+    Rule(("renderer", "kind", "distractors"),
+         lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
+         f"{RENDERERS}, for boards"),
+    Rule(("renderer", "markers", "distractors"),
+         lambda renderer, *listed: renderer != "exact" and _in_planes(*listed),
+         f"exact, {SEVERAL_PLANES}"),
+    Exclusion(GEOMETRIC, lambda reading: {*reading.values_of("renderer")} - {"exact"},
+              "renderer = exact beside it, which alone has it", active=True),
+    Exclusion(("curvature_per_m", "occlusion"),
+              lambda reading: _in_planes(
+                  *reading.values_of("markers"), *reading.values_of("distractors")),
+              f"it absent, {SEVERAL_PLANES}: it is of one sheet", active=True),
+    # Cameras, and what estimators believe of them.
+    Exclusion(OTHER_WAYS, lambda reading: "camera_file" in reading.given,
+              "no other camera beside camera_file; delete it, or camera_file"),
+    Exclusion(
+        ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px",
+         "believed_focal_scale", "believed_distortion"), _is_calibrated,
+        "no other belief about the camera beside believed = calibration; delete one of them"),
+    # Photographs, which have their own poses and light.
+    Exclusion((SIMULATED,), lambda reading: PHOTOGRAPHS not in reading.given,
+              f"{PHOTOGRAPHS} beside it, whose poses are taken", active=True),
+    Exclusion(("kind",), lambda reading: PHOTOGRAPHS in reading.given and reading.shows_boards,
+              "no board beside photographs, whose board `sweep photos` knows; delete it"),
+    Rule(("believed", PHOTOGRAPHS), lambda believed, file: file and believed == "calibration",
+         "truth, for photographs"),
+    # Boards.
+    Exclusion(("points", "refine", "refineDetectedMarkers", "minMarkers"),
+              lambda reading: not reading.shows_boards, "a board: give kind under [board]"),
+    Exclusion(("ids",), lambda reading: "marker_id" in reading.given,
+              "ids, or marker_id of the first; not both", active=True),
     Rule(("points", "detector"),
          lambda points, detector: points == "chessboard" and is_recording(detector),
-         lambda *_: "markers beside recorded detections, which have no corners of chessboards",
-         each=True),
+         "markers beside recorded detections, which have no corners of chessboards"),
     Rule(("refineDetectedMarkers", "detector"),
          lambda refine, detector: refine and is_recording(detector),
-         lambda *_: "false beside recorded detections: no image is searched", each=True),
+         "false beside recorded detections: no image is searched"),
+    Rule(("refineDetectedMarkers", "markers"),
+         lambda refine, listed: refine and is_solid(listed), f"false, {SEVERAL_PLANES}"),
+    Rule(("solver", "points", "markers"),
+         lambda solver, points, listed: is_solid(listed) and solver in SOLVERS
+         and SOLVERS[solver].planar_only and points in ("markers", "chessboard"),
+         f"one of iterative, sqpnp, epnp, photometric, {SEVERAL_PLANES}"),
 )
 
+ONE_VALUE = {
+    "camera_file": "one file; cameras to compare are axes of fx_px, distortion and so on",
+    **dict.fromkeys(STATED, "one list of numbers, not an axis"),
+    SIMULATED: "one value",
+    **dict.fromkeys(("ids", "markers", "distractors"), "it under [board]: it cannot be an axis"),
+}
+"""Parameters that cannot be an axis, and what is expected instead."""
 
-def of_sheets(why: str) -> tuple[Rule, ...]:
-    """Return the rules of targets in several planes."""
-    return (
-        Rule(("solver", "points"),
-             lambda solver, points: solver in SOLVERS and SOLVERS[solver].planar_only
-             and points in ("markers", "chessboard"),
-             lambda *_: f"one of iterative, sqpnp, epnp, photometric, {why}", each=True),
-        Rule(("refineDetectedMarkers",), bool, lambda _: f"false, {why}", each=True),
-    )
+
+def one_value(reading: Reading) -> None:
+    """Demand one value of what cannot be an axis."""
+    for name, expected in ONE_VALUE.items():
+        if reading.axis_of(name) is not None:
+            reading.refuse(name, expected)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -196,27 +255,19 @@ def resolve_sensor(reading: Reading) -> None:
 
     So a pipeline that states the default is equal to one that leaves it out.
     """
-    if reading.given & {*FOCAL_LENGTHS, *FIELDS_OF_VIEW, "pixel_size_um"}:
+    if not reading.given.isdisjoint((*FOCAL_LENGTHS, *FIELDS_OF_VIEW, "pixel_size_um")):
         return
-    ends = [_ends(reading.values_of(name)) for name in ("width_px", "height_px", *SENSOR_SIDES)]
-    if all(map(len, ends)) and all(map(_default_is_square, itertools.product(*ends))):
+    across, down = DEFAULT_SENSOR_MM
+    frames = [(width / (side or across), height / (other or down)) for
+              width, height, side, other in reading.meeting("width_px", "height_px", *SENSOR_SIDES)]
+    if frames and all(are_square(*focal_lengths) for focal_lengths in frames):
         for name, default in zip(SENSOR_SIDES, DEFAULT_SENSOR_MM, strict=True):
             if name not in reading.given:
                 reading.fixed[name] = default
 
 
-def _default_is_square(values: tuple[Any, ...]) -> bool:
-    """Return whether a frame's sides, and those of its sensor or the default, make it square."""
-    width, height, *given = values
-    sides = [side or default for side, default in zip(given, DEFAULT_SENSOR_MM, strict=True)]
-    fx, fy, _, _ = intrinsics(width, height, sides[0], sides[1], 1.0, None, None, None, None)
-    return bool(are_square(fx, fy))
-
-
 FILE_VALUES = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
 """The parameters whose values a camera file has."""
-
-OTHER_WAYS = (*IN_MM, *FIELDS_OF_VIEW)
 
 
 def file_and_camera(written: str, is_file: Callable[[str], bool]) -> tuple[str, str]:
@@ -230,21 +281,17 @@ def file_and_camera(written: str, is_file: Callable[[str], bool]) -> tuple[str, 
 
 
 def read_camera_file(reading: Reading) -> None:
-    """Give the camera's parameters the values of its file; note the file's digest, and faults."""
-    if reading.axis_of("camera_file") is not None:
-        reading.refuse(
-            "camera_file", "one file; cameras to compare are axes of fx_px, distortion and so on")
-        return
+    """Give the camera's parameters the values of its file; note the file's digest, and faults.
+
+    Keys that say something else than the file are at fault.
+    """
     written = reading.fixed.get("camera_file")
     if written is None:
-        return
-    if not written.isprintable():
-        reading.refuse("camera_file", "a path without control characters")
         return
     known = reading.recorded.cameras
     if known is None:
         known = reading.recorded.files
-    if known is not None and reading.given.issuperset(FILE_VALUES):
+    if known is not None and reading.given >= {*FILE_VALUES}:
         path, _ = file_and_camera(written, known.__contains__)
         if path in known:
             reading.files[path] = known[path]
@@ -259,107 +306,62 @@ def read_camera_file(reading: Reading) -> None:
         reading.refuse("camera_file", f"a camera file ({reason})")
         return
     reading.files[path] = hashlib.sha256(content).hexdigest()
-    _take(reading, plain(Path(path).name), calibration)
-
-
-def _take(reading: Reading, name: str, calibration: Calibration) -> None:
-    """Take the values of a file of this name; keys that say something else are at fault."""
-    for other in reading.given.intersection(OTHER_WAYS):
-        reading.refuse(
-            other, f"no other camera beside camera_file; delete it, or camera_file ({name})")
-    if calibration.width_px is None or calibration.height_px is None:
-        missing = [key for key in ("width_px", "height_px") if key not in reading.given]
-        if missing:
-            reading.refuse(
-                "camera_file", f"{' and '.join(missing)} beside it: {name} does not say which "
-                "frame size it holds for")
-    values: dict[str, Any] = {
-        **{key: getattr(calibration, key) for key in FILE_VALUES},
-        **{key: number for key, number in zip(
-            STATED, (calibration.sd, calibration.covariance), strict=True) if number},
-    }
+    name = plain(Path(path).name)
+    values = {key: getattr(calibration, key) for key in FILE_VALUES} | {
+        key: numbers for key, numbers in zip(
+            STATED, (calibration.sd, calibration.covariance), strict=True) if numbers}
+    missing = [key for key in values if values[key] is None and key not in reading.given]
+    if missing:
+        reading.refuse("camera_file", f"{' and '.join(missing)} beside it: {name} does not say "
+                       "which frame size it holds for")
     for key, value in values.items():
-        brief = plain(shown(list(value)) if isinstance(value, tuple) else label(value))
-        if key in reading.given and value is not None and reading.fixed.get(key) != value:
-            hint = "; a calibration holds for its own frame size" if key in (
-                "width_px", "height_px") else ""
-            reading.refuse(key, f"{brief}, which {name} has; delete it, or camera_file{hint}")
-        elif key not in reading.given and value is not None:
-            reading.given.add(key)
+        if value is None:
+            continue
+        if key not in reading.given:
             try:
                 reading.fixed[key] = PARAMETERS[key].check(value)
-                reading.stated[key] = value
             except ValueError as error:
-                del reading.fixed[key]
                 reading.refuse(
-                    "camera_file", f"a camera file ({key} = {brief}: expected {error})")
-
-
-# --------------------------------------------------------------------------------------------------
-# What estimators believe of the camera.
-
-OWN_BELIEFS = (
-    "believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px",
-    "believed_focal_scale", "believed_distortion",
-)
-"""Beliefs about what a calibration determines."""
+                    "camera_file", f"a camera file ({key} = {shown(value)}: expected {error})")
+                del reading.fixed[key]
+            reading.written[key] = f"camera.{key}", value
+            reading.stated[key] = value
+        elif reading.fixed.get(key) != value:
+            reading.refuse(key, f"{shown(value)}, which {name} has; delete it, or camera_file")
 
 
 def beliefs_in_one_way(reading: Reading) -> None:
-    """Demand beliefs that do not contradict each other, and a calibration where one is believed."""
-    known = _calibration_is_sound(reading)
-    if "calibration" not in reading.values_of("believed"):
-        return
-    if known and not any(reading.fixed[name] for name in STATED):
-        where = "camera_file has none" if reading.fixed.get("camera_file") else "or a camera_file"
-        reading.refuse(
-            "believed", f"a calibration's standard deviations: give calibration_sd under [camera] "
-            f"({where})")
-    for name in reading.given.intersection(OWN_BELIEFS):
-        reading.refuse(name, "no other belief about the camera beside believed = calibration; "
-                       "delete one of them")
-
-
-def _calibration_is_sound(reading: Reading) -> bool:
-    """Note what is wrong with standard deviations or covariance; return whether nothing is."""
-    sd, covariance = STATED
-    given = [name for name in STATED if reading.fixed.get(name, True)]
+    """Demand the error of a calibration in one way, and one where a calibration is believed."""
     if not reading.fixed.keys() >= {*STATED}:
-        for name in STATED:
-            if reading.axis_of(name) is not None:
-                reading.refuse(name, "one list of numbers, not an axis")
-        return False
+        return
+    sd, covariance = STATED
+    given = [name for name in STATED if reading.fixed[name]]
     if len(given) == 2:
         reading.refuse(sd, f"{sd} or {covariance}, not both; delete one of them")
-    if len(given) != 1:
-        return not given
+    elif given:
+        _errors_are_sound(reading, given[0])
+    elif _is_calibrated(reading):
+        where = "camera_file has none" if reading.fixed.get("camera_file") else "or a camera_file"
+        reading.refuse("believed", "a calibration's standard deviations: give calibration_sd under "
+                       f"[camera] ({where})")
+
+
+def _errors_are_sound(reading: Reading, name: str) -> None:
+    """Demand as many errors as the camera has numbers, and focal lengths that stay above 0."""
     try:
         errors = [
-            CalibrationError.of(reading.fixed[sd], reading.fixed[covariance], count)
+            CalibrationError.of(reading.fixed[STATED[0]], reading.fixed[STATED[1]], count)
             for count in {len(lens) for lens in reading.values_of("distortion")}
         ]
     except ValueError as error:
-        reading.refuse(given[0], str(error))
-        return False
-    values = [reading.values_of(parameter) for parameter in VIEW_PARAMETERS]
-    if not errors or not all(map(len, values)):
-        return False
-    least = intrinsics(*map(_with_least_focal_length, VIEW_PARAMETERS, values))
-    for focal, length in zip(FOCAL_LENGTHS, least, strict=False):
-        if not float(length) > MAX_DEVIATIONS * errors[0].sd(focal):
-            reading.refuse(
-                given[0], f"focal lengths with standard deviations below 1/{MAX_DEVIATIONS} of "
-                f"them, here {float(length) / MAX_DEVIATIONS:.4g} px")
-            return False
-    return True
-
-
-def _with_least_focal_length(parameter: str, values: Sequence[Any]) -> Any:
-    """Return the value of a camera's parameter on the grid at which focal lengths are least."""
-    if values[0] is None:
-        return None
-    grows = parameter in ("width_px", "height_px", "focal_length_mm", "fx_px", "fy_px")
-    return min(values) if grows else max(values)
+        reading.refuse(name, str(error))
+        return
+    cameras = [intrinsics(*values)[:2] for values in reading.meeting(*VIEW_PARAMETERS)]
+    for focal, lengths in zip(FOCAL_LENGTHS, zip(*cameras, strict=True), strict=False):
+        if errors and not min(lengths) > MAX_DEVIATIONS * errors[0].sd(focal):
+            reading.refuse(name, f"focal lengths with standard deviations below 1/{MAX_DEVIATIONS} "
+                           f"of them, here {min(lengths) / MAX_DEVIATIONS:.4g} px")
+            return
 
 
 # --------------------------------------------------------------------------------------------------
@@ -367,36 +369,32 @@ def _with_least_focal_length(parameter: str, values: Sequence[Any]) -> Any:
 
 def check_backgrounds(reading: Reading) -> None:
     """Demand background images that can be read and have the frame's size."""
+    sizes = {}
     for value in reading.values_of("background"):
         if not isinstance(value, str):
-            continue
-        if not value.isprintable():
-            reading.refuse_value("background", value, "a path without control characters")
             continue
         if reading.recorded.files is not None:
             reading.files[value] = reading.recorded.files.get(value, "")
             continue
         path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
         try:
-            height, width = decode_grey(path).shape
-            problem = _wrong_size(reading, value, width, height)
+            sizes[value] = decode_grey(path).shape[::-1]
             reading.files[value] = file_digest(Path(path)) or ""
         except ValueError as error:
-            problem = f"a level or an image file ({error})"
-        if problem is not None:
-            reading.refuse_value("background", value, problem)
+            reading.refuse_value("background", value, f"a level or an image file ({error})")
+    _have_the_frames_size(reading, "background", sizes)
 
 
-def _wrong_size(reading: Reading, background: str, width: int, height: int) -> str | None:
-    """Return the expectation that a background of a size in pixels misses; None if it fits."""
-    for name, length in (("width_px", width), ("height_px", height)):
-        if any(background in backgrounds and {*frames} - {length}
-               for backgrounds, frames in reading.together("background", name)):
-            return (
-                f"an image of exactly the frame's size: it is {width} x {height}, but "
-                f"{name} = {shown(reading.written(name))}"
-            )
-    return None
+def _have_the_frames_size(
+    reading: Reading, name: str, sizes: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Demand frames of the ``sizes``, width and height in pixels, of the files of a parameter."""
+    for side, key in enumerate(("width_px", "height_px")):
+        for file, length in reading.meeting(name, key):
+            if file in sizes and sizes[file][side] != length:
+                reading.refuse_value(
+                    name, file, "images of exactly the frame's size: it is "
+                    f"{' x '.join(map(str, sizes[file]))}, but {key} = {length}")
 
 
 def file_digest(path: Path) -> str | None:
@@ -412,25 +410,14 @@ def photographs_alone(reading: Reading) -> None:
 
     Of images that are simulated at their poses, the poses and the markers alone.
     """
-    simulated = any(reading.values_of(SIMULATED))
     if PHOTOGRAPHS not in reading.given:
-        if simulated:
-            reading.refuse(SIMULATED, f"{PHOTOGRAPHS} beside it, whose poses are taken")
         return
-    if reading.axis_of(SIMULATED) is not None:
-        reading.refuse(SIMULATED, "one value")
-        return
-    for name in sorted(reading.given):
-        section = reading.parameters[name].section
-        if section == "pose" or (
-            section == "scene" and not simulated and name not in (PHOTOGRAPHS, SIMULATED)
-        ):
-            reading.refuse(name, "nothing beside photographs, which have their own "
-                           f"poses{'' if simulated else ' and light'}; delete it")
-    for name in reading.distributions if not simulated else ():
-        reading.refuse(name, "a value: photographs are not drawn")
-    reading.refuse_values(
-        "believed", "truth, for photographs", lambda name: name == "calibration")
+    simulated = any(reading.values_of(SIMULATED))
+    own = "poses" if simulated else "poses and light"
+    for name in reading.given - {PHOTOGRAPHS, SIMULATED}:
+        if reading.parameters[name].section in ("pose", "pose" if simulated else "scene"):
+            reading.refuse(
+                name, f"nothing beside photographs, which have their own {own}; delete it")
     if reading.sampling != SAMPLINGS[0]:
         reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
     if SEARCH in reading.document:
@@ -438,6 +425,8 @@ def photographs_alone(reading: Reading) -> None:
     if reading.recorded.files is not None:
         reading.files.update(reading.recorded.files)
         return
+    sizes = {}
+    trials = len(reading.values_of(TRIAL) or (0,))
     for name in dict.fromkeys(reading.values_of(PHOTOGRAPHS)):
         path = Path(reading.folder) / name
         try:
@@ -445,32 +434,21 @@ def photographs_alone(reading: Reading) -> None:
         except PluginError as error:
             reading.refuse_value(PHOTOGRAPHS, name, str(error))
             continue
-        for expected in _mismatches(reading, name, record, simulated):
-            reading.refuse_value(PHOTOGRAPHS, name, expected)
+        sizes[name] = record.width_px, record.height_px
+        count, ids = len(record.paths), set(record.marker_id.tolist())
+        if trials > count and not simulated:
+            reading.refuse_value(PHOTOGRAPHS, name, f"trial = {count} at most: its photographs; "
+                                 f"there are {trials} trials")
+        for unknown in [each for each in reading.values_of("marker_id") if each not in ids][:1]:
+            reading.refuse_value(PHOTOGRAPHS, name, f"markers that it has: {shown(sorted(ids))}; "
+                                 f"marker_id = {unknown} is none of them")
         for relative, known in zip(record.paths, record.digests, strict=True):
             found = known if simulated else file_digest(path.parent / relative)
             if found != known:
                 reading.note(plain(relative), "the photograph cannot be read" if found is None else
                              "the photograph is not the one that was recorded: its SHA-256 differs")
             reading.files[relative] = known
-
-
-def _mismatches(
-    reading: Reading, name: str, record: PhotographRecord, simulated: bool
-) -> Iterator[str]:
-    """Yield what the pipeline asks of a record that it does not have."""
-    trials = reading.values_of(TRIAL) or (0,)
-    if trials[-1] >= len(record.paths) and not simulated:
-        yield (f"trial = {len(record.paths)} at most: its photographs; there are "
-               f"{len(trials)} trials")
-    ids = set(record.marker_id.tolist())
-    unknown = [each for each in reading.values_of("marker_id") if each not in ids]
-    if unknown:
-        yield f"markers that it has: {shown(sorted(ids))}; marker_id = {unknown[0]} is none of them"
-    for key, length in (("width_px", record.width_px), ("height_px", record.height_px)):
-        for names, lengths in reading.together(PHOTOGRAPHS, key):
-            if name in names and any(each != length for each in lengths):
-                yield f"{key} = {length}, that of its photographs"
+    _have_the_frames_size(reading, PHOTOGRAPHS, sizes)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -482,55 +460,36 @@ MAX_BOARDS = 10_000
 MAX_BOARD_FAULTS = 10
 """Faults of boards after which no other board is checked."""
 
-IN_ONE_PLANE = {
-    "curvature_per_m": "a bend is that of one sheet",
-    "occlusion": "the sheet that hides lies in the target's plane",
-}
-"""Switches of effects that targets in several planes cannot have, and why."""
-
 
 def boards_can_be_printed(reading: Reading) -> None:
     """Demand what each kind of board needs, and boards whose parts do not overlap."""
-    kinds = reading.values_of("kind")
+    kinds = dict.fromkeys(reading.values_of("kind"))
     needed = {name: kind for kind in kinds for name in NEEDED[kind] if name not in reading.given}
     for name, kind in needed.items():
         meaning = reading.parameters[name].declaration.meaning
         reading.note(f"board.{name}", f"missing; kind = {shown(kind)} needs it: {meaning}")
     used = {"kind", *(name for kind in kinds for name in used_by(kind))}
-    for name, parameter in reading.parameters.items() if kinds else ():
-        if parameter.section == "board" and name in reading.given - used:
+    for name in reading.given - used if kinds else ():
+        if reading.parameters[name].section == "board":
             users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
-            reading.refuse(name, f"kind = {users}, which uses it; kind = "
-                           f"{' or '.join(dict.fromkeys(kinds))} does not: delete it")
+            reading.refuse(name, f"kind = {users}, which uses it; kind = {' or '.join(kinds)} does "
+                           "not: delete it")
     if not reading.shows_boards or needed or not all(map(reading.values_of, ARRANGING)):
         return
-    if "marker_id" in reading.given and any(reading.values_of("ids")):
-        reading.refuse("ids", "ids, or marker_id of the first; not both")
-        return
-    for name in ("ids", "markers", "distractors"):
-        if reading.axis_of(name) is not None:
-            reading.fault(f"axes.{name}", "...", f"{name} under [board]: they cannot be an axis")
-            return
     count = math.prod(
         len(axis) for axis in reading.axes if not axis.columns.keys().isdisjoint(ARRANGING))
     if count > MAX_BOARDS:
         reading.note("axes", f"{count:,} different boards: expected at most {MAX_BOARDS:,}")
         return
-    seen = set()
+    faults = len(reading.faults)
     for values in reading.arrangements():
         for name, value, expected in arrangement_faults(values):
-            if (name, expected) not in seen:
-                seen.add((name, expected))
-                section = reading.parameters[name.partition("[")[0]].section
-                reading.fault(f"{section}.{name}", value, expected)
-        if len(seen) > MAX_BOARD_FAULTS:
+            section = reading.parameters[name.partition("[")[0]].section
+            reading.fault(f"{section}.{name}", value, expected)
+        if len(reading.faults) > faults + MAX_BOARD_FAULTS:
             return
-    if not seen and "warp" in reading.values_of("renderer"):
-        _bitmaps_fit(reading)
-
-
-def _bitmaps_fit(reading: Reading) -> None:
-    """Demand boards of which ``warp`` can draw bitmaps."""
+    if len(reading.faults) > faults or "warp" not in reading.values_of("renderer"):
+        return
     for values in reading.arrangements():
         height, width = bitmap_shape(arranged_board(*values))
         if max(height, width) > MAX_BITMAP_SIDE or height * width > MAX_BITMAP_PX:
@@ -543,86 +502,52 @@ def _bitmaps_fit(reading: Reading) -> None:
             return
 
 
-def boards_are_searched_and_solved(reading: Reading) -> None:
-    """Demand detectors, solvers and renderers that can do boards."""
+BOARD_SOLVERS = ", ".join(name for name, each in SOLVERS.items() if each.of_boards)
+
+
+def targets_are_solved(reading: Reading) -> None:
+    """Demand solvers that can do boards, or single markers."""
     plugged = [each.name for each in reading.plugins if each.of_boards]
     if not reading.shows_boards:
-        reading.refuse_values("solver", "a solver of single markers, or a board: give kind under "
-                              "[board]", lambda name: name in plugged)
-        for name in reading.given & {"points", "refine", "refineDetectedMarkers", "minMarkers"}:
-            reading.refuse(name, "a board: give kind under [board]")
+        Rule(("solver",), lambda solver: solver in plugged,
+             "a solver of single markers, or a board: give kind under [board]").check(reading)
         return
-    if PHOTOGRAPHS in reading.given:
-        reading.refuse("kind", "no board beside photographs, whose board `sweep photos` knows; "
-                       "delete it")
-    for rule in OF_BOARDS:
-        rule.check(reading)
-    if "solver" not in reading.given:
-        reading.note(
-            "estimator.solver", f"missing; a board needs one of {', '.join(BOARD_SOLVERS)}")
-        return
-    for rule in _of_board_solvers(plugged):
-        rule.check(reading)
-    solids = [name for name in ("markers", "distractors")
-              if any(map(is_solid, reading.values_of(name)))]
-    if solids:
-        why = f"for {solids[0]} with z_m or tilt_deg"
-        for rule in of_sheets(why) if "markers" in solids else ():
-            rule.check(reading)
-        for name, reason in IN_ONE_PLANE.items():
-            if reading.is_active(name):
-                reading.refuse(name, f"it absent, {why}: {reason}")
-        reading.refuse_values("renderer", f"exact, {why}", lambda name: name != "exact")
     if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & {
             *reading.values_of("kind")}:
         reading.refuse_value(
             "points", "chessboard", "kind = charuco or diamond, which have a chessboard")
+    if "solver" not in reading.given:
+        reading.note("estimator.solver", f"missing; a board needs one of {BOARD_SOLVERS}")
+        return
 
-
-def _of_board_solvers(plugged: Sequence[str]) -> Iterator[Rule]:
-    """Yield the rules of solvers of boards; those of plug-ins have these names."""
-    for name, all_pixels in (("points", "markers"), ("refine", "none")):
-        yield Rule(
-            (name, "solver"),
-            lambda chosen, solver, all_pixels=all_pixels: (
-                chosen != all_pixels and solver in ("photometric", *plugged)),
-            lambda _, solver, all_pixels=all_pixels: (
-                f"{all_pixels} beside solver = {solver}, which "
-                f"{'chooses by itself' if solver in plugged else 'takes all pixels'}"), each=True)
-
-    def cannot(solver: str, points: str) -> bool:
+    def is_of_boards(solver: str, points: str) -> bool:
         known = SOLVERS.get(solver)
-        return solver not in plugged and (known is None or not (
-            known.of_boards or (points == "largest_marker" and known.corners_alone)))
+        return solver in plugged if known is None else (
+            known.of_boards or (points == "largest_marker" and known.corners_alone))
 
-    yield Rule(
-        ("solver", "points"), cannot,
-        lambda solver, _: f"one of {', '.join(BOARD_SOLVERS)} for boards" + (
-            ", or a plug-in with of_boards=True" if solver not in SOLVERS
-            else "; others with points = largest_marker" if SOLVERS[solver].corners_alone
-            else ""), each=True)
+    Rule(("solver", "points"), lambda *chosen: not is_of_boards(*chosen),
+         f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "
+         "corners alone; plug-ins with of_boards=True").check(reading)
+    for name, whole in (("points", "markers"), ("refine", "none")):
+        Rule((name, "solver"), lambda chosen, solver, whole=whole: (
+                 chosen != whole and solver in ("photometric", *plugged)),
+             lambda _, solver, whole=whole: (
+                 f"{whole} beside solver = {solver}, which chooses by itself")).check(reading)
 
 
 # --------------------------------------------------------------------------------------------------
 # All other rules: ways to give a quantity, partners, packages, random draws, names, sizes.
-#
-# A parameter whose own value is at fault is passed over: its fault is known already.
 
 def each_in_one_way(reading: Reading) -> None:
     """Demand a distance, and each quantity of pose, camera and beliefs in one way."""
     has_poses = PHOTOGRAPHS in reading.given
     given = reading.given - reading.stated.keys() - (set(IN_CAMERA) if has_poses else set())
-    for first, other in contradictions(given):
-        reading.refuse(
-            other[0], f"{', '.join(first)} or {', '.join(other)}, not both; delete one of them")
-    if has_poses:
-        return
-    world = [name for name in WORLD if name in reading.given]
-    in_camera = [name for name in IN_CAMERA if name in reading.given]
-    if world and in_camera:
-        reading.refuse(world[0], "a pose in the world or in the camera's frame, not both; delete "
-                       f"{', '.join(world)}, or {', '.join(in_camera)}")
-    if not world and not {"distance_m", "side_px"} & reading.given:
+    for choice in (*CHOICES, () if has_poses else (IN_CAMERA, WORLD)):
+        ways = [names for way in choice if (names := [name for name in way if name in given])]
+        for other in ways[1:]:
+            reading.refuse(other[0], f"{', '.join(ways[0])} or {', '.join(other)}, not both; "
+                           "delete one of them")
+    if not has_poses and given.isdisjoint(("distance_m", "side_px", *WORLD)):
         reading.note("pose", "expected distance_m or side_px, fixed or under [axes]")
 
 
@@ -633,34 +558,20 @@ PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
 def partners_are_given(reading: Reading) -> None:
     """Demand the parameters without which another has no meaning; not those of a rival way."""
     for name, others in PARTNERS.items():
-        if reading.is_active(name) and not reading.given.intersection(
-                (*others, *RIVALS.get(name, ()))):
-            partner = " or ".join(others) if len(others) < 3 else f"one of {', '.join(others)}"
-            reading.refuse(name, f"{partner} beside it")
-
-
-def effects_need_the_exact_renderer(reading: Reading) -> None:
-    """Demand the renderer ``exact`` for effects that act on edges."""
-    others = [name for name in reading.values_of("renderer") if name != "exact"]
-    for name in GEOMETRIC if others else ():
-        if reading.is_active(name):
-            reading.refuse(name, f"renderer = exact; {others[0]} does not have it")
+        if reading.is_active(name) and reading.given.isdisjoint((*others, *RIVALS.get(name, ()))):
+            reading.refuse(name, f"{' or '.join(others)} beside it")
 
 
 def what_is_installed(reading: Reading) -> None:
-    """Demand detector fields, and packages with the codes of dictionaries, that are installed.
+    """Demand detector fields, and dictionaries that are installed and that each detector has.
 
-    A store's pipeline can be read without the packages.
+    A store's pipeline can be read without the packages of dictionaries.
     """
     for name in reading.given & DetectorSetting.missing_fields():
         reading.refuse(name, "a field that the installed OpenCV has")
     for dictionary in reading.values_of("dictionary") if reading.recorded.files is None else ():
         if (missing := missing_package(dictionary)) is not None:
             reading.refuse_value("dictionary", dictionary, missing)
-
-
-def dictionaries_of_detectors(reading: Reading) -> None:
-    """Demand dictionaries that each detector has."""
     known: dict[str, tuple[str, ...]] = {
         OPENCV: opencv_dictionary_names(),
         **{plugin.name: plugin.dictionaries for plugin in reading.plugins
@@ -671,7 +582,7 @@ def dictionaries_of_detectors(reading: Reading) -> None:
         lambda dictionary, detector: dictionary not in known.get(detector, (dictionary,)),
         lambda _, detector: "one of OpenCV's for its detector; give another detector"
         if detector == OPENCV
-        else f"one that the detector {detector} has: {', '.join(known[detector])}", each=True,
+        else f"one that the detector {detector} has: {', '.join(known[detector])}",
     ).check(reading)
 
 
@@ -681,32 +592,23 @@ def something_random_to_repeat(reading: Reading) -> None:
     Their trials are whole replicates.
     """
     trials = len(reading.values_of(TRIAL)) or 1
-    jitter = reading.values_of("jitter_px")
     drawn = (
-        bool(reading.distributions) or not jitter or max(jitter) > 0
-        or "calibration" in reading.values_of("believed")
-    )
-    noisy = any(reading.is_active(name) for name in (
-        *RANDOM, *(plugin.settings[0].name for plugin in reading.plugins
-                   if plugin.kind == "effect" and plugin.random)))
-    if trials > 1 and not drawn and not noisy and PHOTOGRAPHS not in reading.given:
-        reading.fault(
-            "axes.trial", trials,
-            "something random to repeat: jitter_px above 0, noise, or a distribution",
-        )
+        bool(reading.distributions) or reading.is_active("jitter_px") or _is_calibrated(reading))
+    noisy = map(reading.is_active, (*RANDOM, *(
+        plugin.settings[0].name for plugin in reading.plugins
+        if plugin.kind == "effect" and plugin.random)))
+    if trials > 1 and not drawn and not any(noisy) and PHOTOGRAPHS not in reading.given:
+        reading.fault("axes.trial", trials, "something random to repeat: jitter_px above 0, noise, "
+                      "or a distribution")
     if reading.sampling != "sobol" or reading.axis(TRIAL) is None or SEARCH in reading.document:
         return
     if trials % REPLICATES or trials < 2 * REPLICATES:
-        reading.fault(
-            "axes.trial", trials,
-            f"a multiple of {REPLICATES}, at least {2 * REPLICATES}, for sampling = sobol: "
-            f"{REPLICATES} replicates of as many points each, best a power of two",
-        )
+        reading.fault("axes.trial", trials, f"a multiple of {REPLICATES}, at least "
+                      f"{2 * REPLICATES}, for sampling = sobol: {REPLICATES} replicates of as many "
+                      "points each, best a power of two")
     if not drawn:
-        reading.fault(
-            "sampling", reading.sampling,
-            "a distribution or jitter_px above 0 (the noise of pixels is independent in any case)",
-        )
+        reading.fault("sampling", reading.sampling, "a distribution or jitter_px above 0 (the "
+                      "noise of pixels is independent in any case)")
 
 
 RESERVED = {
@@ -750,25 +652,17 @@ def size_of_the_grid(reading: Reading) -> None:
 
 
 RULES: tuple[Callable[[Reading], None], ...] = (
+    one_value,
     photographs_alone,
     each_in_one_way,
     beliefs_in_one_way,
     what_is_installed,
     boards_can_be_printed,
-    boards_are_searched_and_solved,
+    targets_are_solved,
     partners_are_given,
-    effects_need_the_exact_renderer,
     check_backgrounds,
-    dictionaries_of_detectors,
     something_random_to_repeat,
     names_are_free,
     size_of_the_grid,
-    *(rule.check for rule in OF_VALUES),
+    *(record.check for record in RECORDS),
 )
-"""Every rule, in the order of their messages."""
-
-
-def check_rules(reading: Reading) -> None:
-    """Add the faults of all rules to a reading."""
-    for rule in RULES:
-        rule(reading)

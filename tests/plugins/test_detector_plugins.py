@@ -83,7 +83,7 @@ def test_settings_are_checked_as_our_own(folder):
     assert str(refused.value) == (
         "pipeline: axes.shift_px = [0, 10]: expected a number from -9 to 9 (not 10)"
     )
-    with pytest.raises(PipelineError, match=r"unknown parameter; did you mean shift_px\?"):
+    with pytest.raises(PipelineError, match=r"unknown key; did you mean shift_px\?"):
         Pipeline.from_text(GRID + "shift_pixels = [0, 10]\n", folder=folder)
     chosen = Pipeline.from_text(GRID, ["shift_px=1.5"], folder=folder)
     assert chosen.values_of("shift_px") == (1.5,)

@@ -290,9 +290,13 @@ class Reading(Grid):
     stated: dict[str, Any] = field(default_factory=dict)
     faults: dict[str, None] = field(default_factory=dict)
 
+    def tell(self, lines: Iterable[str]) -> None:
+        """Note faults, each a line without the source."""
+        self.faults.update((f"{self.source}: {line}", None) for line in lines)
+
     def note(self, key: str, problem: str) -> None:
         """Note a fault without a value."""
-        self.faults[f"{self.source}: {key}: {problem}"] = None
+        self.tell([f"{key}: {problem}"])
 
     def fault(self, key: str, value: Any, expected: str) -> None:
         """Note a fault of a key's value."""
@@ -381,8 +385,8 @@ def read_keys(
         given=written.keys(), written=written, distributions={}, axes=[], plugins=tuple(plugins),
         folder=folder, files={each.file: each.digest for each in plugins if each.file},
         document=document, source=source, recorded=recorded,
-        faults=dict.fromkeys(f"{source}: {line}" for line in lines),
     )
+    reading.tell(lines)
     for kind, key, name, expected in faults:
         reading.fault(key, name, expected)
         reading.unread.add(section_of_settings(kind))
@@ -428,8 +432,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
         else:
             reading.fixed[key] = parameter.check(value)
     except TablesError as error:
-        for line in error.lines:
-            reading.faults[f"{reading.source}: {path}{line}"] = None
+        reading.tell(f"{path}{line}" for line in error.lines)
     except ValueError as error:
         if key not in reading.unread:
             axis = "; several values are an axis: they go under [axes]" if (

@@ -301,7 +301,7 @@ def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) 
             reading.unknown_key(section, key, [*keys], f"; expected {', '.join(keys)}")
     values, lines = check_table(
         keys, {key: value for key, value in table.items() if key in keys}, "")
-    reading.faults.extend(f"{reading.source}: {section}.{line}" for line in lines)
+    reading.tell(f"{section}.{line}" for line in lines)
     return {key: value for key, value in values.items() if value is not None}
 
 

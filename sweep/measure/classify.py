@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
-from sweep.model.board import Board, unseen_markers
-from sweep.model.exposure import solid_planes
-from sweep.model.extent import outside_of_frame
+from sweep.model.board import Board
+from sweep.model.extent import unseen_squares
 from sweep.model.polygon import following
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes, Targets
@@ -78,11 +77,8 @@ def target_scenes(
         chessboard_px[rows, : len(board.chessboard_m)] = pixels[:, 4 * size :]
         flags[rows, :size] = visibility[rows, None]
         for row in rows[visibility[rows] == DetectionStatus.not_run].tolist():
-            outside = outside_of_frame(scenes, row, board.corners_m, corners_px[row, :size])
-            flags[row, :size][outside] = DetectionStatus.not_visible
-            if scenes.solid[row]:
-                unseen = unseen_markers(board, solid_planes(scenes, row))
-                flags[row, :size][unseen] = DetectionStatus.not_visible
+            unseen = unseen_squares(scenes, row, board.corners_m, corners_px[row, :size])
+            flags[row, :size][unseen] = DetectionStatus.not_visible
     return TargetScenes(targets, ids, corners_px, chessboard_px, flags)
 
 

@@ -691,30 +691,19 @@ def within(outline: MarkerEdges, line: Floats) -> tuple[MarkerEdges, Integers]:
     ), number
 
 
-def unseen_markers(board: Board, planes: Floats) -> Masks:
-    """Return (M,) which markers show their back, or are wholly behind another's sheet."""
+def unseen_markers(board: Board, planes: Floats, corners: Floats) -> Masks:
+    """Return (M,) which markers show their back, or are wholly behind another's sheet.
+
+    ``corners`` (M, 4, 3) are those of their squares in the camera frame.
+    """
     unseen = np.ones(len(board), dtype=bool)
-    faces = _faces(board, planes)
+    faces, one_sheet = _faces(board, planes), own_sheets(board) == 1
     for face, fronts in zip(faces, _occluders(faces), strict=True):
-        for number, square in _squares(board)[face.number]:
-            corners = square @ face.plane.T
-            unseen[number] = any((corners @ front.normals.T >= 0).all() for front in fronts)
+        if face.number < own_sheets(board):
+            for number in range(len(board)) if one_sheet else [face.number]:
+                inside = [(corners[number] @ front.normals.T >= 0).all() for front in fronts]
+                unseen[number] = any(inside)
     return unseen
-
-
-@lru_cache(maxsize=64)
-def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
-    """Return the markers of each sheet: number, and corners (4, 3) as (column, row, 1)."""
-    squares: list[list[tuple[int, Floats]]] = [[] for _ in sheets_of(board)]
-    if len(board.prints) > len(board):
-        squares[0] = list(enumerate(board.corners_m * [1.0, -1.0, 0.0] + [0.0, 0.0, 1.0]))
-        return squares
-    for number, printed in enumerate(board.prints):
-        side = 2 * printed.half_m / printed.unit_m
-        squares[number] = [(number, np.array([
-            [0.0, 0.0, 1.0], [side, 0.0, 1.0], [side, side, 1.0], [0.0, side, 1.0]
-        ]))]
-    return squares
 
 
 def boxes_px(

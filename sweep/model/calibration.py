@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -141,23 +141,82 @@ def _cameras(tree: Any) -> dict[str, dict[str, Any]]:
     }
 
 
-def _by_name(node: dict[str, Any]) -> dict[str, tuple[str, Any]]:
-    """Return normalised name -> name as written, value."""
-    return {_normal(name): (str(name), value) for name, value in node.items()}
+BASE64 = "$base64$"
+"""Beginning of numbers that OpenCV writes as text that is none."""
+
+
+class _Entry(NamedTuple):
+    """An entry of a file: its name as written, and its value."""
+
+    name: str
+    value: Any
+
+    def fault(self, reason: str) -> ValueError:
+        """Return the error of its value."""
+        return ValueError(f"{plain(self.name)}: {reason}")
+
+    def number(self) -> float:
+        """Return a finite number; ValueError if the value is none."""
+        try:
+            number = float(self.value)
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not abs(number) < 1e300:
+            raise self.fault(f"{plain(self.value)} is not a finite number")
+        return number
+
+    def pixels(self) -> int:
+        """Return a side of a frame."""
+        number = self.number()
+        if number != int(number) or not 1 <= number <= 100_000:
+            raise self.fault(f"{number:g}; expected whole pixels, from 1 to 100000")
+        return int(number)
+
+    def numbers(self) -> tuple[list[float], tuple[int, int] | None]:
+        """Return a list's or a matrix' numbers, row by row, and its shape if it has one."""
+        value, shape, single = self.value, None, False
+        if isinstance(value, dict):
+            if "data" not in value:
+                raise self.fault("a matrix without data")
+            if "rows" in value and "cols" in value:
+                sides = [_Entry(f"{self.name}.{key}", value[key]) for key in ("rows", "cols")]
+                shape = int(sides[0].number()), int(sides[1].number())
+            value, single = value["data"], value.get("dt") == "f"
+        if isinstance(value, str):
+            if value.startswith(BASE64):
+                raise self.fault("base64; write the file with numbers")
+            value = value.split()
+        if not isinstance(value, list):
+            value = [] if value is None else [value]
+        if value and all(isinstance(row, list) for row in value):
+            shape = len(value), len(value[0])
+            value = [number for row in value for number in row]
+        numbers = [_Entry(self.name, each).number() for each in value]
+        if shape is not None and shape[0] * shape[1] != len(numbers):
+            expected = f"{shape[0]} x {shape[1]}"
+            raise self.fault(f"{expected}, but {len(numbers)} numbers; is it cut short?")
+        if single:
+            # Digits enough for single precision stand for a number of single precision.
+            numbers = [float(np.float32(number)) for number in numbers]
+        return numbers, shape
+
+
+def _by_name(node: dict[str, Any]) -> dict[str, _Entry]:
+    """Return the entries of a node by normalised name."""
+    return {_normal(name): _Entry(str(name), value) for name, value in node.items()}
 
 
 def _has_matrix(node: dict[str, Any]) -> bool:
     return not _by_name(node).keys().isdisjoint(MATRIX_NAMES)
 
 
-def _one(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> tuple[str, Any] | None:
-    """Return the first of some names and its value; ValueError if others have other numbers."""
+def _one(named: dict[str, _Entry], names: tuple[str, ...]) -> _Entry | None:
+    """Return the first entry with one of some names; ValueError if others have other numbers."""
     written = [named[name] for name in names if name in named]
-    for name, value in written[1:]:
-        if _numbers(name, value)[0] != _numbers(*written[0])[0]:
-            raise ValueError(
-                f"{plain(written[0][0])} and {plain(name)} differ: delete one of them from the file"
-            )
+    for other in written[1:]:
+        if other.numbers()[0] != written[0].numbers()[0]:
+            both = f"{plain(written[0].name)} and {plain(other.name)}"
+            raise ValueError(f"{both} differ: delete one of them from the file")
     return written[0] if written else None
 
 
@@ -165,194 +224,136 @@ def _calibration(node: dict[str, Any]) -> Calibration:
     named = _by_name(node)
     counts = _check_model(named)
     _check_region(named)
-    fx, fy, cx, cy = _matrix(*_one(named, MATRIX_NAMES) or ("", None))
+    fx, fy, cx, cy = _matrix(_one(named, MATRIX_NAMES) or _Entry("", None))
     lens = _one(named, DISTORTION_NAMES)
     if lens is None and counts != (0,):
         raise ValueError(
             "no distortion coefficients (distortion_coefficients, distCoeffs, D; an empty list "
             "if there is none)"
         )
-    distortion = () if lens is None else _distortion(*lens, counts)
+    distortion = () if lens is None else _distortion(lens, counts)
     width, height = _size(named)
     count = 4 + len(distortion)
     sd, covariance = _one(named, SD_NAMES), _one(named, COVARIANCE_NAMES)
     return Calibration(
         width, height, fx, fy, cx, cy, distortion,
-        () if sd is None else _deviations(*sd, count),
-        () if covariance is None else _covariance(*covariance, count),
+        () if sd is None else _deviations(sd, count),
+        () if covariance is None else _covariance(covariance, count),
     )
 
 
-def _check_model(named: dict[str, tuple[str, Any]]) -> tuple[int, ...]:
+def _check_model(named: dict[str, _Entry]) -> tuple[int, ...]:
     """Return the numbers of coefficients of the file's lens model; ValueError for other models."""
-    camera = _normal(named.get("cameramodel", ("", "pinhole"))[1])
-    if "xi" in named or camera not in ("pinhole", ""):
-        name = named.get("cameramodel", ("", "omnidirectional (xi)"))[1]
-        raise ValueError(f"camera model {plain(name)}: not supported, only pinhole cameras are")
-    fisheye = named.get("fisheyemodel", ("", "0"))[1]
-    if str(fisheye).lower() not in ("0", "false", "no", ""):
+    def value(key: str, default: str) -> Any:
+        return named[key].value if key in named else default
+
+    if "xi" in named or _normal(value("cameramodel", "pinhole")) not in ("pinhole", ""):
+        name = plain(value("cameramodel", "omnidirectional (xi)"))
+        raise ValueError(f"camera model {name}: not supported, only pinhole cameras are")
+    if str(value("fisheyemodel", "0")).lower() not in ("0", "false", "no", ""):
         raise ValueError("a fisheye model: not supported, only OpenCV's pinhole lens model is")
     counts: tuple[int, ...] = COUNTS
     for key in ("distortionmodel", "lensmodel", "distortiontype"):
-        if key not in named:
-            continue
-        model = named[key][1]
+        model = value(key, "")
         if _normal(model) not in MODEL_COUNTS:
             raise ValueError(
                 f"lens model {plain(model)}: not supported; only OpenCV's is (plumb_bob, "
                 "rational_polynomial, radtan, none)"
             )
-        counts = MODEL_COUNTS[_normal(model)]
+        counts = MODEL_COUNTS[_normal(model)] if key in named else counts
     return counts
 
 
-def _check_region(named: dict[str, tuple[str, Any]]) -> None:
+def _check_region(named: dict[str, _Entry]) -> None:
     """Refuse the matrix of a frame of which only a part, or sums of pixels, are sent (ROS)."""
+    advice = "give the calibration of the frame as it is sent"
     for key in ("binningx", "binningy"):
-        if key in named and _number(*named[key]) > 1:
+        if key in named and named[key].number() > 1:
             name, value = named[key]
             raise ValueError(
-                f"{name} = {plain(value)}: the matrix is that of the frame without binning; give "
-                "the calibration of the frame as it is sent"
+                f"{name} = {plain(value)}: the matrix is that of the frame without binning; "
+                f"{advice}"
             )
-    region = named.get("roi", ("", None))[1]
+    region = named["roi"].value if "roi" in named else None
     if isinstance(region, dict):
         width, height = _size(named)
         whole = {"x_offset": 0, "y_offset": 0, "width": width, "height": height}
         for name, value in region.items():
-            if name in whole and _number(name, value) not in (0, whole[name]):
+            if name in whole and _Entry(name, value).number() not in (0, whole[name]):
                 raise ValueError(
                     f"roi with {name} = {plain(value)}: the matrix is that of the whole frame; "
-                    "give the calibration of the frame as it is sent"
+                    f"{advice}"
                 )
 
 
-def _number(name: str, value: Any) -> float:
-    """Return a finite number; ValueError if the value is none."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not abs(number) < 1e300:
-        raise ValueError(f"{plain(name)}: {plain(value)} is not a finite number")
-    return number
-
-
-BASE64 = "$base64$"
-"""Beginning of numbers that OpenCV writes as text that is none."""
-
-
-def _numbers(name: str, value: Any) -> tuple[list[float], tuple[int, int] | None]:
-    """Return a list's or a matrix' numbers, row by row, and its shape if it has one."""
-    shape = None
-    single = False
-    if isinstance(value, dict):
-        if "data" not in value:
-            raise ValueError(f"{plain(name)}: a matrix without data")
-        if "rows" in value and "cols" in value:
-            rows, columns = (_number(f"{name}.{key}", value[key]) for key in ("rows", "cols"))
-            shape = int(rows), int(columns)
-        single = value.get("dt") == "f"
-        value = value["data"]
-    if isinstance(value, str):
-        if value.startswith(BASE64):
-            raise ValueError(f"{plain(name)}: base64; write the file with numbers")
-        value = value.split()
-    if not isinstance(value, list):
-        value = [] if value is None else [value]
-    if value and all(isinstance(row, list) for row in value):
-        shape = len(value), len(value[0])
-        value = [number for row in value for number in row]
-    numbers = [_number(name, each) for each in value]
-    if shape is not None and shape[0] * shape[1] != len(numbers):
-        raise ValueError(
-            f"{plain(name)}: {shape[0]} x {shape[1]}, but {len(numbers)} numbers; is it cut short?"
-        )
-    if single:
-        # Digits enough for single precision stand for a number of single precision.
-        numbers = [float(np.float32(number)) for number in numbers]
-    return numbers, shape
-
-
-def _matrix(name: str, value: Any) -> tuple[float, float, float, float]:
+def _matrix(entry: _Entry) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy of a camera matrix, or of Kalibr's list of the four."""
-    numbers, shape = _numbers(name, value)
-    if len(numbers) == 4 and _normal(name) == "intrinsics" and shape is None:
+    numbers, shape = entry.numbers()
+    if len(numbers) == 4 and _normal(entry.name) == "intrinsics" and shape is None:
         fx, fy, cx, cy = numbers
     elif len(numbers) == 9 and shape in (None, (3, 3)):
         if not any(numbers):
-            raise ValueError(f"{plain(name)}: a matrix of zeros: the camera was not calibrated")
+            raise entry.fault("a matrix of zeros: the camera was not calibrated")
         fx, skew, cx, below, fy, cy = numbers[:6]
         if numbers[6:] != [0, 0, 1]:
-            raise ValueError(f"{plain(name)}: expected 0, 0, 1 as the last row of a camera matrix")
+            raise entry.fault("expected 0, 0, 1 as the last row of a camera matrix")
         if skew != 0 or below != 0:
-            raise ValueError(f"{plain(name)}: a skew of {skew or below:g} is not supported")
+            raise entry.fault(f"a skew of {skew or below:g} is not supported")
     else:
-        raise ValueError(f"{plain(name)}: {len(numbers)} numbers; expected a matrix of 3 x 3")
+        raise entry.fault(f"{len(numbers)} numbers; expected a matrix of 3 x 3")
     if not (fx > 0 and fy > 0):
-        raise ValueError(f"{plain(name)}: focal lengths {fx:g} and {fy:g}; expected above 0")
+        raise entry.fault(f"focal lengths {fx:g} and {fy:g}; expected above 0")
     return fx, fy, cx, cy
 
 
-def _distortion(name: str, value: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
-    numbers, shape = _numbers(name, value)
+def _distortion(entry: _Entry, counts: tuple[int, ...]) -> tuple[float, ...]:
+    numbers, shape = entry.numbers()
     if shape is not None and 1 not in shape and numbers:
-        raise ValueError(f"{plain(name)}: {shape[0]} x {shape[1]}; expected a row or a column")
+        raise entry.fault(f"{shape[0]} x {shape[1]}; expected a row or a column")
     if len(numbers) not in (counts if any(numbers) else COUNTS):
-        raise ValueError(
-            f"{plain(name)}: {len(numbers)} coefficients; expected "
-            f"{' or '.join(str(count) for count in counts)} of this lens model"
-        )
+        expected = " or ".join(map(str, counts))
+        raise entry.fault(f"{len(numbers)} coefficients; expected {expected} of this lens model")
     return tuple(numbers)
 
 
-def _size(named: dict[str, tuple[str, Any]]) -> tuple[int | None, int | None]:
+def _size(named: dict[str, _Entry]) -> tuple[int | None, int | None]:
     """Return the frame's width and height; None if the file does not say."""
     for width, height in (("imagewidth", "imageheight"), ("width", "height")):
         if width in named and height in named:
-            return _whole(*named[width]), _whole(*named[height])
-    name, value = next((named[name] for name in SIZE_NAMES if name in named), ("", None))
-    if not name:
+            return named[width].pixels(), named[height].pixels()
+    entry = next((named[name] for name in SIZE_NAMES if name in named), None)
+    if entry is None:
         return None, None
+    name, value = entry
     if isinstance(value, dict):
         return _size(_by_name(value))
     if isinstance(value, str):
-        value = re.split("[x, ]+", value.strip("[]() "))
-    numbers, _ = _numbers(name, value)
+        entry = _Entry(name, re.split("[x, ]+", value.strip("[]() ")))
+    numbers, _ = entry.numbers()
     if len(numbers) != 2:
-        raise ValueError(f"{plain(name)}: {len(numbers)} numbers; expected width and height")
-    return _whole(name, numbers[0]), _whole(name, numbers[1])
+        raise entry.fault(f"{len(numbers)} numbers; expected width and height")
+    return _Entry(name, numbers[0]).pixels(), _Entry(name, numbers[1]).pixels()
 
 
-def _whole(name: str, value: Any) -> int:
-    number = _number(name, value)
-    if number != int(number) or not 1 <= number <= 100_000:
-        raise ValueError(f"{plain(name)}: {number:g}; expected whole pixels, from 1 to 100000")
-    return int(number)
+_OF_EACH = "of fx, fy, cx, cy and each coefficient"
 
 
-def _deviations(name: str, value: Any, count: int) -> tuple[float, ...]:
+def _deviations(entry: _Entry, count: int) -> tuple[float, ...]:
     """Return the first ``count`` standard deviations of OpenCV's list of up to 18."""
-    numbers, _ = _numbers(name, value)
+    numbers, _ = entry.numbers()
     if len(numbers) < count or any(numbers[count:]):
-        raise ValueError(
-            f"{plain(name)}: {len(numbers)} numbers; expected {count}: of fx, fy, cx, cy and each "
-            "coefficient"
-        )
+        raise entry.fault(f"{len(numbers)} numbers; expected {count}: {_OF_EACH}")
     if min(numbers) < 0:
-        raise ValueError(f"{plain(name)}: a standard deviation below 0")
+        raise entry.fault("a standard deviation below 0")
     return tuple(numbers[:count])
 
 
-def _covariance(name: str, value: Any, count: int) -> tuple[float, ...]:
+def _covariance(entry: _Entry, count: int) -> tuple[float, ...]:
     """Return the leading ``count`` x ``count`` numbers of a covariance matrix."""
-    numbers, _ = _numbers(name, value)
+    numbers, _ = entry.numbers()
     side = math.isqrt(len(numbers))
     if side * side != len(numbers) or side < count:
-        raise ValueError(
-            f"{plain(name)}: {len(numbers)} numbers; expected {count} x {count}: of fx, fy, cx, "
-            "cy and each coefficient"
-        )
+        raise entry.fault(f"{len(numbers)} numbers; expected {count} x {count}: {_OF_EACH}")
     return tuple(np.reshape(numbers, (side, side))[:count, :count].ravel().tolist())
 
 

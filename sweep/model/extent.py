@@ -18,6 +18,7 @@ from sweep.model.board import (
     rectangles,
     sheets_m,
     sheets_of,
+    unseen_markers,
 )
 from sweep.model.coverage import REACH
 from sweep.model.exposure import (
@@ -30,6 +31,7 @@ from sweep.model.exposure import (
     seen_sheets,
     sheet_folds,
     sheet_outline_px,
+    solid_planes,
     target_outline,
     track,
 )
@@ -261,19 +263,28 @@ def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
     return _outside(scenes, rows, scenes.corners_px[rows], curved)
 
 
-def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floats) -> Masks:
-    """Return (M,) which squares of the board of one scene lie wholly outside the frame.
+def unseen_squares(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floats) -> Masks:
+    """Return (M,) which squares of the board of one scene cannot be seen.
 
+    They lie wholly outside the frame, show their back, or are wholly behind another's sheet.
     ``corners_m`` (M, 4, 3) are their corners on the board, ``corners_px`` (M, 4, 2) the images.
     """
-    rows = np.full(len(corners_m), row)
+    rows, count = np.full(len(corners_m), row), len(corners_m)
+
+    def in_camera(points: Floats) -> Floats:
+        moved = transform_points(points, scenes.rotation[[row]], scenes.translation[[row]])
+        return np.asarray(moved[0])
 
     def curved(i: int) -> Floats:
-        points = along_sides(corners_m[i : i + 1], CHORDS_PER_SIDE)
-        moved = transform_points(points, scenes.rotation[[row]], scenes.translation[[row]])
-        return np.asarray(scenes.cameras.take(rows[:1]).project(moved)[0])
+        points = in_camera(along_sides(corners_m[i : i + 1], CHORDS_PER_SIDE))
+        return np.asarray(scenes.cameras.take(rows[:1]).project(points[None])[0])
 
-    return _outside(scenes, rows, corners_px, curved)
+    unseen = _outside(scenes, rows, corners_px, curved)
+    if scenes.solid[row]:
+        printed = corners_m.reshape(1, -1, 3) * scenes.effects["marker_scale"][row]
+        corners = in_camera(printed).reshape(count, 4, 3)
+        unseen |= unseen_markers(scenes.target(row), solid_planes(scenes, row), corners)
+    return unseen
 
 
 def _outside(

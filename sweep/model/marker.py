@@ -28,8 +28,8 @@ from sweep.typing import Floats
 # layouts for fiducial tags", IROS 2019, section III).
 
 @dataclass(frozen=True, slots=True)
-class TagFamily:
-    """The layout of a family.
+class Family:
+    """A family of markers that OpenCV lacks.
 
     Attributes
     ----------
@@ -39,19 +39,22 @@ class TagFamily:
         Modules beyond that square on each side.
     count
         IDs.
+    digest
+        Of a library of STag: the beginning of the SHA-256 of its codes.
     """
 
     modules: int
     overhang: int
     count: int
+    digest: str = ""
 
 
 TAG_FAMILIES = {
-    "tagCircle21h7": TagFamily(5, 2, 38),
-    "tagCircle49h12": TagFamily(5, 3, 65_535),
-    "tagCustom48h12": TagFamily(6, 2, 42_211),
-    "tagStandard41h12": TagFamily(5, 2, 2_115),
-    "tagStandard52h13": TagFamily(6, 2, 48_714),
+    "tagCircle21h7": Family(5, 2, 38),
+    "tagCircle49h12": Family(5, 3, 65_535),
+    "tagCustom48h12": Family(6, 2, 42_211),
+    "tagStandard41h12": Family(5, 2, 2_115),
+    "tagStandard52h13": Family(6, 2, 48_714),
 }
 """By AprilTag's own names."""
 
@@ -141,27 +144,19 @@ def tag_cells(name: str, marker_id: int) -> NDArray[np.bool_]:
 # neighbouring dots joined and smoothed; here the dots are apart. The detector reads dots at their
 # centres, and takes corners from the square and from the circle.
 
-@dataclass(frozen=True, slots=True)
-class StagLibrary:
-    """A library of STag: its number of IDs, and the beginning of their codes' SHA-256."""
-
-    count: int
-    digest: str
-
-
-STAG_LIBRARIES = {
-    "STAG_HD11": StagLibrary(22_309, "8b094d9a0e7f9595"),
-    "STAG_HD13": StagLibrary(2_884, "d452276ebcb1fbad"),
-    "STAG_HD15": StagLibrary(766, "68a33359c25246f8"),
-    "STAG_HD17": StagLibrary(157, "6b7c8cf653861150"),
-    "STAG_HD19": StagLibrary(38, "21b903cb3a75576c"),
-    "STAG_HD21": StagLibrary(12, "7ac380b8f8dfac5b"),
-    "STAG_HD23": StagLibrary(6, "b4881e97f27dddbf"),
-}
-"""By the Hamming distance between their codes."""
-
 STAG_MODULES = 8
 """A module is an eighth of the side: as wide as the white margin of published markers."""
+
+STAG_LIBRARIES = {
+    "STAG_HD11": Family(STAG_MODULES, 0, 22_309, "8b094d9a0e7f9595"),
+    "STAG_HD13": Family(STAG_MODULES, 0, 2_884, "d452276ebcb1fbad"),
+    "STAG_HD15": Family(STAG_MODULES, 0, 766, "68a33359c25246f8"),
+    "STAG_HD17": Family(STAG_MODULES, 0, 157, "6b7c8cf653861150"),
+    "STAG_HD19": Family(STAG_MODULES, 0, 38, "21b903cb3a75576c"),
+    "STAG_HD21": Family(STAG_MODULES, 0, 12, "7ac380b8f8dfac5b"),
+    "STAG_HD23": Family(STAG_MODULES, 0, 6, "b4881e97f27dddbf"),
+}
+"""By the Hamming distance between their codes."""
 
 CIRCLE_RADIUS = 0.4 * STAG_MODULES
 DOTS_RADIUS = 0.35 * STAG_MODULES
@@ -255,6 +250,9 @@ def dot_centres() -> Floats:
 
 check_opencv()  # the dictionaries below are those of the OpenCV that is loaded
 
+FAMILIES = {**TAG_FAMILIES, **STAG_LIBRARIES}
+"""Of markers that OpenCV lacks: AprilTag's and STag's."""
+
 OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
 """Codes of the areas beside an edge."""
 
@@ -266,7 +264,7 @@ def opencv_dictionary_names() -> tuple[str, ...]:
 
 def dictionary_names() -> tuple[str, ...]:
     """Return the names of all dictionaries: OpenCV's, AprilTag's that OpenCV lacks, and STag's."""
-    return (*opencv_dictionary_names(), *TAG_FAMILIES, *STAG_LIBRARIES)
+    return (*opencv_dictionary_names(), *FAMILIES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,8 +302,9 @@ def missing_package(dictionary: str) -> str | None:
 
 def marker_count(dictionary: str) -> int:
     """Return how many IDs a dictionary has."""
-    family = TAG_FAMILIES.get(dictionary) or STAG_LIBRARIES.get(dictionary)
-    return family.count if family else len(opencv_dictionary(dictionary).bytesList)
+    if dictionary in FAMILIES:
+        return FAMILIES[dictionary].count
+    return len(opencv_dictionary(dictionary).bytesList)
 
 
 def module_count(dictionary: str) -> int:
@@ -313,16 +312,14 @@ def module_count(dictionary: str) -> int:
 
     In OpenCV's dictionaries this is the black square: the bits, and a border of one on each side.
     """
-    if dictionary in TAG_FAMILIES:
-        return TAG_FAMILIES[dictionary].modules
-    if dictionary in STAG_LIBRARIES:
-        return STAG_MODULES
+    if dictionary in FAMILIES:
+        return FAMILIES[dictionary].modules
     return int(opencv_dictionary(dictionary).markerSize) + 2
 
 
 def overhang(dictionary: str) -> int:
     """Return the modules of a marker beyond that square on each side: 0 in OpenCV's."""
-    return TAG_FAMILIES[dictionary].overhang if dictionary in TAG_FAMILIES else 0
+    return FAMILIES[dictionary].overhang if dictionary in FAMILIES else 0
 
 
 def has_circles(dictionary: str) -> bool:
@@ -351,15 +348,9 @@ def marker_corners(size_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
     """Return (start, end, before, after) of maximal runs in a line (m, 2) of side codes."""
-    runs = []
-    start = 0
-    for stop in range(1, len(line) + 1):
-        if stop == len(line) or (line[stop] != line[start]).any():
-            before, after = (int(code) for code in line[start])
-            if before != after:
-                runs.append((start, stop, before, after))
-            start = stop
-    return runs
+    starts = [0, *(np.flatnonzero((line[1:] != line[:-1]).any(axis=1)) + 1).tolist()]
+    runs = zip(starts, [*starts[1:], len(line)], *line[starts].T.tolist(), strict=True)
+    return [run for run in runs if run[2] != run[3]]
 
 
 def cell_edges(codes: NDArray[np.int64]) -> MarkerEdges:

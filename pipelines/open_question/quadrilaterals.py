@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.photograph import from_unit_square
-from sweep.model.extent import WARP_PX_PER_MODULE
+from sweep.model.exposure import WARP_PX_PER_MODULE
 from sweep.model.polygon import side_lengths
 from sweep.typing import Floats
 

@@ -29,7 +29,7 @@ from sweep.analysis import simulation_gap
 from sweep.experiment.photographs import read_board
 from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
 from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.photographs.twins import read_scene, twin_pipeline

@@ -22,7 +22,7 @@ from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedErro
 from sweep.measure.detectors import OPENCV, AnyDetectorSetting, make_detector
 from sweep.measure.estimators import SOLVERS, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import dictionary_names, marker_count, missing_package
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes

@@ -29,7 +29,7 @@ from sweep.measure.detectors import (
 )
 from sweep.measure.flags import DetectionStatus
 from sweep.model.camera import Column, map_columns
-from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
+from sweep.model.exposure import hidden, marker_boxes, not_modelled, outside_frame
 from sweep.model.pose import transform_points
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes, build_scenes

@@ -26,7 +26,7 @@ from sweep.measure.estimation import (
     squared_deviations,
 )
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.model.extent import areas_px
+from sweep.model.exposure import areas_px
 from sweep.model.polygon import signed_areas
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes

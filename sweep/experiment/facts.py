@@ -29,7 +29,7 @@ from sweep.model.camera import (
     field_of_view_deg,
 )
 from sweep.model.effects import Effect, is_coded
-from sweep.model.extent import hidden, outside_frame
+from sweep.model.exposure import hidden, outside_frame
 from sweep.model.lens import fold_radius
 from sweep.model.marker import module_count
 from sweep.model.pose import viewing_angle

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
 from sweep.model.board import Board
-from sweep.model.extent import unseen_squares
+from sweep.model.exposure import unseen_squares
 from sweep.model.polygon import following
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes, Targets

@@ -23,8 +23,7 @@ from sweep.model.board import (
     unit_m,
 )
 from sweep.model.effects import MarkerView, after_step
-from sweep.model.exposure import marker_exposure
-from sweep.model.extent import WARP_PX_PER_MODULE
+from sweep.model.exposure import WARP_PX_PER_MODULE, marker_exposure
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
 from sweep.model.polygon import Optics, Projection

@@ -11,7 +11,7 @@ import numpy as np
 from tables import header, row
 
 from sweep.model.camera import Camera
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import render

@@ -10,7 +10,7 @@ from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, 
 from support.lengths import first_of
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 

@@ -16,8 +16,7 @@ from support.board_pictures import (
 from support.lengths import first_of, lengths
 from support.small_scenes import image_of, scenes_of
 from sweep.model.board import extent_of, in_space
-from sweep.model.exposure import marker_exposure
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.renderers import marker_levels
 
 LEVELS = {"black": 20.3, "white": 230.1, "background": 90.4}

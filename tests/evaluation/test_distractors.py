@@ -13,7 +13,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from support.solving import estimate
 from sweep.experiment.pipeline import Pipeline
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.store.provenance import NUMBERS_VERSION

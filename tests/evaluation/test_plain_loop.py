@@ -11,7 +11,7 @@ from support.blocks import run_block
 from support.lengths import lengths
 from sweep.experiment.grid import Block, block_indices
 from sweep.experiment.pipeline import Pipeline
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 

@@ -18,7 +18,7 @@ from sweep.experiment.grid import (
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
 from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import opencv_dictionary
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes

@@ -11,8 +11,7 @@ from sweep.measure.bound import BACKGROUND_MARGIN_PX, bounds
 from sweep.measure.flags import BoundStatus
 from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers, with_distractors
 from sweep.model.effects import NEUTRAL
-from sweep.model.exposure import marker_exposure
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.scene import build_scenes
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

@@ -29,7 +29,7 @@ from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bound
 from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
 from sweep.model.effects import Effects
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import build_scenes
 

@@ -21,7 +21,7 @@ from sweep.measure.detectors import (
     windows,
 )
 from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import marker_count, module_count, opencv_dictionary_names
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes

@@ -17,7 +17,7 @@ from support.lengths import lengths
 from sweep.measure.estimation import pose_error
 from sweep.model import lens
 from sweep.model.camera import Camera, Cameras
-from sweep.model.extent import areas_px
+from sweep.model.exposure import areas_px
 from sweep.model.marker import Marker, marker_corners
 from sweep.model.pose import (
     Pose,

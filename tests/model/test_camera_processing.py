@@ -15,7 +15,7 @@ from sweep.evaluation.search import search_windows
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import BoundStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.sensor import compressed
 
 EVERYTHING = [

@@ -30,8 +30,13 @@ from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import Effects
-from sweep.model.exposure import defocus_px, marker_exposure, seen_sheets
-from sweep.model.extent import marker_boxes, not_modelled
+from sweep.model.exposure import (
+    defocus_px,
+    marker_boxes,
+    marker_exposure,
+    not_modelled,
+    seen_sheets,
+)
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
 

@@ -16,7 +16,7 @@ from support.exact_image import (
     visible,
 )
 from support.lengths import lengths
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import marker_levels, render
 from sweep.model.scene import build_scenes
 

@@ -33,7 +33,7 @@ from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import detections_of, scenes_at, search_windows
 from sweep.measure.flags import BoundStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
 from sweep.experiment.pipeline import Pipeline

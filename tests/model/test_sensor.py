@@ -12,7 +12,7 @@ from scipy import stats
 from support.lengths import lengths
 from sweep.experiment.pipeline import Pipeline
 from sweep.model import sensor
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
 

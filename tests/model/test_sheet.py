@@ -10,8 +10,14 @@ from support.exact_image import LENSES, modules_of, plane_of, values
 from support.lengths import lengths
 from sweep.model import lens
 from sweep.model.effects import NEUTRAL
-from sweep.model.exposure import marker_exposure, shift_waves
-from sweep.model.extent import areas_px, hidden, marker_boxes, not_modelled
+from sweep.model.exposure import (
+    areas_px,
+    hidden,
+    marker_boxes,
+    marker_exposure,
+    not_modelled,
+    shift_waves,
+)
 from sweep.model.renderers import marker_levels, render
 from sweep.model.scene import build_scenes
 

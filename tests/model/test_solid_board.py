@@ -12,7 +12,7 @@ from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import modules
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes

@@ -6,8 +6,7 @@ import numpy as np
 
 from support.exact_image import values
 from sweep.model.effects import NEUTRAL
-from sweep.model.exposure import marker_exposure
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes

@@ -11,7 +11,7 @@ from sweep.evaluation.search import (
 )
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import BoardDetectorSetting, make_board_detector, make_detector
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 
 
 def searched(scenes, setting, *, full=False, wanted=None, boards=None, keep=False):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sweep.experiment.pipeline import Pipeline
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from sweep.evaluation.search import search_windows
 from sweep.measure.detectors import REFINEMENTS
-from sweep.model.extent import marker_boxes
+from sweep.model.exposure import marker_boxes
 from sweep.model.marker import opencv_dictionary
 from sweep.model.renderers import render
 

@@ -57,7 +57,7 @@ BITS = 32
 MAX_GAP = 1000
 """Points between two wanted ones that are generated and not skipped."""
 
-_STEP_SOBOL = np.uint64(0x9E3779B97F4A7C15)
+_STEP = np.uint64(0x9E3779B97F4A7C15)
 _ONE = np.uint64(1)
 
 
@@ -114,7 +114,7 @@ def sobol_uniform(
         (N,) trial ``t`` is point ``t // 16`` of replicate ``t % 16``, whatever other trials exist.
     """
     index, replicate = np.divmod(np.asarray(trials, dtype=np.uint64), np.uint64(REPLICATES))
-    own = mixed(keys + _STEP_SOBOL * (replicate + _ONE))
+    own = mixed(keys + _STEP * (replicate + _ONE))
     return scrambled(points(dimension, index), own)
 
 
@@ -461,43 +461,25 @@ def _hash(text: str) -> np.uint64:
     return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))
 
 
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-
-
-def uniform(
-    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers
-) -> Floats:
-    """Return uniform numbers in (0, 1) of scenes, by geometry key and trial, (N,) each.
-
-    (seed, quantity) is hashed by BLAKE2b, as the keys are; trials are steps of SplitMix64 from
-    there. 53 bits, in the middle of their interval, so that neither 0 nor 1 occurs.
-    """
-    return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
-
-
 SAMPLINGS = ("independent", "sobol")
 """How the draws of a cell's trials relate: not at all, or so that they fill their space evenly."""
 
 
-def jointly_drawn(distributions: Collection[str], others: Sequence[str] = ()) -> list[str]:
-    """Return the quantities that are drawn together, each at its dimension of Sobol's points.
-
-    The jitter comes after the distributions, so that whether there is any changes nothing for them;
-    then come ``others``.
-    """
-    return [*sorted(distributions), "shift_u_px", "shift_v_px", *others]
-
-
-def even_uniform(
-    seed: int, quantity: str, quantities: Sequence[str], keys: NDArray[np.uint64], trials: Integers
+def uniform(
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers,
+    dimension: int | None = None,
 ) -> Floats:
-    """Return uniform numbers in (0, 1) of scenes that fill the space of ``quantities`` evenly.
+    """Return uniform numbers in (0, 1) of scenes, by geometry key and trial, (N,) each.
 
-    They are scrambled by (seed, quantity, geometry key, number of the replicate); the other
-    arguments are as of :func:`uniform`.
+    (seed, quantity) is hashed by BLAKE2b, as the keys are; trials are steps of SplitMix64 from
+    there. 53 bits, in the middle of their interval, so that neither 0 nor 1 occurs. With the number
+    of the quantity among those that are drawn together, its ``dimension``, they fill the space of
+    these evenly.
     """
-    start = mixed(keys ^ _hash(f"{seed}\nsobol\n{quantity}"))
-    return sobol_uniform(quantities.index(quantity), start, trials)
+    if dimension is not None:
+        start = mixed(keys ^ _hash(f"{seed}\nsobol\n{quantity}"))
+        return sobol_uniform(dimension, start, trials)
+    return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
 
 
 def bits(
@@ -505,7 +487,7 @@ def bits(
 ) -> NDArray[np.uint64]:
     """Return 64 random bits for each scene (arguments as :func:`uniform`)."""
     start = mixed(keys ^ _hash(f"{seed}\n{quantity}"))
-    return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1))))
+    return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + _ONE)))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, lru_cache, partial
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from sweep.experiment.axes import TRIAL, Axis, combinations
 from sweep.experiment.draws import (
     CALIBRATED,
+    SHIFTS,
     bits,
     calibrated_columns,
-    even_uniform,
     geometry_keys,
     hashed,
-    jointly_drawn,
     key_texts,
     resolve_pose,
     uniform,
@@ -38,6 +37,8 @@ from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, c
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats
+
+T = TypeVar("T")
 
 
 def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
@@ -62,15 +63,29 @@ def _absolute(folder: str, background: Any) -> Any:
     return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
 
 
-OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
-BOARD_FIELDS = tuple(field.name for field in dataclasses.fields(BoardDetectorSetting))
-ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))
+def _names(declaring: type) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(declaring))
+
+
+OPENCV_FIELDS = _names(DetectorSetting)
 
 NOT_IN_IMAGE = {
-    "window", "camera_file", "calibration_sd", "calibration_covariance",
-    *(field.name for field in dataclasses.fields(BoundSetting)),
+    "window", "camera_file", "calibration_sd", "calibration_covariance", *_names(BoundSetting),
 }
 """Parameters of the scene's stage that do not change its image."""
+
+
+def _made(declaring: type[T], values: Mapping[str, Any]) -> T:
+    """Return a record whose fields have the values of their names."""
+    return declaring(**{name: values[name] for name in _names(declaring)})
+
+
+def effect_of(plugin: DeclaredPlugin) -> Effect:
+    """Return the effect of a plug-in, which is not imported for it: it lacks its function."""
+    widens: Any = plugin.widens
+    step: Any = plugin.step
+    parameters = {setting.name: setting for setting in plugin.settings}
+    return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
 
 
 TARGET_SECTIONS = ("marker", "board", "target")
@@ -110,29 +125,24 @@ class Experiment:
     def detectors(self) -> list[AnyDetectorSetting]:
         """The detector settings, in the order of the detection axes."""
         return [
-            DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
-            if (plugin := self.grid.plugin("detector", values["detector"])) is None
-            else self._plugged(plugin, values)
+            self._plugged("detector", values["detector"], values) or _made(DetectorSetting, values)
             for values in self._settings("detector", Stage.detection)
         ]
 
     @cached_property
     def board_settings(self) -> list[BoardDetectorSetting]:
         """What the detector settings do with boards, in their order."""
-        return [
-            BoardDetectorSetting(**{name: values[name] for name in BOARD_FIELDS})
-            for values in self._settings("detector", Stage.detection)
-        ]
+        return [_made(BoardDetectorSetting, values)
+                for values in self._settings("detector", Stage.detection)]
 
     @cached_property
     def estimators(self) -> list[EstimatorSetting]:
         """The estimators, in the order of the estimation axes."""
         return [
-            EstimatorSetting(**common)
-            if (plugin := self.grid.plugin("estimator", values["solver"])) is None
-            else PluggedEstimatorSetting(**common, own=self._plugged(plugin, values))
+            _made(EstimatorSetting, values) if own is None
+            else _made(PluggedEstimatorSetting, values | {"own": own})
             for values in self._settings("estimator", Stage.estimation)
-            for common in [{name: values[name] for name in ESTIMATOR_FIELDS}]
+            for own in [self._plugged("estimator", values["solver"], values)]
         ]
 
     def _settings(self, section: str, stage: Stage) -> list[dict[str, Any]]:
@@ -143,7 +153,11 @@ class Experiment:
         }
         return [fixed | chosen for chosen in combinations(self.grid.axes_of(stage))]
 
-    def _plugged(self, plugin: DeclaredPlugin, values: Mapping[str, Any]) -> PluginSetting:
+    def _plugged(self, kind: str, name: str, values: Mapping[str, Any]) -> PluginSetting | None:
+        """Return the settings of a plug-in; None for what is built in."""
+        plugin = self.grid.plugin(kind, name)
+        if plugin is None:
+            return None
         own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
         return PluginSetting(plugin, own, self.grid.folder)
 
@@ -152,7 +166,7 @@ class Experiment:
         """The built-in effects and those of plug-ins, which are not imported for it."""
         return (*EFFECTS, *(effect_of(each) for each in self.grid.plugins if each.kind == "effect"))
 
-    @property
+    @cached_property
     def scene_plugins(self) -> ScenePlugins:
         """What plug-ins add to the scenes, imported.
 
@@ -161,7 +175,17 @@ class Experiment:
         PluginError
             If one is not the plug-in that was declared; in one line.
         """
-        return imported(self.grid.plugins, self.grid.folder)
+        effects, renderers, settings = [], {}, []
+        for plugin in self.grid.plugins:
+            if plugin.kind == "effect":
+                effect = cast("EffectPlugin", plugin.record(self.grid.folder))
+                applied = checked_effect(plugin.name, effect.apply)
+                effects.append(effect_of(plugin).applying(applied))
+            elif plugin.kind == "renderer":
+                renderer = cast("RendererPlugin", plugin.record(self.grid.folder))
+                renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)
+                settings += [setting.name for setting in plugin.settings]
+        return ScenePlugins(tuple(effects), renderers, tuple(settings))
 
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
@@ -187,6 +211,16 @@ class Experiment:
             math.prod(self.cell_shapes[variable.name]) * np.dtype(variable.dtype).itemsize
             for variable in self.variables)
 
+    def _given(
+        self, indices: Sequence[NDArray[np.intp]]
+    ) -> tuple[dict[str, Column], NDArray[np.int64]]:
+        """Return the scene parameters as they are given at ``indices``, and the trials (N,)."""
+        values = dict(self._constants)
+        for axis, index in zip(self.scene_axes, indices, strict=True):
+            values |= {name: _column(along, index) for name, along in axis.columns.items()}
+        count = len(indices[0]) if self.scene_axes else 1
+        return values, values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+
     @cached_property
     def _constants(self) -> dict[str, Column]:
         """The scene's parameters that are fixed."""
@@ -202,12 +236,8 @@ class Experiment:
         canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
         """
         grid = self.grid
-        count = len(indices[0]) if self.scene_axes else 1
-        values = dict(self._constants)
-        for axis, index in zip(self.scene_axes, indices, strict=True):
-            for name, along in axis.columns.items():
-                values[name] = _column(along, index)
-        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+        values, trials = self._given(indices)
+        count = len(trials)
         values["distortion"] = values["distortion"].map(canonical_distortion)
         if grid.shows_boards:
             values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
@@ -228,25 +258,24 @@ class Experiment:
             resolve_pose(values)
             return values | poses
         keys = geometry_keys(values, drawn, count)
-        draw: Callable[..., Floats] = uniform
-        if grid.sampling == "sobol":
-            calibrated = () if calibration is None else calibration.names
-            quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
-            draw = partial(even_uniform, quantities=quantities)
+        # Quantities that are drawn together: the jitter comes after the distributions, so that
+        # whether there is any changes nothing for them.
+        calibrated = () if calibration is None else calibration.names
+        together = [*sorted(drawn), *SHIFTS, *(CALIBRATED + name for name in calibrated)]
+
+        def draw(quantity: str, keys: NDArray[np.uint64] = keys) -> Floats:
+            dimension = together.index(quantity) if grid.sampling == "sobol" else None
+            return uniform(grid.seed, quantity, keys, trials, dimension)
+
         # What is drawn for a photograph is the same for all its markers; their noise is not.
         shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
         for name, distribution in drawn.items():
-            number = draw(grid.seed, name, keys=shared, trials=trials)
-            values[name] = Column.of(distribution.at(number))
+            values[name] = Column.of(distribution.at(draw(name, shared)))
         if (jitter > 0).any():
-            for name in ("shift_u_px", "shift_v_px"):
-                number = draw(grid.seed, name, keys=keys, trials=trials)
-                values[name] = Column.of(jitter * (2 * number - 1))
+            for name in SHIFTS:
+                values[name] = Column.of(jitter * (2 * draw(name) - 1))
         if calibration is not None:
-            values |= calibrated_columns(
-                calibration, values, count,
-                lambda quantity: draw(grid.seed, quantity, keys=keys, trials=trials),
-            )
+            values |= calibrated_columns(calibration, values, count, draw)
         if noisy:
             values["noise_key"] = Column.of(bits(grid.seed, "noise", keys, trials))
         resolve_pose(values)
@@ -273,12 +302,7 @@ class Experiment:
     def image_keys(self, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
         """Return the keys (N,) of the images of scenes at ``indices`` (N,) along the scene axes."""
         grid = self.grid
-        count = len(indices[0]) if self.scene_axes else 1
-        values = dict(self._constants)
-        for axis, index in zip(self.scene_axes, indices, strict=True):
-            for name, along in axis.columns.items():
-                values[name] = Column.of([along[i] for i in index.tolist()])
-        trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+        values, trials = self._given(indices)
         if "background" in values:  # an image is known by its content
             values["background"] = values["background"].map(
                 lambda value: grid.files.get(value) or value)
@@ -291,30 +315,4 @@ class Experiment:
             for name, distribution in sorted(grid.distributions.items())
             if grid.parameters[name].stage is Stage.scene
         ]
-        return bits(grid.seed, f"image {grid.sampling}", hashed(texts, count), trials)
-
-
-# --------------------------------------------------------------------------------------------------
-# The effects and renderers of a pipeline: the built-in ones, and those of its plug-ins.
-
-def effect_of(plugin: DeclaredPlugin) -> Effect:
-    """Return the effect of a plug-in, which is not imported for it: it lacks its function."""
-    widens: Any = plugin.widens
-    step: Any = plugin.step
-    parameters = {setting.name: setting for setting in plugin.settings}
-    return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
-
-
-@lru_cache(maxsize=16)
-def imported(plugins: tuple[DeclaredPlugin, ...], folder: str) -> ScenePlugins:
-    """Return what plug-ins add to scenes, imported; PluginError if one is not as declared."""
-    effects, renderers, settings = [], {}, []
-    for plugin in plugins:
-        if plugin.kind == "effect":
-            record = cast("EffectPlugin", plugin.record(folder))
-            effects.append(effect_of(plugin).applying(checked_effect(plugin.name, record.apply)))
-        elif plugin.kind == "renderer":
-            renderer = cast("RendererPlugin", plugin.record(folder))
-            renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)
-            settings += [setting.name for setting in plugin.settings]
-    return ScenePlugins(tuple(effects), renderers, tuple(settings))
+        return bits(grid.seed, f"image {grid.sampling}", hashed(texts, len(trials)), trials)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.grid import Grid
-from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
+from sweep.experiment.parameters import PHOTOGRAPHS, Stage, superseded
 from sweep.measure.flags import (
     BoundStatus,
     DetectionStatus,
@@ -309,21 +309,21 @@ class Variable:
         widths = [(0, 0)] * outer + [(0, each) for each in missing]
         return np.pad(kept, widths, constant_values=beyond)
 
+    def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
+        """Return its axes in the pipeline's order: those of its stage and of the stages before."""
+        return tuple(axis for axis in pipeline.axes if axis.stage <= self.stage)
+
     def configuration_axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return the axes of detection and estimation that it has, stage by stage.
 
         They span its configurations, the last axis fastest; a scene's variable has none.
         """
-        stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
-        return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
+        settings = (axis for axis in self.axes(pipeline) if axis.stage is not Stage.scene)
+        return tuple(sorted(settings, key=lambda axis: axis.stage))
 
     def configurations(self, pipeline: Grid) -> int:
         """Return the number of its configurations: one for a scene's variable."""
         return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
-
-    def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
-        """Return its axes in the pipeline's order: those of its stage and of the stages before."""
-        return pipeline.axes_of(*(stage for stage in Stage if stage <= self.stage))
 
     def dimensions(self, pipeline: Grid) -> tuple[str, ...]:
         """Return the names of its dimensions: its axes, then ``inner``."""
@@ -445,20 +445,27 @@ VARIABLES: dict[str, Variable] = {
 """Every variable by its name, those of boards included."""
 
 
+# --------------------------------------------------------------------------------------------------
+# Variables that not every pipeline has: draws, and what is known of photographs.
+
+def _drawn(name: str, meaning: str, unit: str, scale: float = 0.0, drawn_as: str = "") -> Variable:
+    """Return the variable of a number of each scene that is drawn, or follows from one that is.
+
+    ``scale`` is the largest number that it is added up from, by which rounding is measured; 0 if
+    it is a product.
+    """
+    tolerance = Tolerance("absolute", TRUTH_RTOL * scale) if scale else Tolerance(
+        "relative", TRUTH_RTOL)
+    return Variable(name, Stage.scene, "f8", meaning, unit, present_when=_TRUTH,
+                    tolerance=tolerance, drawn_as=drawn_as or name)
+
+
 PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
-    Variable("side_px", _S, "f8", "side of the black square if it were parallel to the image plane",
-             "px", present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL),
-             drawn_as="side_px"),
-    Variable("distance_m", _S, "f8", "depth of the marker's centre along the optical axis", "m",
-             present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL),
-             drawn_as="distance_m"),
-    Variable("tilt_deg", _S, "f8", "angle between the marker's plane and the image plane", "degree",
-             present_when=_TRUTH, tolerance=Tolerance("absolute", 180 * TRUTH_RTOL),
-             drawn_as="tilt_deg"),
-    Variable("image_x_px", _S, "f8", "image of the marker's centre, x", "px", present_when=_TRUTH,
-             tolerance=Tolerance("absolute", 1e-6), drawn_as="image_x_px"),
-    Variable("image_y_px", _S, "f8", "image of the marker's centre, y", "px", present_when=_TRUTH,
-             tolerance=Tolerance("absolute", 1e-6), drawn_as="image_y_px"),
+    _drawn("side_px", "side of the black square if it were parallel to the image plane", "px"),
+    _drawn("distance_m", "depth of the marker's centre along the optical axis", "m"),
+    _drawn("tilt_deg", "angle between the marker's plane and the image plane", "degree", 180),
+    _drawn("image_x_px", "image of the marker's centre, x", "px", 1e6),
+    _drawn("image_y_px", "image of the marker's centre, y", "px", 1e6),
     Variable("truth", _S, "u1", "origin of the true pose", flags=TruthSource, tolerance=_EQUAL),
     Variable("truth_std", _S, "f4",
              "standard deviation of the true pose, as far as it is known; camera frame",
@@ -478,21 +485,21 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
     >>> [variable.name for variable in drawn_variables(pipeline)]
     ['side_px', 'distance_m']
     """
+    scales = {name: drawn.largest for name, drawn in pipeline.distributions.items()}
+    if "side_px" in scales:
+        scales["distance_m"] = 0.0
+    parameters = {name: pipeline.parameters[name] for name in scales}
     variables = [
-        _drawn_parameter(pipeline.parameters[name], distribution.largest)
-        for name, distribution in pipeline.distributions.items()
+        _drawn(name, parameter.declaration.meaning, parameter.unit, scales[name])
+        for name, parameter in parameters.items()
     ]
-    if "side_px" in pipeline.distributions:
-        variables.append(_drawn_parameter(PARAMETERS["distance_m"]))
-    jitter = max(map(float, pipeline.values_of("jitter_px")), default=0.0)
-    if jitter:
+    if jitter := max(map(float, pipeline.values_of("jitter_px")), default=0.0):
         variables += [
             _drawn(f"jitter_{axis}_px", f"shift of the centre's undistorted projection along "
                    f"{axis}", "px", jitter, f"shift_{axis}_px")
             for axis in ("u", "v")
         ]
-    error = pipeline.calibration
-    if error is not None:
+    if (error := pipeline.calibration) is not None:
         variables += [
             _drawn(f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, "
                    "for estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
@@ -503,45 +510,23 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
     return tuple(variables)
 
 
-def _drawn_parameter(parameter: Parameter, scale: float = 0.0) -> Variable:
-    name = parameter.name
-    return _drawn(name, parameter.declaration.meaning, parameter.unit, scale, name)
-
-
-def _drawn(name: str, meaning: str, unit: str, scale: float, drawn_as: str) -> Variable:
-    """Return the variable of a number of each scene that is drawn, or follows from one that is.
-
-    ``scale`` is the largest number that it is added up from, by which rounding is measured; 0 if
-    it is a product.
-    """
-    tolerance = Tolerance("absolute", TRUTH_RTOL * scale) if scale else Tolerance(
-        "relative", TRUTH_RTOL)
-    return Variable(name, Stage.scene, "f8", meaning, unit, present_when=_TRUTH,
-                    tolerance=tolerance, drawn_as=drawn_as)
-
-
 def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables that a pipeline's store has: the schema's, then draws.
+
+    Those of each marker of a board are as long as the largest board.
 
     >>> from sweep.experiment.pipeline import Pipeline
     >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1, "jitter_px": 0.5}})
     >>> [variable.name for variable in variables_of(pipeline)[-2:]]
     ['jitter_u_px', 'jitter_v_px']
     """
-    drawn = drawn_variables(pipeline)
-    photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
     common = SCHEMA
     if pipeline.shows_boards:
-        common = tuple(each for each in common if each.name not in NOT_OF_BOARDS)
-        common += _board_variables(pipeline)
-    return common + drawn + photographed
-
-
-def _board_variables(pipeline: Grid) -> tuple[Variable, ...]:
-    """Return the variables of a pipeline's boards, as long as its largest board."""
-    markers, corners = pipeline.largest_board
-    lengths = (("marker", markers), ("chessboard_corner", corners))
-    return tuple(
-        dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
-        if corners or "chessboard_corner" not in variable.inner
-    )
+        markers, corners = pipeline.largest_board
+        lengths = (("marker", markers), ("chessboard_corner", corners))
+        common = tuple(each for each in SCHEMA if each.name not in NOT_OF_BOARDS) + tuple(
+            dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
+            if corners or "chessboard_corner" not in variable.inner
+        )
+    photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
+    return common + drawn_variables(pipeline) + photographed

@@ -104,7 +104,7 @@ def run(
             progress=report, child=child)
     rate = summary.computed_scenes / max(summary.seconds, 1e-3)
     lines = [
-        f"camera: {read.facts.camera.line()}", *_again(summary, retry_failed=retry_failed),
+        f"camera: {read.facts.camera_line}", *_again(summary, retry_failed=retry_failed),
         f"{_poses(summary)}, {summary.detected_line}"
         + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else ""),
         f'xarray.open_zarr("{summary.data}")', *summary.warnings]
@@ -186,8 +186,8 @@ def plan(
             expected.seconds, expected.workers, expected.bytes, expected.files),
         library.forecast.free_disk(f"runs/{read.name}.zarr"), up_to=read.stopping is not None)
     sections = {
-        "Camera": [facts.camera.line(), *facts.camera_notes],
-        "Poses": [facts.poses.line(), *facts.pose_notes, *facts.detector_notes, *bound],
+        "Camera": [facts.camera_line, *facts.camera_notes],
+        "Poses": [facts.pose_line, *facts.pose_notes, *facts.detector_notes, *bound],
         "Dimensions": _dimensions(read),
         "Required": _required(read),
         "Trials": [] if read.stopping is None else _rule_lines(read.stopping),
@@ -203,7 +203,7 @@ def plan(
              *(["--yes"] if refused else [])]
     return findings(lines, {
         "title": read.title, "camera": facts.camera, "notes": [*facts.notes, *bound],
-        "views": facts.poses.ranges(),
+        "views": facts.view_ranges,
         "dimensions": {axis.name: len(axis) for axis in read.axes},
         "require": {"all": list(read.requirements), "per": list(read.require_per)},
         **dataclasses.asdict(expected),

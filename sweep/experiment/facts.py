@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,138 +29,45 @@ from sweep.model.camera import (
     field_of_view_deg,
 )
 from sweep.model.effects import Effect, is_coded
-from sweep.model.exposure import hidden, outside_frame
-from sweep.model.lens import fold_radius
+from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.marker import module_count
-from sweep.model.pose import viewing_angle
-from sweep.model.scene import build_cameras, build_scenes
+from sweep.model.pose import angles_of_rotation, viewing_angle
+from sweep.model.scene import Scenes, build_cameras, build_scenes
 from sweep.plugins.declared import DeclaredPlugin
 from sweep.typing import Floats, Masks
-
-# --------------------------------------------------------------------------------------------------
-# What a pipeline's camera and poses are: ranges over the scenes that are looked at.
 
 Range = tuple[float, float]
 """The least and the largest value on the grid."""
 
+MAX_SAMPLE = 600
+"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
 
-@dataclass(frozen=True, slots=True)
-class CameraFacts:
-    """The camera of a grid; each quantity has its least and its largest value.
+MAX_CORNERS = 200
+"""The most corners of a grid that are looked at."""
 
-    Of large grids, and of what is drawn, by the scenes that are looked at.
+OFF_CENTRE = 0.15
+"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
 
-    Attributes
-    ----------
-    width_px, height_px, fx_px, fy_px, cx_px, cy_px
-        Frame, focal lengths and principal point.
-    hfov_deg, vfov_deg
-        Angle between the frame's edges, without lens distortion: 2 atan(width / (2 fx)).
-    aspect
-        fy / fx: the width of a pixel over its height.
-    off_centre_x, off_centre_y
-        Principal point minus the frame's centre, as a share of its width and height.
-    square
-        Whether the pixels are square everywhere on the grid.
-    side_px
-        Side of the black square parallel to the image plane, at the farthest and the nearest
-        pose; None if all are behind the camera. Of boards the sides of the smallest and the
-        largest marker.
-    boards
-        Whether scenes show boards.
-    """
+WIDE_DEG = 150.0
+"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
 
-    width_px: Range
-    height_px: Range
-    fx_px: Range
-    fy_px: Range
-    cx_px: Range
-    cy_px: Range
-    hfov_deg: Range
-    vfov_deg: Range
-    aspect: Range
-    off_centre_x: Range
-    off_centre_y: Range
-    square: bool
-    side_px: Range | None
-    boards: bool
+RADIANS = (0.2, math.pi)
+"""Fields of view between these look like radians: of 12 to 180 degrees."""
 
-    def line(self) -> str:
-        """Return the camera in one line."""
-        focal = f"fx = fy = {_text(self.fx_px)} px" if self.square else (
-            f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
-            f"(pixels are not square: fy/fx = {_text(self.aspect, 4)})")
-        line = (f"{self.frame}, {focal}, HFOV {_text(self.hfov_deg, 4)}°, "
-                f"VFOV {_text(self.vfov_deg, 4)}°")
-        if self.side_px is None:
-            return line
-        if self.boards:
-            return f"{line}, the markers have sides of {_text(self.side_px, 4)} px"
-        far, near = self.side_px
-        return f"{line}, the marker's side is " + (f"{far:.4g} px" if far == near else (
-            f"{near:.4g} px at the nearest pose, {far:.4g} px at the farthest"))
+ROUNDED_RAD = 4e-3
+"""How far an angle in radians that someone rounded may be from a multiple of 15°."""
 
-    @property
-    def frame(self) -> str:
-        """The frame's size, in words."""
-        return f"{_text(self.width_px)} x {_text(self.height_px)} px"
+NOT_SQUARE = 0.01
+"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
 
-    def attributes(self) -> dict[str, Any]:
-        """Return the dataset's attributes: a number, or the least and the largest one."""
-        sides = {} if self.side_px is None else dict(
-            zip(("farthest_side_px", "nearest_side_px"), self.side_px, strict=True))
-        return {
-            f"camera_{name}": low if low == high else [low, high]
-            for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
-            for low, high in [getattr(self, name)]
-        } | sides
+APART_DEG = 5.0
+"""Difference of tilt and viewing angle that is told."""
 
+FARTHER = 1.1
+"""Range over depth that is told: a direction of 25° from the optical axis."""
 
-@dataclass(frozen=True, slots=True)
-class PoseFacts:
-    """Poses of a grid, all of them or a sample.
-
-    Attributes
-    ----------
-    poses, sampled
-        Scene cells of the grid, and how many of them were looked at.
-    tilt_deg, viewing_angle_deg, range_m
-        (n,) of each: angle to the image plane, angle to the line of sight, distance of the centre.
-    depth_m
-        (n,) of the centre, along the optical axis.
-    behind, averted, outside, cut
-        (n,) whether a corner is behind the camera; the marker is seen from behind or edge on; it
-        lies outside the frame; a corner of the black square does. Each without those before.
-    """
-
-    poses: int
-    sampled: int
-    tilt_deg: Floats
-    viewing_angle_deg: Floats
-    range_m: Floats
-    depth_m: Floats
-    behind: Masks
-    averted: Masks
-    outside: Masks
-    cut: Masks
-
-    def line(self) -> str:
-        """Return the poses in one line."""
-        sample = "" if self.sampled == self.poses else f" ({self.sampled:,} poses looked at)"
-        return (f"tilt {_text(self.tilt_deg, 4)}°, viewing angle "
-                f"{_text(self.viewing_angle_deg, 4)}°, {_text(self.range_m, 4)} m away{sample}")
-
-    def ranges(self) -> dict[str, list[float]]:
-        """Return the least and the largest tilt, viewing angle and distance."""
-        return {name: list(_ends(getattr(self, name)))
-                for name in ("tilt_deg", "viewing_angle_deg", "range_m")}
-
-    def share(self, chosen: Masks) -> str:
-        """Return the share of the poses that are ``chosen``, in words."""
-        count, whole = int(chosen.sum()), self.sampled == self.poses
-        if count == self.sampled:
-            return "all poses" if whole else f"all {count:,} poses looked at"
-        return f"{'' if whole else 'about '}{100 * chosen.mean():.2g} % of the poses"
+MIN_SHARE = 0.01
+"""Share of poses that is told."""
 
 
 def _ends(numbers: Floats) -> Range:
@@ -199,47 +106,11 @@ def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") 
     return Part(name, bool(text), form.format(text) if text else otherwise)
 
 
-# --------------------------------------------------------------------------------------------------
-# The facts of an experiment, and what may surprise: a line each. They are gathered once.
-
-MAX_SAMPLE = 600
-"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
-
-MAX_CORNERS = 200
-"""The most corners of a grid that are looked at."""
-
-OFF_CENTRE = 0.15
-"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
-
-WIDE_DEG = 150.0
-"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
-
-RADIANS = (0.2, math.pi)
-"""Fields of view between these look like radians: of 12 to 180 degrees."""
-
-ROUNDED_RAD = 4e-3
-"""How far an angle in radians that someone rounded may be from a multiple of 15°."""
-
-POLE = 1e-9
-"""Denominator of the radial distortion at a fold below which it is a pole."""
-
-NOT_SQUARE = 0.01
-"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
-
-APART_DEG = 5.0
-"""Difference of tilt and viewing angle that is told."""
-
-FARTHER = 1.1
-"""Range over depth that is told: a direction of 25° from the optical axis."""
-
-MIN_SHARE = 0.01
-"""Share of poses that is told."""
-
-
 class Facts:
     """What an experiment's camera and poses are, which parts are active, and what may surprise.
 
-    `sweep plan` prints all of it; the start of a run prints the notes.
+    Of large grids, and of what is drawn, by the scenes that are looked at. `sweep plan` prints all
+    of it; the start of a run prints the notes.
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -254,14 +125,13 @@ class Facts:
         """
         axes = self.experiment.scene_axes
         lengths = [len(axis) for axis in axes]
-        cells = math.prod(lengths)
-        if cells <= MAX_SAMPLE:
+        if math.prod(lengths) <= MAX_SAMPLE:
             indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-            return max(cells, 1), self.experiment.scene_values(indices)
+            return max(math.prod(lengths), 1), self.experiment.scene_values(indices)
         first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
         # The last axis of a product varies fastest.
         order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
-        ends = itertools.product(*((0, lengths[k] - 1) if lengths[k] > 1 else (0,) for k in order))
+        ends = itertools.product(*(sorted({0, lengths[k] - 1}) for k in order))
         corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
         chosen = np.random.default_rng(0)
         anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
@@ -270,9 +140,20 @@ class Facts:
             for k, other in enumerate(anywhere)
         ])
 
+    # The camera.
+
     @cached_property
-    def camera(self) -> CameraFacts:
-        """What a pipeline's camera is, by the scenes that are looked at."""
+    def camera(self) -> dict[str, Any]:
+        """Each quantity of the camera: its least and its largest value.
+
+        Frame, focal lengths and principal point in px; hfov_deg and vfov_deg, the angle between
+        the frame's edges without lens distortion, 2 atan(width / (2 fx)); aspect, fy / fx: the
+        width of a pixel over its height; off_centre_x and off_centre_y, the principal point minus
+        the frame's centre, as a share of its width and height; square, whether the pixels are
+        square everywhere on the grid; side_px of the black square parallel to the image plane, at
+        the farthest and the nearest pose, None if all are behind the camera, of boards the sides
+        of the smallest and the largest marker; boards, whether scenes show boards.
+        """
         count, values = self._sample
         fx, fy, cx, cy = build_cameras(values, count).view.T
         width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
@@ -281,61 +162,58 @@ class Facts:
             sides = given.broadcast(count) if not given.missing else (
                 fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
         sides = sides[sides > 0]  # before the camera
-        relative = self.grid.relative_sizes
-        return CameraFacts(
-            **{name: _ends(numbers) for name, numbers in {
-                "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
-                "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
-                "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
-                "off_centre_x": (cx - (width - 1) / 2) / width,
-                "off_centre_y": (cy - (height - 1) / 2) / height,
-            }.items()},
-            square=bool(np.all(are_square(fx, fy))), boards=self.grid.shows_boards,
-            side_px=None if not len(sides) else (
-                float(sides.min()) * relative[0], float(sides.max()) * relative[1]),
-        )
-
-    @cached_property
-    def poses(self) -> PoseFacts:
-        """What a pipeline's poses are."""
-        count, values = self._sample
-        scenes = build_scenes(values, count)
-        normal, depth = scenes.rotation[:, 2, 2], scenes.translation[:, 2]
-        behind = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
-        averted = hidden(scenes) & ~behind
-        outside = np.zeros(count, dtype=bool)
-        seen = np.flatnonzero(~behind & ~averted)
-        outside[seen] = outside_frame(scenes, seen)
-        corners = scenes.corners_px
-        beyond = (corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)
-        return PoseFacts(
-            poses=math.prod(len(axis) for axis in self.experiment.scene_axes),
-            sampled=count,
-            tilt_deg=np.degrees(np.arctan2(np.hypot(*scenes.rotation[:, :2, 2].T), -normal)),
-            viewing_angle_deg=np.degrees(viewing_angle(scenes.rotation, scenes.translation)),
-            range_m=np.linalg.norm(scenes.translation, axis=1),
-            depth_m=depth,
-            behind=behind, averted=averted, outside=outside,
-            cut=np.asarray(beyond.any(axis=(1, 2)) & ~behind & ~averted & ~outside),
-        )
+        numbers = {
+            "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
+            "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
+            "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
+            "off_centre_x": (cx - (width - 1) / 2) / width,
+            "off_centre_y": (cy - (height - 1) / 2) / height,
+        }
+        return {name: _ends(each) for name, each in numbers.items()} | {
+            "square": bool(np.all(are_square(fx, fy))),
+            "side_px": None if not len(sides) else tuple(
+                end * scale for end, scale in zip(
+                    _ends(sides), self.grid.relative_sizes, strict=True)),
+            "boards": self.grid.shows_boards,
+        }
 
     @property
-    def notes(self) -> list[str]:
-        """The lines that `sweep plan` and the start of a run print."""
-        if PHOTOGRAPHS in self.grid.given:
-            return []
-        return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
+    def _frame(self) -> str:
+        """The frame's size, in words."""
+        return f"{_text(self.camera['width_px'])} x {_text(self.camera['height_px'])} px"
+
+    @property
+    def camera_line(self) -> str:
+        """The camera in one line."""
+        camera, side = self.camera, self.camera["side_px"]
+        focal = f"fx = fy = {_text(camera['fx_px'])} px" if camera["square"] else (
+            f"fx = {_text(camera['fx_px'])} px, fy = {_text(camera['fy_px'])} px "
+            f"(pixels are not square: fy/fx = {_text(camera['aspect'], 4)})")
+        line = (f"{self._frame}, {focal}, HFOV {_text(camera['hfov_deg'], 4)}°, "
+                f"VFOV {_text(camera['vfov_deg'], 4)}°")
+        if side is None:
+            return line
+        if camera["boards"]:
+            return f"{line}, the markers have sides of {_text(side, 4)} px"
+        far, near = side
+        return f"{line}, the marker's side is " + (f"{far:.4g} px" if far == near else (
+            f"{near:.4g} px at the nearest pose, {far:.4g} px at the farthest"))
+
+    @property
+    def camera_attributes(self) -> dict[str, Any]:
+        """The dataset's attributes of the camera: a number, or the least and the largest one."""
+        return {
+            f"camera_{name}": low if low == high else [low, high]
+            for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
+            for low, high in [self.camera[name]]
+        } | dict(zip(("farthest_side_px", "nearest_side_px"), self.camera["side_px"] or (),
+                     strict=False))
 
     @cached_property
     def camera_notes(self) -> list[str]:
         """A line for each property of the camera, or of beliefs about it, that may surprise."""
-        return [*self._view_notes(), *self._centre_notes(), *self._fold_notes(),
-                *self._side_notes(), *self._belief_notes()]
-
-    @cached_property
-    def pose_notes(self) -> list[str]:
-        """A line for each property of a pipeline's poses that may surprise."""
-        return [*self._visibility_notes(), *self._axis_notes(), *self._unit_notes()]
+        return [*self._view_notes(), *self._centre_notes(), *self._side_notes(),
+                *self._belief_notes()]
 
     def _numbers(self, name: str) -> list[float]:
         """Return the numbers of the document for a parameter: the ends or the mean of draws."""
@@ -343,68 +221,54 @@ class Facts:
             return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
         return [float(value) for value in self.grid.values_of(name) if value is not None]
 
+    def _radians(self, section: str) -> Iterator[str]:
+        """Yield a line for each angle of a section whose values look like radians."""
+        for name, parameter in PARAMETERS.items():
+            if (parameter.section, parameter.unit) != (section, "degree"):
+                continue
+            angles = np.array([value for value in self._numbers(name) if value])
+            steps = np.abs(angles) / (math.pi / 12)
+            alike = (angles > RADIANS[0]) & (angles < RADIANS[1]) if name in FIELDS_OF_VIEW else (
+                np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD) & (
+                    steps > 0.5) & (steps < 24.5)
+            if len(angles) and alike.all():
+                largest = max(angles, key=abs)
+                yield (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
+                       f"{math.degrees(largest):.4g}")
+
     def _view_notes(self) -> Iterator[str]:
-        facts = self.camera
-        hfov = _text(facts.hfov_deg, 4)
-        if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
-            yield (f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the "
+        aspect, hfov = self.camera["aspect"], _text(self.camera["hfov_deg"], 4)
+        if max(abs(ratio - 1) for ratio in aspect) > NOT_SQUARE:
+            yield (f"pixels are not square: fy/fx = {_text(aspect, 4)}; a single side of the "
                    "sensor, or fx_px alone, makes them square")
-        if facts.hfov_deg[1] > WIDE_DEG:
+        if self.camera["hfov_deg"][1] > WIDE_DEG:
             yield (f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in "
                    "another unit?")
         if len(self.grid.values_of("width_px")) > 1 and self.grid.fixed.get("fx_px") is not None:
             yield (f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
                    "place of fx_px keeps it")
-        for name in FIELDS_OF_VIEW:
-            numbers = self._numbers(name)
-            if numbers and min(numbers) > RADIANS[0] and max(numbers) < RADIANS[1]:
-                yield _in_degrees(name, numbers)
+        yield from self._radians("camera")
 
     def _centre_notes(self) -> Iterator[str]:
-        facts = self.camera
-        for name, ends, shares in (
-            ("cx_px", facts.cx_px, facts.off_centre_x), ("cy_px", facts.cy_px, facts.off_centre_y),
-        ):
-            off = max(map(abs, shares))
+        for axis in "xy":
+            centre = f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}"
+            off = max(map(abs, self.camera[f"off_centre_{axis}"]))
             if off > 0.5:
-                yield f"{name} = {_text(ends)}: outside the frame of {facts.frame}"
+                yield f"{centre}: outside the frame of {self._frame}"
             elif off > OFF_CENTRE:
-                yield (f"{name} = {_text(ends)}: far from the centre of the frame of "
-                       f"{facts.frame}; is it that of another frame size?")
-        x, y = facts.width_px[0] / 2, facts.height_px[0] / 2
-        if (facts.cx_px, facts.cy_px) == ((x, x), (y, y)):
+                yield (f"{centre}: far from the centre of the frame of {self._frame}; is it that "
+                       "of another frame size?")
+        x, y = (self.camera[name][0] / 2 for name in ("width_px", "height_px"))
+        if (self.camera["cx_px"], self.camera["cy_px"]) == ((x, x), (y, y)):
             yield (f"cx_px = {x:g}, cy_px = {y:g}: half the frame; with pixel (0, 0) at the "
                    f"pixel's centre, as here, the middle is {x - 0.5:g}, {y - 0.5:g}: subtract 0.5 "
                    "if the program that gave them has its corner there "
                    "(pipelines/half_pixel/README.md)")
 
-    def _fold_notes(self) -> Iterator[str]:
-        """Yield a line if the only lens' radial distortion stops growing within the frame."""
-        facts = self.camera
-        lens = canonical_distortion(self.grid.fixed.get("distortion", ()))
-        ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
-        radius = fold_radius(lens) if lens else math.inf
-        if any(low != high for low, high in ends) or not math.isfinite(radius):
-            return
-        width, height, fx, fy, cx, cy = (low for low, _ in ends)
-        k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
-        s = radius**2
-        denominator = 1 + s * (k4 + s * (k5 + s * k6))
-        if denominator <= POLE:
-            return
-        fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
-        corner = math.hypot(
-            max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
-        )
-        if fold < corner:
-            yield (f"the lens folds {fold * fx:.0f} px from the principal point, within the frame "
-                   f"(corner: {corner * fx:.0f} px): poses beyond are not_modelled")
-
     def _side_notes(self) -> Iterator[str]:
         """Yield a line if no marker of the grid is of a size that can be detected."""
-        facts = self.camera
-        far, near = facts.side_px or (0.0, math.inf)
-        whose = "the markers' sides are" if facts.boards else "the marker's side is"
+        far, near = self.camera["side_px"] or (0.0, math.inf)
+        whose = "the markers' sides are" if self.camera["boards"] else "the marker's side is"
         units = (
             "" if "side_px" in self.grid.given
             else "; are size_m and the distances in metres?" if "size_m" in self.grid.given
@@ -413,7 +277,7 @@ class Facts:
         if near < min(map(module_count, self.grid.values_of("dictionary"))):
             yield (f"{whose} at most {near:.4g} px, less than a pixel a module: too small to be "
                    f"read{units}")
-        elif far > max(facts.width_px[1], facts.height_px[1]):
+        elif far > max(self.camera["width_px"][1], self.camera["height_px"][1]):
             yield f"{whose} at least {far:.4g} px, more than the frame's{units}"
 
     def _belief_notes(self) -> Iterator[str]:
@@ -430,31 +294,98 @@ class Facts:
                    "calibrations, fx and fy above all, vary together, which "
                    "calibration_covariance states")
 
-    def _visibility_notes(self) -> list[str]:
-        facts, target = self.poses, self.grid.target_word
+    # The poses.
+
+    @cached_property
+    def _scenes(self) -> Scenes:
+        """The scenes that are looked at."""
+        count, values = self._sample
+        return build_scenes(values, count)
+
+    @cached_property
+    def views(self) -> dict[str, Floats]:
+        """Tilt to the image plane, angle to the line of sight, distance of the centre, (n,) each.
+
+        Of the scenes that are looked at.
+        """
+        rotation, translation = self._scenes.rotation, self._scenes.translation
+        return {
+            "tilt_deg": np.degrees(angles_of_rotation(rotation)[0]),
+            "viewing_angle_deg": np.degrees(viewing_angle(rotation, translation)),
+            "range_m": np.linalg.norm(translation, axis=1),
+        }
+
+    @property
+    def view_ranges(self) -> dict[str, list[float]]:
+        """The least and the largest tilt, viewing angle and distance."""
+        return {name: list(_ends(numbers)) for name, numbers in self.views.items()}
+
+    @property
+    def _poses(self) -> int:
+        """The number of scene cells of the grid."""
+        return math.prod(len(axis) for axis in self.experiment.scene_axes)
+
+    @property
+    def pose_line(self) -> str:
+        """The poses in one line."""
+        count, _ = self._sample
+        tilt, angle, distance = (_text(numbers, 4) for numbers in self.views.values())
+        sample = "" if count == self._poses else f" ({count:,} poses looked at)"
+        return f"tilt {tilt}°, viewing angle {angle}°, {distance} m away{sample}"
+
+    @cached_property
+    def pose_notes(self) -> list[str]:
+        """A line for each property of a pipeline's poses that may surprise."""
+        return [*self._visibility_notes(), *self._axis_notes(), *self._radians("pose")]
+
+    def _share(self, chosen: Masks) -> str:
+        """Return the share of the poses that are ``chosen``, in words."""
+        whole = len(chosen) == self._poses
+        if chosen.all():
+            return "all poses" if whole else f"all {len(chosen):,} poses looked at"
+        return f"{'' if whole else 'about '}{100 * chosen.mean():.2g} % of the poses"
+
+    def _visibility_notes(self) -> Iterator[str]:
+        """Yield a line for each reason for which markers are not wholly seen; the first counts."""
+        scenes, target = self._scenes, self.grid.target_word
         world = not self.grid.given.isdisjoint(WORLD)
         framed = not self.grid.given.isdisjoint(("frame_x", "frame_y"))
-        lines = [f"{facts.share(chosen)} {what}" for chosen, what in (
-            (facts.behind, "have a corner behind the camera: not_visible"),
-            (facts.averted,
+        left = np.ones(len(scenes), dtype=bool)
+
+        def outside() -> Masks:
+            rows, wholly = np.flatnonzero(left), np.zeros_like(left)
+            wholly[rows] = outside_frame(scenes, rows)
+            return wholly
+
+        corners = scenes.corners_px
+        reasons: tuple[tuple[Callable[[], Any], str], ...] = (
+            (lambda: ~np.isfinite(scenes.outline_px).all(axis=(1, 2)),
+             "have a corner behind the camera: not_visible"),
+            (lambda: hidden(scenes),
              f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
-            (facts.outside, f"are outside the frame{' of the camera' * world}: not_visible"
+            (lambda: not_modelled(scenes),
+             "lie where the lens folds, or bend or move out of what is modelled: not_modelled"),
+            (outside,
+             f"are outside the frame{' of the camera' * world}: not_visible"
              + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
-            (facts.cut, "are cut off by the frame's edge"
-             + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
-                "the middle" if framed else "")),
-        ) if chosen.mean() > MIN_SHARE]
-        unseen = facts.behind | facts.averted | facts.outside
-        whole = [f"{facts.share(unseen)} are not_visible:"]
-        return whole + lines if unseen.all() and len(lines) > 1 else lines
+            (lambda: ((corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)).any((1, 2)),
+             "are cut off by the frame's edge" + (
+                 f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
+                 "the middle" if framed else "")),
+        )
+        for reason, what in reasons:
+            chosen = np.asarray(left & reason())
+            left &= ~chosen
+            if chosen.mean() > MIN_SHARE:
+                yield f"{self._share(chosen)} {what}"
 
     def _axis_notes(self) -> Iterator[str]:
         """Yield lines for angles and distances that differ off the axis, or do nothing."""
-        facts, given, drawn = self.poses, self.grid.given, self.grid.distributions
-        shown, in_camera = ~facts.behind, given.isdisjoint(WORLD)
-        tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
+        given, drawn = self.grid.given, self.grid.distributions
+        shown, in_camera = self._scenes.translation[:, 2] > 0, given.isdisjoint(WORLD)
+        tilt, view, distance = (numbers[shown] for numbers in self.views.values())
         apart = np.abs(view - tilt).max(initial=0)
-        farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
+        farther = (distance / self._scenes.translation[shown, 2]).max(initial=0)
         turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
         if in_camera and turned == "tilt_deg" and apart > APART_DEG:
             angles = "tilt_deg is" if given.isdisjoint(("yaw_deg", "pitch_deg")) else (
@@ -463,42 +394,36 @@ class Facts:
                    f"{apart:.3g}° (tilt {_text(tilt, 3)}°, viewing angle {_text(view, 3)}°): "
                    f"{angles} to the image plane, view_angle_deg is to the line of sight")
         if in_camera and farther > FARTHER:
-            distance = "side_px" if "side_px" in given else "distance_m"
-            yield (f"{distance} counts along the optical axis: off it, the "
+            depth = "side_px" if "side_px" in given else "distance_m"
+            yield (f"{depth} counts along the optical axis: off it, the "
                    f"{self.grid.target_word}'s centre is up to {farther:.3g} times as far away")
         if ("azimuth_deg" in drawn or len(self.grid.values_of("azimuth_deg")) > 1) and not (
                 turned in drawn or self.grid.any_value(turned, bool)):
             yield f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0"
 
-    def _unit_notes(self) -> Iterator[str]:
-        """Yield a line for each angle whose values look like radians."""
-        for parameter in PARAMETERS.values():
-            if parameter.section != "pose" or parameter.unit != "degree":
-                continue
-            values = self._numbers(parameter.name)
-            steps = np.array([value for value in values if value]) / (math.pi / 12)
-            close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
-            if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
-                yield _in_degrees(parameter.name, values)
+    # The detections, and all notes.
 
     @property
-    def detector_notes(self) -> list[str]:
+    def detector_notes(self) -> Iterator[str]:
         """A line for each property of the detections that may surprise."""
-        lines = []
-        squares = self.grid.any_value("kind", lambda kind: kind == "aprilgrid") or (
-            self.grid.any_value("corner_squares", bool))
+        squares = "aprilgrid" in self.grid.values_of("kind") or any(
+            self.grid.values_of("corner_squares"))
         if squares and self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector")):
-            lines.append(
-                "board: squares touch its markers' corners, and OpenCV's default threshold joins "
-                "both: it finds a third of sharp markers; adaptiveThreshConstant = 60, "
-                "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in "
-                "five (pipelines/boards/README.md)")
+            yield ("board: squares touch its markers' corners, and OpenCV's default threshold "
+                   "joins both: it finds a third of sharp markers; adaptiveThreshConstant = 60, "
+                   "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in "
+                   "five (pipelines/boards/README.md)")
         if "apriltag" in self.grid.values_of("cornerRefinementMethod"):
-            lines.append(
-                "cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of "
-                "and below those of its other refinements, and of its calibrations: half a pixel "
-                "in position and direction (pipelines/half_pixel/README.md)")
-        return lines
+            yield ("cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of "
+                   "and below those of its other refinements, and of its calibrations: half a "
+                   "pixel in position and direction (pipelines/half_pixel/README.md)")
+
+    @property
+    def notes(self) -> list[str]:
+        """The lines that `sweep plan` and the start of a run print."""
+        if PHOTOGRAPHS in self.grid.given:
+            return []
+        return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
 
     @cached_property
     def parts(self) -> list[Part]:
@@ -576,12 +501,6 @@ class Facts:
     def _needs_images(self, solver: str) -> bool:
         plugin = self.grid.plugin("estimator", solver)
         return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
-
-
-def _in_degrees(name: str, numbers: Sequence[float]) -> str:
-    largest = max(numbers, key=abs)
-    return (f"{name} = {largest:g}: in degrees; {largest:g} radians would be "
-            f"{math.degrees(largest):.4g}")
 
 
 def _described(plugin: DeclaredPlugin) -> str:

@@ -273,7 +273,7 @@ def facts_of(data: ReportData) -> dict[str, Any]:
     """Return what the models are of."""
     return {
         "store": data.store, "title": data.pipeline.heading,
-        "camera": data.pipeline.facts.camera.line(),
+        "camera": data.pipeline.facts.camera_line,
         "fingerprint": dict(data.run_metadata.get("fingerprint", {})),
         "pipeline": data.pipeline.text,
     }

@@ -66,7 +66,7 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
         "Store": data.store,
-        "Camera": "; ".join([data.pipeline.facts.camera.line(), *data.pipeline.facts.camera_notes]),
+        "Camera": "; ".join([data.pipeline.facts.camera_line, *data.pipeline.facts.camera_notes]),
         "Run": _dates(data.run_metadata),
         **({"Sampling": sampling} if (sampling := sampling_text(data.results)) else {}),
         "Versions": versions,

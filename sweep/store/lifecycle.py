@@ -291,7 +291,7 @@ def root_attributes(
     attributes = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
-        **pipeline.facts.camera.attributes(),
+        **pipeline.facts.camera_attributes,
         **({"camera_notes": "; ".join(surprising)} if surprising else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": json.dumps(metadata),

@@ -560,7 +560,7 @@ class SolverTrial:
         experiment = self.pipeline.experiment
         batch = scenes_at(experiment, [np.arange(SCENES)])
         (searched,), _ = detections_of(
-            experiment, batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
+            batch, np.ones((SCENES, 1), dtype=bool), [], keep=True)
         (setting,) = experiment.estimators
         rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
         try:

@@ -243,7 +243,7 @@ def _run_batch(
     start = time.perf_counter()
     batch = scenes_at(experiment, indices)
     found, result.row_seconds[part] = detections_of(
-        experiment, batch, searched & batch.visible[:, None], failures,
+        batch, searched & batch.visible[:, None], failures,
         keep=any(each.needs_images for each in builds),
     )
     asked = batch.values["bound"].broadcast(len(need), np.str_)

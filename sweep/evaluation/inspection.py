@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import PluginError, RunError
+from sweep.errors import RunError
 from sweep.evaluation.block import assumed_cameras, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import (
-    SceneBatch,
-    detection_sources,
-    scenes_at,
-    search_windows,
-    whole_frames,
-)
+from sweep.evaluation.search import SceneBatch, detections_of, scenes_at, searched_windows
 from sweep.experiment.experiment import Experiment
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -76,29 +69,26 @@ def _indices(experiment: Experiment) -> list[NDArray[np.intp]]:
     return [np.zeros(1, dtype=np.intp) for _ in experiment.scene_axes]
 
 
-def _single_scene(
-    experiment: Experiment, *, whole_frame: bool
-) -> tuple[SceneBatch, Grey, list[int], list[int]]:
-    """Return a single scene, its image (h, w), the image's window, and the one that is searched.
+def _rendered(batch: SceneBatch, *, whole_frame: bool) -> tuple[Grey, tuple[int, int, int, int]]:
+    """Return the image (h, w) of a single scene and its window: the one that is searched.
 
-    The latter is that of a run, but the whole frame if the target is not seen.
+    The whole frame if that is asked for, or if the target is not seen.
     """
-    batch = scenes_at(experiment, _indices(experiment))
-    full = whole_frames(batch) | ~batch.visible
-    window, frame = (
-        search_windows(batch.scenes, batch.boxes, experiment.detectors[0], whole)[0].tolist()
-        for whole in (full, np.ones_like(full))
-    )
-    left, top, right, bottom = shown = frame if whole_frame else window
-    box = batch.boxes[0] if batch.visible[0] else np.zeros_like(batch.boxes[0])
-    return batch, render(batch.scenes, 0, box, (left, top, right, bottom)), shown, window
+    right, bottom = batch.scenes.frame[0].tolist()
+    window, box = (0, 0, right, bottom), np.zeros_like(batch.boxes[0])
+    if batch.visible[0]:
+        box = batch.boxes[0]
+        if not whole_frame:
+            left, top, right, bottom = searched_windows(batch)[0][0].tolist()
+            window = left, top, right, bottom
+    return render(batch.scenes, 0, box, window), window
 
 
 @single_threaded()
 def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> Grey:
     """Return the image (h, w) of a pipeline's single scene; it is not searched."""
-    _, image, _, _ = _single_scene(pipeline.experiment, whole_frame=whole_frame)
-    return image
+    experiment = pipeline.experiment
+    return _rendered(scenes_at(experiment, _indices(experiment)), whole_frame=whole_frame)[0]
 
 
 @single_threaded()
@@ -123,22 +113,15 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
     columns = {name: column[0, 0] for name, column in result.columns.items()}
-    batch, image, window, (x0, y0, x1, y1) = _single_scene(experiment, whole_frame=whole_frame)
-    scenes, targets = batch.scenes, batch.targets
-    left, top, right, bottom = window
-    source = detection_sources(experiment, batch)[0]
-    output = SearchOutput([], None, [])
-    origin = np.array([x0, y0] if source.needs_images else [0, 0], dtype=np.float64)
-    with suppress(PluginError):  # flagged "failed" by the run
-        output = source(0, image[y0 - top : y1 - top, x0 - left : x1 - left])
-    ids = () if output.ids is None else output.ids.ravel()
-    true_markers, length = targets.corners_px[0], float(scenes.size_m[0])
-    error = "corner_error_px" if targets.targets.are_markers else "marker_corner_error_px"
-    chessboard = np.zeros((0, 2))
-    if not targets.targets.are_markers:
-        length = float(np.ptp(targets.targets[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
-        if "chessboard_corner_error_px" in columns:
-            chessboard = targets.chessboard_px[0] + columns["chessboard_corner_error_px"]
+    batch = scenes_at(experiment, _indices(experiment))
+    scenes, target = batch.scenes, batch.targets.targets[0]
+    image, window = _rendered(batch, whole_frame=whole_frame)
+    (searched,), _ = detections_of(batch, batch.visible[:, None], [])
+    output = searched.outputs.get(0, SearchOutput([], None, []))
+    ids, origin = () if output.ids is None else output.ids.ravel(), searched.output_origins[0]
+    length = float(scenes.size_m[0])
+    if not target.is_marker:
+        length = float(np.ptp(target.corners_m.reshape(-1, 3), axis=0)[:2].min())
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
         cameras, _ = assumed_cameras(experiment.estimators[0], batch.values, scenes)
@@ -148,11 +131,11 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
-        window=(left, top, right, bottom),
+        window=window,
         true_corners=scenes.corners_px[0],
-        true_markers=true_markers,
-        markers=true_markers + columns[error],
-        chessboard=chessboard,
+        true_markers=batch.targets.corners_px[0],
+        markers=searched.found.marker_corners[0],
+        chessboard=searched.found.chessboard_px[0],
         area_px=float(columns["marker_area_px"]),
         decoded=[
             (int(number), quad[0] + origin)

@@ -47,6 +47,8 @@ class SceneBatch:
 
     Attributes
     ----------
+    experiment
+        The experiment that they are of.
     indices
         (N,) along each scene axis of the grid.
     values, scenes
@@ -59,6 +61,7 @@ class SceneBatch:
         (N, 4) left, top, right, bottom of what the targets can influence, px of the frame.
     """
 
+    experiment: Experiment
     indices: Sequence[NDArray[np.intp]]
     values: Mapping[str, Column]
     scenes: Scenes
@@ -80,7 +83,8 @@ def scenes_at(experiment: Experiment, indices: Sequence[NDArray[np.intp]]) -> Sc
     visibility = visibility_flags(scenes)
     boards = values["board"].listed(count) if "board" in values else None
     targets = target_scenes(scenes, visibility, boards, experiment.grid.largest_board)
-    return SceneBatch(indices, values, scenes, visibility, targets, marker_boxes(scenes))
+    return SceneBatch(
+        experiment, indices, values, scenes, visibility, targets, marker_boxes(scenes))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -251,9 +255,9 @@ class RecordedSearch:
         )
 
 
-def detection_sources(experiment: Experiment, batch: SceneBatch) -> list[DetectionSource]:
+def detection_sources(batch: SceneBatch) -> list[DetectionSource]:
     """Return where the detections of a batch come from, by detector setting."""
-    scenes, targets = batch.scenes, batch.targets
+    experiment, scenes, targets = batch.experiment, batch.scenes, batch.targets
     return [
         RecordedSearch(
             setting.record().recording, scenes, targets, experiment.image_keys(batch.indices)
@@ -286,6 +290,8 @@ class SearchResult:
         (N, 2) the first pixel of each searched image in the frame.
     poses
         Those that come with what was found (:meth:`DetectionSource.poses`).
+    outputs, output_origins
+        Row -> what the source found, and (N, 2) the pixel of the frame from which it counts.
     """
 
     targets: TargetScenes
@@ -295,6 +301,8 @@ class SearchResult:
     images: dict[int, Grey]
     origins: Integers
     poses: Poses
+    outputs: Mapping[int, SearchOutput]
+    output_origins: Integers
 
 
 def whole_frames(batch: SceneBatch) -> Masks:
@@ -350,6 +358,15 @@ def search_windows(
     return np.where(whole[:, None], frame, cut)
 
 
+def searched_windows(batch: SceneBatch) -> list[Integers]:
+    """Return the windows (N, 4) that each detector setting searches."""
+    full = whole_frames(batch)
+    return [
+        search_windows(batch.scenes, batch.boxes, setting, full)
+        for setting in batch.experiment.detectors
+    ]
+
+
 def common_windows(windows: Sequence[Integers]) -> Integers:
     """Return the smallest windows (N, 4) that hold several settings' windows (N, 4)."""
     return np.concatenate([
@@ -359,38 +376,16 @@ def common_windows(windows: Sequence[Integers]) -> Integers:
 
 
 def detections_of(
-    experiment: Experiment, batch: SceneBatch, wanted: Masks, failures: list[Failure], *,
-    keep: bool = False,
+    batch: SceneBatch, wanted: Masks, failures: list[Failure], *, keep: bool = False
 ) -> tuple[list[SearchResult], Floats]:
-    """Render scenes once and search them with each detector setting, as :func:`search` does."""
-    full = whole_frames(batch)
-    cuts = [
-        search_windows(batch.scenes, batch.boxes, setting, full) for setting in experiment.detectors
-    ]
-    return search(batch, wanted, detection_sources(experiment, batch), cuts, failures, keep=keep)
-
-
-def search(
-    batch: SceneBatch,
-    wanted: Masks,
-    sources: Sequence[DetectionSource],
-    cuts: Sequence[Integers],
-    failures: list[Failure],
-    *,
-    keep: bool = False,
-) -> tuple[list[SearchResult], Floats]:
-    """Render each scene once and search it with each source of detections.
+    """Render each scene once and search it with each detector setting.
 
     Parameters
     ----------
     batch
         N scenes.
     wanted
-        (N, sources) which scene is searched by which source.
-    sources
-        Where the detections come from: one for each detector setting.
-    cuts
-        Of each source the windows (N, 4) that it searches, as :func:`search_windows` returns them.
+        (N, detector settings) which scene is searched with which setting.
     failures
         The exceptions of single scenes are appended.
     keep
@@ -399,20 +394,21 @@ def search(
     Returns
     -------
     results : list of SearchResult
-        One for each source.
+        One for each setting.
     row_s : ndarray
         (N,) seconds spent on rendering and searching each scene.
     """
-    scenes, widest = batch.scenes, common_windows(cuts)
+    sources, windows = detection_sources(batch), searched_windows(batch)
+    rendered = common_windows(windows)
     passes = [
-        _Pass(source, k, cut, widest, keep, failures, np.zeros(len(scenes)))
-        for k, (source, cut) in enumerate(zip(sources, cuts, strict=True))
+        _Pass(source, k, cut, rendered, keep, failures, np.zeros(len(batch.scenes)))
+        for k, (source, cut) in enumerate(zip(sources, windows, strict=True))
     ]
     imaged = wanted & np.array([keep or source.needs_images for source in sources])
-    row_s = np.zeros(len(scenes))
-    for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
+    row_s = np.zeros(len(batch.scenes))
+    for rows in _groups(np.flatnonzero(imaged.any(axis=1)), rendered, batch.scenes.plain):
         begun = time.perf_counter()
-        images = images_of(render_all, batch, rows, widest, failures)
+        images = images_of(render_all, batch, rows, rendered, failures)
         row_s[rows] = (time.perf_counter() - begun) / len(rows)
         for each in passes:
             some = np.flatnonzero(imaged[rows, each.number])
@@ -437,7 +433,7 @@ class _Pass:
 
     source: DetectionSource
     number: int
-    cuts: Integers
+    windows: Integers
     rendered: Integers
     keep: bool
     failures: list[Failure]
@@ -448,8 +444,8 @@ class _Pass:
 
     def search(self, rows: NDArray[np.intp], images: Sequence[Grey | None]) -> None:
         """Search the rendered images of scenes ``rows`` (n,); None is one that was not rendered."""
-        cut = self.cuts[rows] - np.tile(self.rendered[rows, :2], 2)
-        cropped = (self.cuts[rows] != self.rendered[rows]).any(axis=1)
+        cut = self.windows[rows] - np.tile(self.rendered[rows, :2], 2)
+        cropped = (self.windows[rows] != self.rendered[rows]).any(axis=1)
         for i, (row, image) in enumerate(zip(rows.tolist(), images, strict=True)):
             if image is None:
                 self.failed.append(row)
@@ -471,14 +467,15 @@ class _Pass:
 
     def result(self, targets: TargetScenes) -> SearchResult:
         """Return what was found in the windows."""
-        begun, origins = time.perf_counter(), self.cuts[:, :2]
-        offset = origins if self.source.needs_images else np.zeros_like(origins)
-        found = classify(targets, self.outputs, offset.astype(np.float64))
+        begun, first = time.perf_counter(), self.windows[:, :2]
+        origins = first if self.source.needs_images else np.zeros_like(first)
+        found = classify(targets, self.outputs, origins.astype(np.float64))
         flags = found.flags.copy()
         flags[self.failed] = DetectionStatus.failed
         poses = self.source.poses(found)
         seconds = float(self.row_s.sum()) + time.perf_counter() - begun
-        return SearchResult(targets, found, flags, seconds, self.images, origins, poses)
+        return SearchResult(
+            targets, found, flags, seconds, self.images, first, poses, self.outputs, origins)
 
 
 GROUP_PX = 1 << 24

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,20 +18,18 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.search import common_windows, scenes_at, search_windows, whole_frames
+from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS, VARIABLES, Variable
-from sweep.measure.classify import TargetScenes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
-from sweep.model.camera import Column
 from sweep.model.polygon import signed_areas
 from sweep.model.scene import Scenes
 from sweep.store.files import write_whole
 from sweep.store.layout import planned_arrays
 from sweep.store.locations import reason_of
-from sweep.typing import Integers, Masks
+from sweep.typing import Integers
 
 # --------------------------------------------------------------------------------------------------
 # An experiment's scenes as a set of images: their numbers, names, windows, and visibility.
@@ -40,8 +39,11 @@ BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
-class ImageBatch:
-    """N scenes of an experiment and their images' names.
+class ImageBatch(SceneBatch):
+    """N scenes of an experiment as images, with their names.
+
+    There is an image of each visible scene: its target is in the frame, and the lens model holds
+    there.
 
     Attributes
     ----------
@@ -49,22 +51,13 @@ class ImageBatch:
         (N,) places in the grid of scene axes, the last axis fastest.
     keys
         (N,) keys of the images (:func:`sweep.experiment.experiment.Experiment.image_keys`).
-    scenes, targets, values
-        Geometry, what is shown, and parameters.
-    visible
-        (N,) whether there is an image: the target is in the frame, and the lens model holds there.
-    boxes, windows
-        (N, 4) left, top, right, bottom in pixels of the frame, half-open: what the target can
-        touch, and the part of the frame that the image shows.
+    windows
+        (N, 4) left, top, right, bottom in pixels of the frame, half-open: the part of the frame
+        that the image shows.
     """
 
     numbers: NDArray[np.intp]
     keys: NDArray[np.uint64]
-    scenes: Scenes
-    targets: TargetScenes
-    values: Mapping[str, Column]
-    visible: Masks
-    boxes: Integers
     windows: Integers
 
     def __len__(self) -> int:
@@ -99,18 +92,13 @@ def image_batch(
     """
     indices = scene_indices(pipeline, numbers)
     batch = scenes_at(pipeline.experiment, indices)
-    scenes, boxes = batch.scenes, batch.boxes
-    windows = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
-    if windowed:
-        full = whole_frames(batch)
-        windows = common_windows([
-            search_windows(scenes, boxes, setting, full)
-            for setting in pipeline.experiment.detectors
-        ])
+    frame = batch.scenes.frame
     return ImageBatch(
-        np.asarray(numbers), pipeline.experiment.image_keys(indices), scenes, batch.targets,
-        batch.values,
-        batch.visible, boxes, windows,
+        **{field.name: getattr(batch, field.name) for field in dataclasses.fields(batch)},
+        numbers=np.asarray(numbers),
+        keys=pipeline.experiment.image_keys(indices),
+        windows=common_windows(searched_windows(batch)) if windowed
+        else np.concatenate([np.zeros_like(frame), frame], axis=1),
     )
 
 

@@ -400,8 +400,8 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
         return _prepare(pipeline, [index[chosen] for index in indices], most)
     wanted = np.full((count, len(experiment.detectors)), len(rows) > 0)
-    searches, _ = detections_of(experiment, batch, wanted, [], keep=True)
-    return _Condition(batch, searches, detection_sources(experiment, batch))
+    searches, _ = detections_of(batch, wanted, [], keep=True)
+    return _Condition(batch, searches, detection_sources(batch))
 
 
 # --------------------------------------------------------------------------------------------------

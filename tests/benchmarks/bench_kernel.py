@@ -17,7 +17,7 @@ from tables import header, row
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import scenes_at, search_windows, whole_frames
+from sweep.evaluation.search import scenes_at, searched_windows
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import Detector, charuco_board
 from sweep.model.renderers import render_all
@@ -99,7 +99,7 @@ class Block:
         self.values, self.scenes, self.boxes = batch.values, batch.scenes, batch.boxes
         self.rows = np.flatnonzero(batch.visible)
         self.setting = self.pipeline.experiment.detectors[0]
-        self.cut = search_windows(self.scenes, self.boxes, self.setting, whole_frames(batch))
+        (self.cut,) = searched_windows(batch)
         self.camera = self.scenes.cameras.matrix(0)
         self.posed = [
             (cv2.Rodrigues(self.scenes.rotation[k])[0], self.scenes.translation[k])

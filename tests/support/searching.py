@@ -1,16 +1,13 @@
 """What one detector setting finds in scenes that were built without a pipeline."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from sweep.evaluation.search import (
-    ImageSearch,
-    SceneBatch,
-    search,
-    search_windows,
-    visibility_flags,
-)
+from sweep.evaluation.search import SceneBatch, detections_of, visibility_flags
 from sweep.measure.classify import target_scenes
-from sweep.measure.detectors import BoardDetectorSetting, make_board_detector, make_detector
+from sweep.measure.detectors import BoardDetectorSetting
+from sweep.model.camera import Column
 from sweep.model.exposure import marker_boxes
 
 
@@ -23,13 +20,11 @@ def searched(scenes, setting, *, full=False, wanted=None, boards=None, keep=Fals
     count, failures = len(scenes), []
     flags = np.zeros(count, dtype=np.uint8) if boards is None else visibility_flags(scenes)
     targets = target_scenes(scenes, flags, *(boards or ()))
-    batch = SceneBatch([], {}, scenes, flags, targets, marker_boxes(scenes))
-    source = ImageSearch(
-        make_detector(setting), make_board_detector(setting, BoardDetectorSetting()), scenes,
-        targets,
-    )
-    cut = search_windows(scenes, batch.boxes, setting, np.broadcast_to(full, count))
+    experiment = SimpleNamespace(detectors=[setting], board_settings=[BoardDetectorSetting()])
+    windows = ["full" if each else "target" for each in np.broadcast_to(full, count).tolist()]
+    values = {"window": Column.of(windows), "background": Column.of(0.0)}
+    batch = SceneBatch(experiment, [], values, scenes, flags, targets, marker_boxes(scenes))
     wanted = np.broadcast_to(True if wanted is None else wanted, count)
-    (result,), _ = search(batch, wanted[:, None], [source], [cut], failures, keep=keep)
+    (result,), _ = detections_of(batch, wanted[:, None], failures, keep=keep)
     assert not failures
     return result

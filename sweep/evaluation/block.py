@@ -16,7 +16,6 @@ A scene is rendered once for all detector settings, and a detection is shared by
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -46,7 +45,7 @@ from sweep.evaluation.variables import (
 )
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.experiment import Experiment
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bounds, outside_model
@@ -164,7 +163,7 @@ def compute_block(experiment: Experiment, block: Block) -> dict[str, NDArray[Any
     >>> int(compute_block(pipeline.experiment, Block((), ()))["detection"])
     1
     """
-    cells = run_cells(experiment, block_indices(block))
+    cells = run_cells(experiment, block.indices())
     return {
         variable.name: to_dataset_layout(
             variable, experiment.grid, block, cells.columns[variable.name])
@@ -294,12 +293,9 @@ def bound_notes(pipeline: Pipeline) -> list[str]:
     if set(pipeline.values_of("bound")) <= {"none"}:
         return []
     experiment = pipeline.experiment
-    lengths = [len(axis) for axis in experiment.scene_axes]
-    total = math.prod(lengths)
+    total = len(experiment.all_scenes)
     numbers = np.unique(np.linspace(0, total - 1, min(total, NOTED_SCENES)).astype(np.int64))
-    indices = [np.asarray(index, dtype=np.intp) for index in np.unravel_index(numbers, lengths)] \
-        if lengths else []
-    batch = scenes_at(experiment, indices)
+    batch = scenes_at(experiment, experiment.all_scenes.indices(numbers))
     asked = np.flatnonzero(batch.values["bound"].broadcast(len(numbers), np.str_) != "none")
     found = {outside_model(batch.scenes, row) for row in asked.tolist()}
     if not found or BoundStatus.given in found:
@@ -348,9 +344,8 @@ def warm_up(pipeline: Pipeline) -> None:
             "solver": solvers or [SOLVERS[0]],
         },
     })
-    lengths = tuple(len(axis) for axis in standard.experiment.scene_axes)
     try:
-        values = compute_block(standard.experiment, Block((0,) * len(lengths), lengths))
+        values = compute_block(standard.experiment, standard.experiment.all_scenes)
     except MachineFaultError:
         raise
     except Exception as error:

@@ -26,7 +26,6 @@ from sweep.exchange.images import (
     ImageBatch,
     TruthTables,
     image_batch,
-    scene_count,
     write_errors,
 )
 from sweep.execution.forecast import free_disk
@@ -138,7 +137,7 @@ def export(
     if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
     target = Path(folder)
-    count = scene_count(pipeline)
+    count = len(pipeline.experiment.all_scenes)
     if count > MAX_SCENES:
         raise StoreError(
             f"{plain(target, 300)}: {count:,} scenes; at most {MAX_SCENES:,} are exported; choose "
@@ -283,7 +282,7 @@ def _rendered_parts(
     pipeline: Pipeline, folder: Path, windowed: bool, workers: int | None
 ) -> Iterator[_Part]:
     """Yield the parts of an export, in this process or from several."""
-    count = scene_count(pipeline)
+    count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
     work = functools.partial(write_images, pipeline, folder, windowed)
     if workers is None or workers == 1 or len(parts) == 1:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,17 +71,6 @@ class ImageBatch(SceneBatch):
         ]
 
 
-def scene_count(pipeline: Pipeline) -> int:
-    """Return the number of scenes of an experiment."""
-    return math.prod(len(axis) for axis in pipeline.experiment.scene_axes)
-
-
-def scene_indices(pipeline: Pipeline, numbers: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return the indices (N,) along each scene axis of scenes by their numbers (N,)."""
-    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return [np.asarray(index) for index in np.unravel_index(numbers, lengths)] if lengths else []
-
-
 def image_batch(
     pipeline: Pipeline, numbers: NDArray[np.intp], *, windowed: bool = False
 ) -> ImageBatch:
@@ -90,7 +78,7 @@ def image_batch(
 
     A window is the smallest that holds those of all detector settings of the experiment.
     """
-    indices = scene_indices(pipeline, numbers)
+    indices = pipeline.experiment.all_scenes.indices(numbers)
     batch = scenes_at(pipeline.experiment, indices)
     frame = batch.scenes.frame
     return ImageBatch(
@@ -104,7 +92,7 @@ def image_batch(
 
 def image_batches(pipeline: Pipeline, *, windowed: bool = False) -> Iterator[ImageBatch]:
     """Yield all scenes of an experiment, in the order of their numbers."""
-    count = scene_count(pipeline)
+    count = len(pipeline.experiment.all_scenes)
     for start in range(0, count, BATCH):
         numbers = np.arange(start, min(start + BATCH, count), dtype=np.intp)
         yield image_batch(pipeline, numbers, windowed=windowed)
@@ -270,7 +258,7 @@ class TruthTables:
             **dict(zip(("cx_px", "cy_px"), (view[:, 2:] - first).T, strict=True)),
             "camera": cameras, "marker_area_px": variables["marker_area_px"],
         })
-        indices = scene_indices(self.pipeline, batch.numbers)
+        indices = self.pipeline.experiment.all_scenes.indices(batch.numbers)
         for axis, along in zip(axes, indices, strict=True):
             for name, values in axis.columns.items():
                 if name not in (*table, "marker_id", "dictionary"):

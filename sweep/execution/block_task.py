@@ -21,7 +21,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage, lacking_plugins
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.rules import file_digest
@@ -231,7 +231,7 @@ def _compute_begun(
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells, seconds, failures = CellsResult.not_run(pipeline.experiment, len(block)), _NO_SECONDS, []
     if len(rows):
-        indices = [index[rows] for index in block_indices(block)]
+        indices = [index[rows] for index in block.indices()]
         computed = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
         for name, columns in computed.columns.items():
             cells.columns[name][:, rows] = columns

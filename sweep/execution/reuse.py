@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import StoreError
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import alike
@@ -275,7 +275,7 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
         lacking = [variable for variable in variables if variable.name not in present]
         rows = np.flatnonzero(taken.reshape(len(block), -1).any(axis=1))
         if lacking and len(rows):  # what follows from the parameters alone
-            indices = [index[rows] for index in block_indices(block)]
+            indices = [index[rows] for index in block.indices()]
             drawn = pipeline.experiment.scene_values(indices)
             for v in lacking:
                 values[v.name].reshape(-1)[rows] = drawn[v.drawn_as].broadcast(len(rows))

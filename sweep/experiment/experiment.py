@@ -24,7 +24,7 @@ from sweep.experiment.draws import (
     resolve_pose,
     uniform,
 )
-from sweep.experiment.grid import Grid
+from sweep.experiment.grid import Block, Grid
 from sweep.experiment.parameters import PARAMETERS, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
@@ -111,6 +111,12 @@ class Experiment:
     def scene_axes(self) -> tuple[Axis, ...]:
         """The axes that blocks are cut along."""
         return self.grid.axes_of(Stage.scene)
+
+    @cached_property
+    def all_scenes(self) -> Block:
+        """All its scenes, as one block."""
+        lengths = tuple(len(axis) for axis in self.scene_axes)
+        return Block((0,) * len(lengths), lengths)
 
     @cached_property
     def target_axes(self) -> tuple[Axis, ...]:

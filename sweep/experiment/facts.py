@@ -323,7 +323,7 @@ class Facts:
     @property
     def _poses(self) -> int:
         """The number of scene cells of the grid."""
-        return math.prod(len(axis) for axis in self.experiment.scene_axes)
+        return len(self.experiment.all_scenes)
 
     @property
     def pose_line(self) -> str:

@@ -212,12 +212,18 @@ class Block:
     def __len__(self) -> int:
         return math.prod(self.shape)
 
+    def indices(self, scenes: NDArray[np.intp] | None = None) -> list[NDArray[np.intp]]:
+        """Return the indices (N,) along each scene axis of its scenes, by default of all.
+
+        ``scenes`` (N,) are their numbers in the block, in which the last axis counts fastest.
+        """
+        numbers = np.arange(len(self)) if scenes is None else scenes
+        within = np.unravel_index(numbers, self.shape) if self.shape else ()
+        return [start + index for start, index in zip(self.starts, within, strict=True)]
+
     def cell(self, scene: int) -> tuple[int, ...]:
         """Return the indices of its scene number ``scene`` along each scene axis."""
-        if not self.shape:
-            return ()
-        within = np.unravel_index(scene, self.shape)
-        return tuple(start + int(k) for start, k in zip(self.starts, within, strict=True))
+        return tuple(int(index[0]) for index in self.indices(np.array([scene])))
 
     def __str__(self) -> str:
         pairs = zip(self.starts, self.stops, strict=True)
@@ -260,11 +266,3 @@ class Blocks:
         index = [start // extent
                  for start, extent in zip(block.starts, self.extents, strict=True)]
         return int(np.ravel_multi_index(index, self.counts)) if index else 0
-
-
-def block_indices(block: Block) -> list[NDArray[np.intp]]:
-    """Return the indices (N,) of a block's cells along each scene axis, the last fastest."""
-    grids = np.meshgrid(
-        *(np.arange(a, b) for a, b in zip(block.starts, block.stops, strict=True)), indexing="ij"
-    )
-    return [grid.ravel() for grid in grids]

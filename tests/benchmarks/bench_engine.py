@@ -18,7 +18,7 @@ from tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.execution.forecast import forecast, seconds_of
 from sweep.execution.runner import execute
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import default_workers
 
@@ -75,7 +75,7 @@ def bare(text, start, stop, seconds, at):
     for trial in range(start, stop):
         lengths = tuple(len(axis) for axis in axes)
         block = Block((0, 0, 0, trial), (*lengths[:3], trial + 1))
-        run_cells(pipeline.experiment, block_indices(block))
+        run_cells(pipeline.experiment, block.indices())
         done += len(block)
     seconds.put((done, time.perf_counter() - begun))
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -80,7 +80,7 @@ def _shown(value):
 def measured(pipeline, count=None):
     """Run a pipeline's scenes: all, or ``count`` of them, drawn by its seed."""
     shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    indices = block_indices(Block((0,) * len(shape), shape))
+    indices = Block((0,) * len(shape), shape).indices()
     if count is not None and count < len(indices[0]):
         chosen = np.random.default_rng(pipeline.seed).permutation(len(indices[0]))[:count]
         indices = [index[np.sort(chosen)] for index in indices]

@@ -32,7 +32,7 @@ from support.blocks import run_block
 from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -74,7 +74,7 @@ class Estimated:
     def __init__(self, text, settings=(), noise=0.0):
         pipeline = Pipeline.from_text(text, settings)
         block = whole(pipeline)
-        self.values = pipeline.experiment.scene_values(block_indices(block))
+        self.values = pipeline.experiment.scene_values(block.indices())
         self.scenes = build_scenes(self.values, len(block))
         self.estimators = pipeline.experiment.estimators
         shifts = np.random.default_rng(6).normal(size=self.scenes.corners_px.shape)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from support.blocks import run_block, run_cells
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
@@ -120,7 +120,7 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, reques
         key: column.reshape(len(block), *column.shape[len(shape) :])
         for key, column in result.values.items()
     }
-    values = pipeline.experiment.scene_values(block_indices(block))
+    values = pipeline.experiment.scene_values(block.indices())
     scenes = build_scenes(values, len(block))
     (printed,) = set(values["board"].listed(len(block)))
     boxes = marker_boxes(scenes)

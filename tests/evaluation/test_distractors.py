@@ -8,7 +8,7 @@ from support import searching
 from support.blocks import run_cells
 from support.lengths import lengths
 from sweep.evaluation.search import search_windows, visibility_flags
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import DetectorSetting
@@ -51,7 +51,7 @@ def one(chosen, name):
 def searched(chosen, count, window):
     """Scenes, their boards, and what is found in windows or whole frames."""
     shape = tuple(len(axis) for axis in chosen.experiment.scene_axes)
-    values = chosen.experiment.scene_values(block_indices(Block((0,) * len(shape), shape)))
+    values = chosen.experiment.scene_values(Block((0,) * len(shape), shape).indices())
     scenes = build_scenes(values, count)
     visible = visibility_flags(scenes) == DetectionStatus.not_run
     boards = values["board"].listed(count), chosen.largest_board

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
@@ -133,7 +133,7 @@ def plain_loop(trials):
     """
     pipeline = Pipeline.from_text(GRID, [f"trial={trials}", "window=full"])
     block = whole(pipeline)
-    scenes = build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
+    scenes = build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
     boxes = marker_boxes(scenes)
     detectors = {}
     for name, number in DICTIONARIES.items():

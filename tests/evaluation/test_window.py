@@ -13,7 +13,6 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags
 from sweep.experiment.grid import (
     Block,
-    block_indices,
 )
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
@@ -323,7 +322,7 @@ def test_opencv_refines_the_same_pixels_elsewhere_in_the_frame_otherwise(name, c
     text = BOARD.format(board=BOARDS[name], noise=0, window="full", trials=count)
     pipeline = Pipeline.from_text(text)
     shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    values = pipeline.experiment.scene_values(block_indices(Block((0, 0), shape)))
+    values = pipeline.experiment.scene_values(Block((0, 0), shape).indices())
     scenes = build_scenes(values, 3 * count)
     boxes = marker_boxes(scenes)
     parameters = cv2.aruco.DetectorParameters()

@@ -14,7 +14,6 @@ from sweep import cli
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
-from sweep.exchange.images import scene_indices
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.pipeline import Pipeline
 
@@ -90,7 +89,7 @@ def test_truth_is_what_opencv_projects_with_the_camera_file(exported):
 def test_images_are_those_of_a_run_to_the_last_bit(exported, pipeline):
     folder, _ = exported
     whole = Pipeline.from_text(pipeline.text, ['window="full"'])
-    run = run_cells(whole, scene_indices(whole, np.arange(18))).columns
+    run = run_cells(whole, whole.experiment.all_scenes.indices(np.arange(18))).columns
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -226,18 +225,18 @@ def test_what_is_large_has_to_be_confirmed(pipeline, tmp_path, monkeypatch):
 
 
 def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
-    keys = pipeline.experiment.image_keys(scene_indices(pipeline, np.arange(18)))
+    keys = pipeline.experiment.image_keys(pipeline.experiment.all_scenes.indices(np.arange(18)))
     assert len(set(keys.tolist())) == 18
     single = cell(pipeline, "tilt_deg=50,distance_m=0.2,trial=2")
     assert single.experiment.image_keys([np.zeros(1, dtype=np.intp)]) == keys[14]
     larger = Pipeline.from_text(
         pipeline.text, ["distance_m=[0.05, 0.2]", "trial=9", 'window="full"', "solver=ippe",
                         "cornerRefinementMethod=none"])
-    among = larger.experiment.image_keys(scene_indices(larger, np.arange(36)))
+    among = larger.experiment.image_keys(larger.experiment.all_scenes.indices(np.arange(36)))
     assert set(among.tolist()) & set(keys.tolist()) == set(keys[[3, 4, 5, 12, 13, 14]].tolist())
     for other in ("seed=6", "noise_grey=3", "size_m=0.06", "background=100", "fx_px=151"):
         changed = Pipeline.from_text(pipeline.text, [other])
-        among = changed.experiment.image_keys(scene_indices(changed, np.arange(18)))
+        among = changed.experiment.image_keys(changed.experiment.all_scenes.indices(np.arange(18)))
         assert not set(among.tolist()) & set(keys.tolist()), other
 
 

@@ -17,7 +17,6 @@ from sweep.errors import ArgumentError, PipelineError, StoreError
 from sweep.evaluation.inspection import inspect_scene
 from sweep.exchange.answers import Conventions
 from sweep.exchange.export import export
-from sweep.exchange.images import scene_indices
 from sweep.exchange.score import prepare
 from sweep.experiment.cell_selection import cell
 from sweep.experiment.pipeline import Pipeline
@@ -222,12 +221,12 @@ def test_several_programs_and_our_own_detector_are_paired_on_one_axis(exported, 
 
 def test_scenes_that_were_not_exported_are_failed_and_said(exported):
     whole = prepare(exported, [exported / "detections.csv"]).pipeline
-    known = run_cells(whole, scene_indices(whole, np.arange(24)))
+    known = run_cells(whole, whole.experiment.all_scenes.indices(np.arange(24)))
     assert not known.failures
     # On another grid, the cells that it shares with the export have the same detections.
     grown = prepare(exported, [exported / "detections.csv"],
                     settings=["trial=4", "distance_m=[0.25, 0.1]"]).pipeline
-    found = run_cells(grown, scene_indices(grown, np.arange(32)))
+    found = run_cells(grown, grown.experiment.all_scenes.indices(np.arange(32)))
     assert {failure.scene % 4 for failure in found.failures} == {3}
     assert "not among those that were exported" in found.failures[0].text
     flags, corners = (found.columns[name][0].reshape(2, 2, 2, 4, *rest)

@@ -6,7 +6,7 @@ from scipy import stats
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, Blocks, block_indices
+from sweep.experiment.grid import Block, Blocks
 from sweep.experiment.pipeline import Pipeline
 
 DRAWN = """
@@ -37,7 +37,7 @@ def drawn(*settings, text=DRAWN, order=ORDER, take=None):
     pipeline = Pipeline.from_text(text, settings)
     axes = {axis.name: axis for axis in pipeline.experiment.scene_axes}
     block = whole(pipeline)
-    values = pipeline.experiment.scene_values(block_indices(block))
+    values = pipeline.experiment.scene_values(block.indices())
     kept = [name for name in axes if name in order]
     others = tuple(0 if name not in order else slice(None) for name in axes)
     table = {}
@@ -157,7 +157,7 @@ def test_jitter_moves_the_undistorted_projection_of_the_centre_by_the_shift(dist
                 "cx_px=300.25", "cy_px=260"]
     pipeline = Pipeline.from_text(DRAWN, settings)
     block = whole(pipeline)
-    values = pipeline.experiment.scene_values(block_indices(block))
+    values = pipeline.experiment.scene_values(block.indices())
     truth = run_block(pipeline, block).values["true_tvec_m"].reshape(-1, 3)
     bearings = [values["bearing_x_deg"].values, np.full(len(block), -4.0)]
     expected = np.tan(np.radians(np.stack(bearings)))

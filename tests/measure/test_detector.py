@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import (
     ALIGNMENT_PX,
@@ -162,7 +162,7 @@ def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(diction
     # an edge that rounding of the roll's sine moves across a pixel's centre.
     assert np.abs(values["corner_error_px"]).max() <= 1.5
 
-    scenes = build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
+    scenes = build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     left, top = 320 - side // 2, 240 - side // 2
     for row, marker_id in enumerate(scenes.marker_id):

@@ -25,7 +25,7 @@ from support.searching import searched
 from support.solving import estimate
 from sweep.evaluation import search as search_module
 from sweep.evaluation.search import visibility_flags
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
@@ -48,7 +48,7 @@ def whole(pipeline):
 
 def scenes_of(pipeline):
     block = whole(pipeline)
-    return build_scenes(pipeline.experiment.scene_values(block_indices(block)), len(block))
+    return build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
 
 
 def cameras(count, lens=()):

@@ -23,13 +23,13 @@ from sweep.evaluation.results import to_dataset_layout
 from support.flags_and_numbers import contradiction
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.report.reference import TABLES
 from sweep.experiment.schema import SCHEMA, VARIABLES
 
 pipeline = Pipeline.from_text("[marker]\\nsize_m = 0.05\\n[axes]\\ndistance_m = [0.3, 0.5, 1e3]")
 block = Block((0,), (3,))
-columns = run_cells(pipeline.experiment, block_indices(block)).columns
+columns = run_cells(pipeline.experiment, block.indices()).columns
 values = {v.name: to_dataset_layout(v, pipeline, block, columns[v.name]) for v in SCHEMA}
 
 def judged(**changed):

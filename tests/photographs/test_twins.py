@@ -10,7 +10,7 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import scene_image
 from sweep.experiment.cell_selection import cell
-from sweep.experiment.grid import Block, block_indices
+from sweep.experiment.grid import Block
 from sweep.experiment.photographs import read_record
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
@@ -36,7 +36,7 @@ def prepared(tmp_path_factory):
 
 def all_indices(pipeline):
     lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return block_indices(Block((0,) * len(lengths), lengths))
+    return Block((0,) * len(lengths), lengths).indices()
 
 
 def test_rows_are_those_of_the_photographs_with_their_poses(prepared):

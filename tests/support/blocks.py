@@ -5,7 +5,6 @@ from typing import Any
 
 from sweep.evaluation import block as cells_of_blocks
 from sweep.evaluation.results import Failure, to_dataset_layout
-from sweep.experiment.grid import block_indices
 
 
 def run_cells(pipeline, indices, *needs):
@@ -24,7 +23,7 @@ class BlockResult:
 
 def run_block(pipeline, block):
     """Render, detect and estimate every scene of a block."""
-    cells = run_cells(pipeline, block_indices(block))
+    cells = run_cells(pipeline, block.indices())
     return BlockResult(
         {
             v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])

@@ -20,7 +20,6 @@ import zarr.storage._local as local
 from sweep.evaluation.block import run_cells
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.experiment.grid import block_indices
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 
@@ -94,7 +93,7 @@ def main():
     if work is block:
         # Compiled code is loaded once, here.
         store = open_store(url)
-        run_cells(store.pipeline.experiment, block_indices(store.blocks[0]))
+        run_cells(store.pipeline.experiment, store.blocks[0].indices())
     told, stopped = [], []
     for number, at in json.loads(instants):
         pid, pipe = fork(work, (url, file), number, at, signal.Signals[signal_name])

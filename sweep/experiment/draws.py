@@ -54,31 +54,36 @@ REPLICATES = 16
 BITS = 32
 """Binary digits of a point; those beyond are random."""
 
-MAX_GAP = 1000
-"""Points between two wanted ones that are generated and not skipped."""
-
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _ONE = np.uint64(1)
 
 
-def points(dimension: int, index: Integers) -> NDArray[np.uint64]:
-    """Return the points (N,) of a dimension at indices (N,) of the sequence, times 2^32."""
+@lru_cache(maxsize=64)
+def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
+    """Return the first direction numbers (count,) of a dimension, times 2^32."""
     from scipy.stats import qmc  # noqa: PLC0415  (slow to import, for few pipelines)
 
-    wanted, back = np.unique(np.asarray(index, dtype=np.int64), return_inverse=True)
     engine = qmc.Sobol(dimension + 1, scramble=False, bits=BITS)
-    parts = [np.empty(0)]
-    # Trials of one cell may be far apart: what lies between them is skipped, not generated.
-    for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > MAX_GAP) + 1):
-        if not len(run):
-            continue
-        engine.reset()
-        if run[0]:
-            engine.fast_forward(int(run[0]))
-        # SciPy warns where the first points that are asked for are not 2^k.
-        count = 1 << int(run[-1] - run[0]).bit_length()
-        parts.append(engine.random(count)[run - run[0], dimension])
-    return np.asarray((np.concatenate(parts) * 2.0**BITS).astype(np.uint64)[back])
+    corners = []
+    for k in range(count):
+        engine.reset().fast_forward(1 << k)
+        corners.append(engine.random()[0, dimension] * 2.0**BITS)
+    # Point 2^k is the sum of the directions k and k - 1, which its Gray code has.
+    return np.bitwise_xor.accumulate(np.array(corners).astype(np.uint64))
+
+
+def points(dimension: int, index: Integers) -> NDArray[np.uint64]:
+    """Return the points (N,) of a dimension at indices (N,) of the sequence, times 2^32.
+
+    A point is the sum modulo 2 of the directions that the Gray code of its index has, wherever it
+    is in the sequence.
+    """
+    index = np.asarray(index, dtype=np.uint64)
+    gray, result = index ^ (index >> _ONE), np.zeros(index.shape, dtype=np.uint64)
+    for direction in _directions(dimension, int(index.max(initial=0)).bit_length()):
+        result ^= direction * (gray & _ONE)
+        gray >>= _ONE
+    return result
 
 
 def scrambled(digits: NDArray[np.uint64], keys: NDArray[np.uint64]) -> Floats:

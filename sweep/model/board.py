@@ -412,10 +412,7 @@ def sides_m(targets: Sequence[Board], number: NDArray[np.intp], size_m: Floats) 
 @lru_cache(maxsize=8192)
 def target_edges(target: Board) -> MarkerEdges:
     """Return the edges of a target, without what stands beside it, in units."""
-    if target.is_marker:
-        return target.prints[0].edges
-    outline = target.edges()
-    return MarkerEdges(outline.ends / unit_m(target), outline.sides)
+    return target.prints[0].edges if target.is_marker else _in_units(target, target.prints)
 
 
 @lru_cache(maxsize=8192)
@@ -427,8 +424,13 @@ def edges_of(target: Board) -> MarkerEdges:
 
 def beside_edges(target: Board) -> MarkerEdges:
     """Return the edges of what stands beside a target, in units."""
-    beside = edges_on_sheet(target.distractors)
-    return MarkerEdges(beside.ends / unit_m(target), beside.sides)
+    return _in_units(target, target.distractors)
+
+
+def _in_units(target: Board, prints: Sequence[Print]) -> MarkerEdges:
+    """Return the edges of prints in a target's plane, in its units."""
+    on_sheet = edges_on_sheet(prints)
+    return MarkerEdges(on_sheet.ends / unit_m(target), on_sheet.sides)
 
 
 @lru_cache(maxsize=64)

@@ -25,7 +25,7 @@ from sweep.model.board import (
     sheets_m,
     solid_print,
 )
-from sweep.model.coverage import MarkerEdges, joined
+from sweep.model.coverage import joined
 from sweep.model.marker import (
     BLACK,
     OUTSIDE,
@@ -35,7 +35,7 @@ from sweep.model.marker import (
     missing_package,
     module_count,
     overhang,
-    rectangle_edges,
+    square_edges,
 )
 from sweep.typing import Floats, Integers
 
@@ -77,11 +77,6 @@ def dictionary_of_all() -> Any:
 def length(meaning: str) -> Any:
     """Return the declared field of a length that must be given."""
     return required(meaning, unit="m", low=0, high=1e6, open_low=True)
-
-
-def margin(meaning: str) -> Any:
-    """Return the declared field of a sheet's margin."""
-    return parameter(None, meaning, unit="m", low=0, high=1e6)
 
 
 def place(meaning: str, default: Any = dataclasses.MISSING) -> Any:
@@ -188,8 +183,9 @@ class Markers:
     quiet_zone_modules: float | None = parameter(
         None, "width of the white that surrounds each marker on its own sheet (default: 1)", 0, 100
     )
-    margin_m: float | None = margin(
-        "width of the one white sheet beyond all markers; without it each has its own"
+    margin_m: float | None = parameter(
+        None, "width of the one white sheet beyond all markers; without it each has its own", 0,
+        1e6,
     )
 
     @property
@@ -299,19 +295,14 @@ def with_distractors(
         each = BoardMarker(marker_id or 0, x_m, y_m, size, *pose)
         printed, _ = each.placed(dictionary, quiet_modules, not each.is_flat)
         if marker_id is None:
-            square = _black_square(float(module_count(dictionary)), quiet_modules)
-            printed = printed._replace(edges=square)
+            # A black square as large as a marker's, on its white sheet.
+            modules = module_count(dictionary)
+            printed = printed._replace(edges=joined([
+                square_edges(-quiet_modules, modules + quiet_modules, OUTSIDE, WHITE),
+                square_edges(0, modules, WHITE, BLACK),
+            ]))
         prints.append(printed)
     return dataclasses.replace(board, distractors=tuple(prints)) if prints else board
-
-
-def _black_square(modules: float, quiet_modules: float) -> MarkerEdges:
-    """Return the edges of a black square as large as a marker's, on its white sheet."""
-    low, high = -quiet_modules, modules + quiet_modules
-    return joined([
-        rectangle_edges(np.array([[low, low, high, high]]), OUTSIDE, WHITE),
-        rectangle_edges(np.array([[0.0, 0.0, modules, modules]]), WHITE, BLACK),
-    ])
 
 
 def listing_faults(
@@ -379,8 +370,9 @@ class _OnSheet:
         "right, then upwards; without it they count from the first on", list_text=_LIST_OF_IDS,
         reads=_read_ids,
     )
-    margin_m: float | None = margin(
-        "width of the white sheet beyond all that is black (default: one module of a marker)"
+    margin_m: float | None = parameter(
+        None, "width of the white sheet beyond all that is black (default: one module of a "
+        "marker)", 0, 1e6,
     )
 
     @property

@@ -25,6 +25,7 @@ from sweep.model.polygon import (
     homogeneous_pixel,
     is_curved,
     piece_count,
+    plane_point,
     sheet_pixel,
 )
 from sweep.typing import Floats
@@ -698,18 +699,10 @@ def differentiate(
             if not t0 < t1:
                 continue
             ca, cb, da, db = a + t0 * (c - a), a + t1 * (c - a), b + t0 * (d - b), b + t1 * (d - b)
-            xa, ya = velocity(
-                plane[0, 0] * ca + plane[0, 1] * da + plane[0, 2],
-                plane[1, 0] * ca + plane[1, 1] * da + plane[1, 2],
-                plane[2, 0] * ca + plane[2, 1] * da + plane[2, 2],
-                translation, optics, rates[:2],
-            )
-            xb, yb = velocity(
-                plane[0, 0] * cb + plane[0, 1] * db + plane[0, 2],
-                plane[1, 0] * cb + plane[1, 1] * db + plane[1, 2],
-                plane[2, 0] * cb + plane[2, 1] * db + plane[2, 2],
-                translation, optics, rates[2:],
-            )
+            x, y, z = plane_point(plane, ca, da)
+            xa, ya = velocity(x, y, z, translation, optics, rates[:2])
+            x, y, z = plane_point(plane, cb, db)
+            xb, yb = velocity(x, y, z, translation, optics, rates[2:])
             for k in range(POSE):
                 at_a[k] = rates[0, k] * (yb - ya) - rates[1, k] * (xb - xa)
                 at_b[k] = rates[2, k] * (yb - ya) - rates[3, k] * (xb - xa)

@@ -39,8 +39,7 @@ class Patch:
     Attributes
     ----------
     values
-        Every parameter of the effects in this scene; NaN if it is not given. Of text and lists
-        the number of the value, 0 for the default.
+        Every parameter of the effects in this scene; NaN if it is not given.
     left, top
         The first pixel's column and row in the frame.
     frame
@@ -49,21 +48,14 @@ class Patch:
         (4,) fx, fy, cx, cy in pixels.
     noise_key
         Key of the scene's random numbers.
-    coded
-        Parameter that is text or a list -> the values that the numbers in `values` stand for.
     """
 
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
     left: int
     top: int
     frame: tuple[int, int]
     intrinsics: Floats
     noise_key: np.uint64
-    coded: Mapping[str, Sequence[Any]]
-
-    def meaning(self, name: str) -> Any:
-        """Return the text or list of a parameter."""
-        return self.coded[name][int(self.values[name])]
 
     def normals(self, stream: str, shape: tuple[int, ...]) -> Floats:
         """Return standard normal numbers (h, w), a function of scene, stream and pixel alone.
@@ -257,10 +249,8 @@ def _noisy(levels: Floats, patch: Patch) -> Floats:
 
 def _demosaiced(levels: Floats, patch: Patch) -> Floats:
     """Return levels seen through colour filters."""
-    return demosaiced(
-        levels, patch.meaning("bayer"), patch.meaning("demosaic"), patch.values["bayer_red"],
-        patch.values["bayer_blue"],
-    )
+    names = "bayer", "demosaic", "bayer_red", "bayer_blue"
+    return demosaiced(levels, *(patch.values[name] for name in names))
 
 
 def _toned(levels: Floats, patch: Patch) -> Floats:
@@ -272,7 +262,7 @@ def _toned(levels: Floats, patch: Patch) -> Floats:
 
 def _noisy_by_level(levels: Floats, patch: Patch) -> Floats:
     """Return levels with noise whose standard deviation is interpolated over the level."""
-    table = patch.meaning("noise_table")
+    table = patch.values["noise_table"]
     field = normal_field(
         patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
         patch.values["noise_correlation"],
@@ -333,20 +323,13 @@ EFFECTS: tuple[Effect, ...] = (
         ),
         # The velocities are those of both effects of motion.
         **{
-            name: parameter(
-                0.0, f"velocity of the marker's centre, {along}", unit="m/s", low=-1e9,
-                high=1e9, drawable=True,
-            )
-            for name, along in zip(
-                VELOCITIES[:3], ("right", "down", "away from the camera"), strict=True
-            )
-        },
-        **{
-            name: parameter(
-                0.0, "angular velocity about the axis through the marker's centre that points "
-                + along, unit="degree/s", low=-1e9, high=1e9, drawable=True,
-            )
-            for name, along in zip(VELOCITIES[3:], ("right", "down", "forward"), strict=True)
+            name: drawn(0.0, f"{velocity} {along}", -1e9, 1e9)
+            for name, (velocity, along) in zip(VELOCITIES, [
+                *(("velocity of the marker's centre,", along)
+                  for along in ("right", "down", "away from the camera")),
+                *(("angular velocity about the axis through the marker's centre that points", along)
+                  for along in ("right", "down", "forward")),
+            ], strict=True)
         },
     },
         needs={

@@ -45,6 +45,7 @@ from sweep.model.polygon import (
     half_plane,
     is_curved,
     plane_normal,
+    plane_point,
     sheet_pixels,
     signed_areas,
 )
@@ -107,13 +108,11 @@ def outline_extent(
     normal = plane_normal(plane)
     for j in range(len(outline)):
         height = outline[j, 2]
-        z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
+        x, y, z = plane_point(plane, outline[j, 0], outline[j, 1])
         z += height * normal[2]
         if not z > 0.0:
             behind += 1
             continue
-        x = plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]
-        y = plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]
         x, y = (x + height * normal[0]) / z, (y + height * normal[1]) / z
         if optics.distorted:
             a, b, c, d = jacobian(x, y, lens)
@@ -256,7 +255,7 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     return Sheet(
         x, y, effect["curvature_per_m"] * float(np.linalg.norm(scenes.plane[row][:, 0])),
         math.cos(direction), -math.sin(direction),
-        scenes.effects.meaning("bend", effect) == "saddle", waves,
+        effect["bend"] == "saddle", waves,
         float(np.hypot(waves[:, :, 2], waves[:, :, 3]).sum(axis=1).max(initial=0.0)),
         PIECE_LENGTHS * length_px,
     )

@@ -391,7 +391,8 @@ def rectangle_edges(boxes: Floats, outside: int, inside: int) -> MarkerEdges:
     return MarkerEdges(ends, np.repeat(np.array(codes, dtype=np.int64), len(boxes), axis=0))
 
 
-def _square(low: float, high: float, outside: int, inside: int) -> MarkerEdges:
+def square_edges(low: float, high: float, outside: int, inside: int) -> MarkerEdges:
+    """Return the edges of one square, its corners at (low, low) and (high, high)."""
     return rectangle_edges(np.array([[low, low, high, high]], dtype=np.float64), outside, inside)
 
 
@@ -413,7 +414,7 @@ def edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
     n = len(codes) - 2
     parts = [cell_edges(codes)]
     if surround == WHITE:
-        parts.append(_square(beyond - margin, n - beyond + margin, OUTSIDE, WHITE))
+        parts.append(square_edges(beyond - margin, n - beyond + margin, OUTSIDE, WHITE))
     whole = joined(parts)
     return MarkerEdges(whole.ends - beyond, whole.sides)
 
@@ -427,9 +428,9 @@ def _stag_edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
         The package stag-python is not installed.
     """
     code = int(_stag_codes(dictionary)[marker_id])
-    parts = [_square(0, STAG_MODULES, OUTSIDE if margin == 0 else WHITE, BLACK)]
+    parts = [square_edges(0, STAG_MODULES, OUTSIDE if margin == 0 else WHITE, BLACK)]
     if margin > 0:
-        parts.append(_square(-margin, STAG_MODULES + margin, OUTSIDE, WHITE))
+        parts.append(square_edges(-margin, STAG_MODULES + margin, OUTSIDE, WHITE))
     middle = np.full(2, STAG_MODULES / 2)
     parts.append(_circle(middle, CIRCLE_RADIUS, CIRCLE_SIDES, (WHITE, BLACK)))
     parts += [

@@ -103,6 +103,28 @@ class ModuleEdge(NamedTuple):
 
 
 @compiled_inline
+def plane_point(plane: Floats, column: float, row: float) -> tuple[float, float, float]:
+    """Return a point of a plane in the camera frame."""
+    return (
+        plane[0, 0] * column + plane[0, 1] * row + plane[0, 2],
+        plane[1, 0] * column + plane[1, 1] * row + plane[1, 2],
+        plane[2, 0] * column + plane[2, 1] * row + plane[2, 2],
+    )
+
+
+@compiled_inline
+def pixel(x: float, y: float, z: float, optics: Optics) -> tuple[float, float]:
+    """Return the pixel of a point in the camera frame; NaN if it is not before the camera."""
+    if not z > 0.0:
+        return math.nan, math.nan
+    x, y = x / z, y / z
+    if optics.distorted:
+        x, y = distort(x, y, optics.lens)
+    intrinsics = optics.intrinsics
+    return intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
+
+
+@compiled_inline
 def homogeneous_pixel(
     projection: Projection, shift_x: float, shift_y: float, column: float, row: float
 ) -> tuple[float, float, float]:
@@ -110,26 +132,19 @@ def homogeneous_pixel(
 
     The principal point is at (``shift_x``, ``shift_y``).
     """
-    plane, intrinsics = projection.plane, projection.optics.intrinsics
-    z = plane[2, 0] * column + plane[2, 1] * row + plane[2, 2]
-    x = intrinsics[0] * (plane[0, 0] * column + plane[0, 1] * row + plane[0, 2]) + shift_x * z
-    y = intrinsics[1] * (plane[1, 0] * column + plane[1, 1] * row + plane[1, 2]) + shift_y * z
-    return x, y, z
+    intrinsics = projection.optics.intrinsics
+    x, y, z = plane_point(projection.plane, column, row)
+    return intrinsics[0] * x + shift_x * z, intrinsics[1] * y + shift_y * z, z
 
 
 @compiled_inline
 def distorted_point(t: float, projection: Projection, edge: ModuleEdge) -> tuple[float, float]:
     """Return the pixel of the point at parameter t of an edge, seen through the lens."""
-    plane, optics = projection.plane, projection.optics
     column = edge.column + t * (edge.to_column - edge.column)
     row = edge.row + t * (edge.to_row - edge.row)
-    z = plane[2, 0] * column + plane[2, 1] * row + plane[2, 2]
-    x, y = distort(
-        (plane[0, 0] * column + plane[0, 1] * row + plane[0, 2]) / z,
-        (plane[1, 0] * column + plane[1, 1] * row + plane[1, 2]) / z,
-        optics.lens,
-    )
-    intrinsics = optics.intrinsics
+    x, y, z = plane_point(projection.plane, column, row)
+    x, y = distort(x / z, y / z, projection.optics.lens)
+    intrinsics = projection.optics.intrinsics
     return intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
 
 
@@ -285,21 +300,12 @@ def sheet_pixel(
 
     NaN if it is not before the camera.
     """
-    plane, optics = projection.plane, projection.optics
     at_column, at_row, height = bent_point(column, row, sheet)
-    x = plane[0, 0] * at_column + plane[0, 1] * at_row + plane[0, 2]
-    y = plane[1, 0] * at_column + plane[1, 1] * at_row + plane[1, 2]
-    z = plane[2, 0] * at_column + plane[2, 1] * at_row + plane[2, 2]
+    x, y, z = plane_point(projection.plane, at_column, at_row)
     if height != 0.0:
-        normal = plane_normal(plane)
+        normal = plane_normal(projection.plane)
         x, y, z = x + height * normal[0], y + height * normal[1], z + height * normal[2]
-    if not z > 0.0:
-        return math.nan, math.nan
-    x, y = x / z, y / z
-    if optics.distorted:
-        x, y = distort(x, y, optics.lens)
-    intrinsics = optics.intrinsics
-    u, v = intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
+    u, v = pixel(x, y, z, projection.optics)
     waves = sheet.waves
     right = down = 0.0
     for wave in range(waves.shape[1]):

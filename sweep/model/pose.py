@@ -318,19 +318,15 @@ Whoever looks at the marker sees the body's left, y, on the right.
 
 
 def _coordinate(whose: str, axis: str) -> Any:
-    return parameter(
-        None,
-        f"{whose} place in the world along {axis}; with the others it replaces the pose in the "
-        "camera's frame (default: 0 beside another place in the world)",
-        unit="m", low=-1e12, high=1e12, drawable=True,
+    return drawn(
+        None, f"{whose} place in the world along {axis}; with the others it replaces the pose in "
+        "the camera's frame (default: 0 beside another place in the world)", -1e12, 1e12,
     )
 
 
 def _angle(whose: str, meaning: str) -> Any:
-    return parameter(
-        None, f"{whose} {meaning} (default: 0 beside another place in the world)", unit="degree",
-        low=-360, high=360, drawable=True,
-    )
+    default = "default: 0 beside another place in the world"
+    return drawn(None, f"{whose} {meaning} ({default})", -360, 360)
 
 
 @dataclass(frozen=True, slots=True)

@@ -167,13 +167,10 @@ class SceneEffects:
         """Return whether an effect is active whose record has ``outline = change``, (N,)."""
         return self._any_active(lambda effect: effect.outline == change)
 
-    def of(self, row: int) -> dict[str, float]:
-        """Return the parameters of one scene."""
-        return {name: float(column[row]) for name, column in self.values.items()}
-
-    def meaning(self, name: str, effect: Mapping[str, float]) -> Any:
-        """Return the text or list that a number of :meth:`of` stands for."""
-        return self.coded[name][int(effect[name])]
+    def of(self, row: int) -> dict[str, Any]:
+        """Return the parameters of one scene: numbers, NaN if not given, texts and lists."""
+        numbers = {name: float(column[row]) for name, column in self.values.items()}
+        return numbers | {name: each[int(numbers[name])] for name, each in self.coded.items()}
 
     def active_in(self, row: int) -> list[Effect]:
         """Return the effects that are active in one scene."""
@@ -329,7 +326,7 @@ class Scenes:
         effects, (width, height) = self.effects, self.frame[row].tolist()
         return Patch(
             effects.of(row), left, top, (width, height), self.cameras.view[row],
-            effects.noise_key[row], effects.coded,
+            effects.noise_key[row],
         )
 
     def motion(self, row: int) -> Motion:

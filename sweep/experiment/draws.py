@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.axes import Distribution
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
+from sweep.model.board import along_sides
 from sweep.model.calibration import CalibrationError
 from sweep.model.camera import (
     PER_SIDE,
@@ -330,7 +331,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     # What a scene gets must not depend on whether others have a lens.
     for curved in (False, True):
         rows = np.flatnonzero(cameras.distorted == curved)
-        points = _along_sides(outline[rows], PER_SIDE if curved else 1)
+        points = along_sides(outline[rows], PER_SIDE if curved else 1)
 
         def offsets(
             part: NDArray[np.intp], centre_xy: Floats, rows: NDArray[np.intp] = rows,
@@ -345,14 +346,6 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
             margin[rows], shift[rows],
         ).centres()
     return tuple(centres.T)
-
-
-def _along_sides(corners: Floats, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 3) along the sides of quadrilaterals (n, 4, 3)."""
-    t = (np.arange(per_side) / per_side)[:, None]
-    following = np.roll(corners, -1, axis=1)
-    points = corners[:, :, None] + t * (following - corners)[:, :, None]
-    return points.reshape(len(corners), 4 * per_side, 3)
 
 
 def _bearings(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:

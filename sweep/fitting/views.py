@@ -233,7 +233,7 @@ def marker_view(
 ) -> FittedMarker | None:
     """Return the pixels of the marker of a scene in a photograph (height, width); None for few."""
     scenes, lens = taken.scenes, taken.lens(row)
-    marker, corners = scenes.target(row), scenes.corners_px[row]
+    marker, corners = scenes.targets[row], scenes.corners_px[row]
     dictionary, marker_id = marker.dictionary, marker.marker_ids[0]
     modules = module_count(dictionary)
     module_px = float(side_lengths(corners[None]).mean()) / modules

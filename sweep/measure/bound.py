@@ -37,7 +37,6 @@ from sweep.measure.likelihood import (
 from sweep.model import coverage
 from sweep.model.board import side_m
 from sweep.model.coverage import POSE, work_space
-from sweep.model.effects import IN_BOUND
 from sweep.model.polygon import Projection
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
@@ -170,7 +169,7 @@ def outside_model(scenes: Scenes, row: int) -> BoundStatus:
     noise, levels = effects["noise_grey"], scenes.levels[row] * effects["gain"]
     margin = CLIPPING_DEVIATIONS * noise
     if isinstance(scenes.background[row], str) or any(
-        each.switch not in IN_BOUND for each in scenes.effects.active_in(row)
+        not each.in_bound for each in scenes.effects.active_in(row)
     ):
         return BoundStatus.not_in_model
     if noise < MIN_NOISE:
@@ -213,7 +212,7 @@ def bounds(
         if status[row] != BoundStatus.given:
             continue
         effects, rotation = scenes.effects.of(row), scenes.rotation[row]
-        target, translation = scenes.target(row), scenes.translation[row]
+        target, translation = scenes.targets[row], scenes.translation[row]
         view = marker_view(
             target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row),
             low[row], noise_variance(effects["noise_grey"]), (rotation, translation),

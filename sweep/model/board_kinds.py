@@ -305,9 +305,7 @@ def with_distractors(
     return dataclasses.replace(board, distractors=tuple(prints)) if prints else board
 
 
-def listing_faults(
-    listed: Sequence[Sequence[Any]] | None, dictionary: str
-) -> list[Fault]:
+def listing_faults(listed: Sequence[Sequence[Any]] | None, dictionary: str) -> list[Fault]:
     """Return what keeps single distractors beside a board of a dictionary from being printed."""
     if listed and len(listed) > MAX_MARKERS:
         return [Fault("distractors", len(listed), f"at most {MAX_MARKERS} of them")]

@@ -485,9 +485,7 @@ class CalibrationError:
     factor: Floats
 
     @staticmethod
-    def of(
-        sd: Sequence[float], covariance: Sequence[float], coefficients: int
-    ) -> CalibrationError:
+    def of(sd: Sequence[float], covariance: Sequence[float], coefficients: int) -> CalibrationError:
         """Return the error that standard deviations or a covariance matrix state.
 
         Parameters

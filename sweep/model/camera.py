@@ -127,9 +127,7 @@ def intrinsics(
     elif pixel_size_um is not None:
         fx = fy = 1e3 * focal_length_mm / pixel_size_um
     else:
-        fx, fy = _of_sensor(
-            width_px, height_px, sensor_width_mm, sensor_height_mm, focal_length_mm
-        )
+        fx, fy = _of_sensor(width_px, height_px, sensor_width_mm, sensor_height_mm, focal_length_mm)
     cx = (width_px - 1) / 2 if cx_px is None else cx_px
     cy = (height_px - 1) / 2 if cy_px is None else cy_px
     return fx, fy, cx, cy

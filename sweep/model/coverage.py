@@ -132,9 +132,7 @@ class Segment(NamedTuple):
 
 
 @compiled
-def _add_in_row(
-    row: Floats, jump: float, xa: float, xb: float, dy: float
-) -> None:
+def _add_in_row(row: Floats, jump: float, xa: float, xb: float, dy: float) -> None:
     """Add a segment from x = xa to xb that descends by dy within one row of pixels."""
     left, right = (xa, xb) if xa <= xb else (xb, xa)
     first = int(left)
@@ -158,9 +156,7 @@ def _add_in_row(
 
 
 @compiled
-def _add_segment(
-    cover: Floats, jump: float, x0: float, y0: float, x1: float, y1: float
-) -> None:
+def _add_segment(cover: Floats, jump: float, x0: float, y0: float, x1: float, y1: float) -> None:
     """Add a segment that lies within the box [0, width] x [0, height]."""
     if not (y0 < y1 or y1 < y0) or math.isnan(x0) or math.isnan(x1):
         return
@@ -189,9 +185,7 @@ def _add_segment(
 
 
 @compiled
-def _clamped_pixel(
-    t: float, width: float, height: float, segment: Segment
-) -> tuple[float, float]:
+def _clamped_pixel(t: float, width: float, height: float, segment: Segment) -> tuple[float, float]:
     """Return the pixel at parameter t of a segment, clamped into the box."""
     x0, y0, z0, x1, y1, z1 = segment
     if t <= 0.0:
@@ -241,9 +235,7 @@ def _add_projected(cover: Floats, jump: float, segment: Segment) -> None:
 
 
 @compiled
-def _add_left(
-    cover: Floats, jump: float, ya: float, yb: float, sigma: float
-) -> None:
+def _add_left(cover: Floats, jump: float, ya: float, yb: float, sigma: float) -> None:
     """Add a segment from y = ya to yb so far left of the box that it covers whole rows."""
     reach = REACH * sigma + 1.0
     first = max(math.floor(min(ya, yb) - reach), 0)
@@ -351,9 +343,7 @@ def accumulate_curved(
         for piece in range(pieces):
             distance = 0.0
             t = (piece + 1.0) / pieces
-            u1, v1 = sheet_pixel(
-                edge.column + t * columns, edge.row + t * rows, projection, sheet
-            )
+            u1, v1 = sheet_pixel(edge.column + t * columns, edge.row + t * rows, projection, sheet)
             for quarter in range(1, 4):
                 t = (piece + 0.25 * quarter) / pieces
                 u, v = sheet_pixel(
@@ -729,9 +719,7 @@ def _add_column(
 
 
 @compiled
-def normal_equations(
-    image: Floats, work: Work, free: int, matrix: Floats, vector: Floats
-) -> None:
+def normal_equations(image: Floats, work: Work, free: int, matrix: Floats, vector: Floats) -> None:
     """Sum up JᵀJ and Jᵀ·image over the pixels of a box, and clear ``work``.
 
     J's columns are the first ``free`` slopes and the areas of outside, black and white; pixels that

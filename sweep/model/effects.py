@@ -176,9 +176,7 @@ def is_coded(default: Any) -> bool:
     return isinstance(default, (str, tuple))
 
 
-def after_step(
-    effects: Sequence[Effect], step: str, levels: Floats, patch: Patch
-) -> Floats:
+def after_step(effects: Sequence[Effect], step: str, levels: Floats, patch: Patch) -> Floats:
     """Return levels (h, w) after those of active effects that belong to a step."""
     for apply in dict.fromkeys(each.apply for each in effects if each.step == step):
         levels = levels if apply is None else apply(levels, patch)
@@ -511,9 +509,6 @@ GEOMETRIC = tuple(effect.switch for effect in EFFECTS if effect.step == "edges")
 
 RANDOM = tuple(effect.switch for effect in EFFECTS if effect.random)
 """Switches of the effects that draw random numbers."""
-
-IN_BOUND = tuple(effect.switch for effect in EFFECTS if effect.in_bound)
-"""Switches of the effects that the accuracy bound models."""
 
 NEEDS: dict[str, tuple[str, ...]] = {
     name: others for effect in EFFECTS for name, others in effect.needs.items()

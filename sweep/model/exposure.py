@@ -92,9 +92,7 @@ image, since it crosses the camera's plane, shows its back, or lies where the le
 
 
 @compiled
-def outline_extent(
-    projection: Projection, outline: Floats, extent: Floats
-) -> tuple[int, bool]:
+def outline_extent(projection: Projection, outline: Floats, extent: Floats) -> tuple[int, bool]:
     """Write left, top, right, bottom in px of an outline's image to ``extent`` (4,).
 
     The extent is that of the points (M, 3), in modules, that are in front of the camera.
@@ -177,9 +175,7 @@ _STREAMS = {
 }
 
 
-def shift_waves(
-    std_px: float, length_px: float, key: np.uint64, field: str = "geometry"
-) -> Floats:
+def shift_waves(std_px: float, length_px: float, key: np.uint64, field: str = "geometry") -> Floats:
     """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.polygon.Sheet`).
 
     Parameters
@@ -222,14 +218,14 @@ class SeenSheet(NamedTuple):
 def solid_planes(scenes: Scenes, row: int) -> Floats:
     """Return the planes (P, 3, 3) of the sheets of one scene's board."""
     return sheet_planes(
-        scenes.target(row), scenes.rotation[row], scenes.translation[row],
+        scenes.targets[row], scenes.rotation[row], scenes.translation[row],
         float(scenes.effects["marker_scale"][row]),
     )
 
 
 def seen_sheets(scenes: Scenes, row: int) -> list[SeenSheet]:
     """Return the sheets of one scene that face the camera: one of a target in one plane."""
-    target = scenes.target(row)
+    target = scenes.targets[row]
     if target.is_flat:
         return [SeenSheet(0, extent_of(target).sheet, scenes.plane[row])]
     planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
@@ -245,12 +241,10 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     for field in FIELDS:
         if effect[f"{field}_px"] != 0:
             own_px = effect[f"{field}_length_px"]
-            added = shift_waves(
-                effect[f"{field}_px"], own_px, scenes.effects.noise_key[row], field
-            )
+            added = shift_waves(effect[f"{field}_px"], own_px, scenes.effects.noise_key[row], field)
             # The sum of both fields has the waves of both.
             waves, length_px = np.concatenate([waves, added], axis=1), min(length_px, own_px)
-    x, y = extent_of(scenes.target(row)).origin.tolist()
+    x, y = extent_of(scenes.targets[row]).origin.tolist()
     direction = math.radians(effect["bend_deg"])
     return Sheet(
         x, y, effect["curvature_per_m"] * float(np.linalg.norm(scenes.plane[row][:, 0])),
@@ -291,7 +285,7 @@ def target_outline(scenes: Scenes, row: int) -> Floats:
 
     In modules: its sheets' corners, or more points under a lens or on a bent sheet.
     """
-    target, bend = scenes.target(row), scene_sheet(scenes, row)
+    target, bend = scenes.targets[row], scene_sheet(scenes, row)
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or is_curved(bend) else 1
     if target.is_flat:
         (points,) = rectangles(extent_of(target).sheet[None], per_side)
@@ -303,9 +297,7 @@ def target_outline(scenes: Scenes, row: int) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # The point spread.
 
-def spread_px(
-    scenes: Scenes, row: int, inverse_depth: Floats, blurred: bool = False
-) -> Floats:
+def spread_px(scenes: Scenes, row: int, inverse_depth: Floats, blurred: bool = False) -> Floats:
     """Return the point spread's standard deviation in px at inverse depths (...) in 1/m.
 
     With ``blurred`` that of the image that sharpening subtracts.
@@ -416,7 +408,7 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
 
 def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return the extent, from ``low`` to ``high`` (2,), of the sheets that the frame can see."""
-    target = scenes.target(row)
+    target = scenes.targets[row]
     if (
         len(sheets_of(target)) == 1 or scenes.renderer[row] == "warp"
         or any(each.outline != "kept" for each in scenes.effects.active_in(row))
@@ -451,7 +443,7 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         corners = scenes.corners_px[row]
         if not np.isfinite(corners).all():
             continue
-        extent = extent_of(scenes.target(row))
+        extent = extent_of(scenes.targets[row])
         square = rectangles(extent.ink[None])[0].astype(np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
         half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
@@ -471,9 +463,7 @@ _COARSE_TURN = math.pi / 8
 """Turn between two instants above which the marker may point anywhere between them."""
 
 
-def _exposed_extent(
-    scenes: Scenes, row: int, low: Floats, high: Floats
-) -> tuple[Floats, Floats]:
+def _exposed_extent(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return the extent, from ``low`` to ``high`` (2,) at rest, under motion and blur.
 
     NaN if the image has no meaning while rows that see the marker are exposed. At an instant a
@@ -493,7 +483,7 @@ def _exposed_extent(
     count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MAX_INSTANTS))
     times = np.linspace(begin, end, count)
     extents, states = track(
-        scenes.projection(row), target_outline(scenes, row), scenes.target(row).is_flat, motion,
+        scenes.projection(row), target_outline(scenes, row), scenes.targets[row].is_flat, motion,
         times,
     )
     front = states != BEHIND
@@ -552,11 +542,11 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
     facing = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
     for row in np.flatnonzero(scenes.solid).tolist():
         facing[row] = any(
-            each.number < own_sheets(scenes.target(row)) for each in seen_sheets(scenes, row)
+            each.number < own_sheets(scenes.targets[row]) for each in seen_sheets(scenes, row)
         )
     behind: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
     for row in np.flatnonzero(behind).tolist():
-        target = scenes.target(row)
+        target = scenes.targets[row]
         if target.distractors and scenes.solid[row]:
             behind[row] = not np.isfinite(scenes.corners_px[row]).all()
         elif target.distractors:
@@ -593,7 +583,7 @@ def unseen_squares(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floa
     if scenes.solid[row]:
         printed = corners_m.reshape(1, -1, 3) * scenes.effects["marker_scale"][row]
         corners = in_camera(printed).reshape(count, 4, 3)
-        unseen |= unseen_markers(scenes.target(row), solid_planes(scenes, row), corners)
+        unseen |= unseen_markers(scenes.targets[row], solid_planes(scenes, row), corners)
     return unseen
 
 
@@ -659,7 +649,7 @@ def _path_px(scenes: Scenes, row: int, motion: Motion, begin: float, end: float)
     """Return the longest path of a corner, in px, from a time to another."""
     linear = motion._replace(velocity=motion.velocity * np.array([1.0, 1, 1, 0, 0, 0]))
     extents, states = track(
-        scenes.projection(row), target_outline(scenes, row), scenes.target(row).is_flat, linear,
+        scenes.projection(row), target_outline(scenes, row), scenes.targets[row].is_flat, linear,
         np.linspace(begin, end, MIN_INSTANTS),
     )
     extents = extents[states != BEHIND]
@@ -700,11 +690,9 @@ the share by which one sheet moves against the other is its largest error."""
 MAX_SHADOWS = 512
 
 
-def _layers(
-    scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool
-) -> list[Layer]:
+def _layers(scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool) -> list[Layer]:
     """Return what is seen of one scene in the rows of a box; ``beside``: of distractors alone."""
-    target, effect = scenes.target(row), scenes.effects.of(row)
+    target, effect = scenes.targets[row], scenes.effects.of(row)
     if target.is_flat:
         (sheet,) = seen_sheets(scenes, row)
         edges = (

@@ -25,8 +25,6 @@ MAX_PIXELS = 500_000_000
 MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 """Size of the largest image file: four channels of 16 bits."""
 
-MAX_PATH_LENGTH = 4096
-
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm")
 """Ends of the names of image files, in lower case."""
 
@@ -46,8 +44,6 @@ def read_regular(path: str | Path, most: int) -> bytes:
         If the file does not exist, cannot be read, is not a regular file, or has more than
         ``most`` bytes; a missing one's reason ends with the most similar name in its folder.
     """
-    if len(str(path)) > MAX_PATH_LENGTH:
-        raise ValueError("File name too long")
     try:
         status = Path(path).stat()
     except FileNotFoundError as error:

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import compiled
+from sweep.compilation import compiled, compiled_inline
 
 COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's models have."""
@@ -81,9 +81,9 @@ def pack_once(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
 _kept = lru_cache(maxsize=1024)(pack_once)
 
 
-@compiled
-def distort(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the distorted normalised coordinates of (x, y)."""
+@compiled_inline
+def _upright(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the distorted normalised coordinates of (x, y) on a sensor without tilt."""
     r2 = x * x + y * y
     radial = (1 + ((lens[4] * r2 + lens[1]) * r2 + lens[0]) * r2) / (
         1 + ((lens[7] * r2 + lens[6]) * r2 + lens[5]) * r2
@@ -92,6 +92,13 @@ def distort(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float
     yd = y * radial + lens[2] * (r2 + 2 * y * y) + 2 * lens[3] * x * y
     xd += (lens[9] * r2 + lens[8]) * r2
     yd += (lens[11] * r2 + lens[10]) * r2
+    return xd, yd
+
+
+@compiled
+def distort(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the distorted normalised coordinates of (x, y)."""
+    xd, yd = _upright(x, y, lens)
     if lens[12] != 0.0 or lens[13] != 0.0:
         w = lens[20] * xd + lens[21] * yd + lens[22]
         return (
@@ -102,9 +109,7 @@ def distort(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float
 
 
 @compiled
-def jacobian(
-    x: float, y: float, lens: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
+def jacobian(x: float, y: float, lens: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """Return d(xd)/dx, d(xd)/dy, d(yd)/dx, d(yd)/dy of :func:`distort` at (x, y)."""
     r2 = x * x + y * y
     n = 1 + ((lens[4] * r2 + lens[1]) * r2 + lens[0]) * r2
@@ -120,10 +125,7 @@ def jacobian(
     c = slope * x * y + 2 * lens[2] * x + 2 * lens[3] * y + prism_y * x
     e = radial + slope * y * y + 6 * lens[2] * y + 2 * lens[3] * x + prism_y * y
     if lens[12] != 0.0 or lens[13] != 0.0:
-        xd = x * radial + 2 * lens[2] * x * y + lens[3] * (r2 + 2 * x * x)
-        yd = y * radial + lens[2] * (r2 + 2 * y * y) + 2 * lens[3] * x * y
-        xd += (lens[9] * r2 + lens[8]) * r2
-        yd += (lens[11] * r2 + lens[10]) * r2
+        xd, yd = _upright(x, y, lens)
         w = lens[20] * xd + lens[21] * yd + lens[22]
         u = (lens[14] * xd + lens[15] * yd + lens[16]) / w
         v = (lens[17] * xd + lens[18] * yd + lens[19]) / w

@@ -220,9 +220,7 @@ def _stag_codes(name: str) -> NDArray[np.uint64]:
     raise MissingPackageError(f"{name}: its codes are not in {path}; install stag-python 1.1")
 
 
-def _circle(
-    centre: Floats, radius: float, sides: int, areas: tuple[int, int]
-) -> MarkerEdges:
+def _circle(centre: Floats, radius: float, sides: int, areas: tuple[int, int]) -> MarkerEdges:
     """Return a regular polygon with a circle's area; ``areas`` are those inside and outside."""
     turn = 2 * math.pi / sides
     angle = turn * np.arange(sides + 1)

@@ -149,9 +149,7 @@ def distorted_point(t: float, projection: Projection, edge: ModuleEdge) -> tuple
 
 
 @compiled
-def distance_from_chord(
-    px: float, py: float, x0: float, y0: float, x1: float, y1: float
-) -> float:
+def distance_from_chord(px: float, py: float, x0: float, y0: float, x1: float, y1: float) -> float:
     """Return the distance of a point from the straight line through two others."""
     length = math.hypot(x1 - x0, y1 - y0)
     if length == 0.0:

@@ -266,9 +266,7 @@ def towards(sight: Floats) -> Floats:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def rotation_of_view_angle(
-    view: Floats, azimuth: Floats, roll: Floats, sight: Floats
-) -> Floats:
+def rotation_of_view_angle(view: Floats, azimuth: Floats, roll: Floats, sight: Floats) -> Floats:
     """Return S · Rot((cos azimuth, sin azimuth, 0), view) · Rz(roll) · Rx(180°), (N, 3, 3).
 
     S is the smallest rotation of the optical axis to the line of sight (N, 3), so that the angle

@@ -238,7 +238,7 @@ def marker_levels(
 
     Both (height, width); the part of a pixel that the marker does not cover counts as level 0.
     """
-    renderer, target = scenes.renderer[row], scenes.target(row)
+    renderer, target = scenes.renderer[row], scenes.targets[row]
     black, white = scenes.levels[row, 1:].tolist()
     if renderer in scenes.effects.plugins.renderers:
         return scenes.effects.plugins.renderers[renderer](_marker_view(scenes, row, box))
@@ -271,7 +271,7 @@ _NO_EDGES = np.empty((0, 6))
 
 def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
     """Return the marker or the board of a scene as samples see it."""
-    key = scenes.target(row)
+    key = scenes.targets[row]
     inverse = np.linalg.inv(scenes.plane[row])
     levels, optics = scenes.levels[row], scenes.cameras.optics(row)
     if key.margin is None:
@@ -279,9 +279,7 @@ def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
     beyond = overhang(key.dictionary)
     inverse[:2] += beyond * inverse[2]
     bits = modules(key.dictionary, key.marker_ids[0])
-    return SampledMarker(
-        bits, key.margin - beyond, _NO_EDGES, _NO_EDGES, levels, inverse, optics
-    )
+    return SampledMarker(bits, key.margin - beyond, _NO_EDGES, _NO_EDGES, levels, inverse, optics)
 
 
 @lru_cache(maxsize=16)
@@ -302,7 +300,7 @@ def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
     """Return the marker of a scene as renderers of plug-ins get it."""
     _, black, white = scenes.levels[row].tolist()
     distorted = bool(scenes.cameras.distorted[row])
-    key = scenes.target(row)
+    key = scenes.targets[row]
     beyond = overhang(key.dictionary)
     from_whole = np.array([[1.0, 0.0, -beyond], [0.0, 1.0, -beyond], [0.0, 0.0, 1.0]])
     return MarkerView(
@@ -362,7 +360,7 @@ def _warped(
 
     A bitmap's pixels have their edges at halves; beyond it is the level ``border``.
     """
-    extent = extent_of(scenes.target(row))
+    extent = extent_of(scenes.targets[row])
     square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
     transform = cv2.getPerspectiveTransform(
         rectangles(square[None])[0].astype(np.float32),
@@ -377,7 +375,7 @@ def _warped(
 def _warp_grey(scenes: Scenes, row: int, box: Box) -> Grey:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
-    target = scenes.target(row)
+    target = scenes.targets[row]
     bitmap = _grey_bitmap(target, black, white, 0.0 if target.is_marker else background)
     border = int(background + (0.5 + coverage.ROUNDING_SNAP))
     return np.asarray(_warped(scenes, row, box, bitmap, border))
@@ -511,7 +509,7 @@ def beside_pixels(scenes: Scenes, row: int, box: Box) -> Masks:
     With blur and motion, and the pixels next to these: to renderers that are not exact, and to
     what mixes neighbours, it is not sharper.
     """
-    key = scenes.target(row)
+    key = scenes.targets[row]
     if not key.distractors:
         return np.zeros((box[3] - box[1], box[2] - box[0]), dtype=bool)
     share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 0.0]), beside=True)

@@ -195,9 +195,7 @@ class SceneEffects:
         """
         uneven = self._any_active(lambda effect: effect.widens == "uneven light")
         steep = self._any_active(lambda effect: "uneven light" in effect.worsens)
-        return np.where(
-            uneven, np.where(steep, np.inf, np.maximum(self.values["gain"], 1.0)), 0.0
-        )
+        return np.where(uneven, np.where(steep, np.inf, np.maximum(self.values["gain"], 1.0)), 0.0)
 
     def _any_active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
         """Return whether one of the effects that are concerned is active, (N,)."""
@@ -313,10 +311,6 @@ class Scenes:
         ]
         return np.array(exact, dtype=bool) & ~self.solid & ~self.effects.active
 
-    def target(self, row: int) -> Board:
-        """Return what one scene shows."""
-        return self.targets[row]
-
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
         return Projection(self.plane[row], self.cameras.optics(row))
@@ -342,10 +336,7 @@ class Scenes:
         )
 
 
-_NEUTRAL_COLUMNS = {name: Column.of(value) for name, value in NEUTRAL.items()}
-_DEFAULT_CAMERA = {
-    field.name: Column.of(field.default) for field in dataclasses.fields(Camera)
-}
+_DEFAULTS = NEUTRAL | {field.name: field.default for field in dataclasses.fields(Camera)}
 
 
 def build_scenes(
@@ -362,7 +353,7 @@ def build_scenes(
     :meth:`Column.of` takes. ``plugins`` are needed if the scenes are to be rendered.
     """
     values = {
-        **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None,
+        **_DEFAULTS, "noise_key": 0, "x_m": None, "y_m": None,
         "board": values.get("neighbourhood"), **values,
     }
 

@@ -76,7 +76,7 @@ def measured(side, tilt):
     scenes = batch.scenes
     box = batch.boxes[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
     view = marker_view(
-        scenes.target(0), scenes.size_m[0], scenes.cameras.optics(0), box[:2], noise_variance(2.0)
+        scenes.targets[0], scenes.size_m[0], scenes.cameras.optics(0), box[:2], noise_variance(2.0)
     )
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()

@@ -105,7 +105,7 @@ def test_the_solver_finds_the_pose_of_perfect_corners():
     pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
     scenes = build_scenes(pipeline.experiment.scene_values([np.arange(3)]), 3)
     found = build(pipeline.experiment.estimators[0])(of_markers(
-        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), [scenes.target(0)] * 3))
+        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), [scenes.targets[0]] * 3))
     np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
     np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)
     assert found.reprojection_px.max() < 1e-4

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +16,19 @@ from sweep.measure.classify import Findings, TargetScenes, classify, target_scen
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,
     AnyDetectorSetting,
-    BoardDetector,
-    FindFunction,
     SearchOutput,
     full_frame_reason,
-    make_board_detector,
-    make_detector,
     margin_px,
     uneven_light_needs_frame,
     windows,
 )
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.sources import DetectionSource, detection_source
 from sweep.model.camera import Column, map_columns
 from sweep.model.exposure import hidden, marker_boxes, not_modelled, outside_frame
-from sweep.model.pose import transform_points
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plugins import Poses
-from sweep.plugins.declared import PluginSetting
-from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -112,165 +105,19 @@ def images_of(
 
 
 # --------------------------------------------------------------------------------------------------
-# Where detections come from: a detector that searches images, or what another program found.
-
-class DetectionSource(Protocol):
-    """Where the detections of N scenes with one setting come from.
-
-    One that needs images gets them in windows; else its pixels are those of the frame.
-    """
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether scenes are rendered for it."""
-        ...
-
-    def __call__(self, row: int, image: Grey) -> SearchOutput:
-        """Return what is found in the image of scene ``row``."""
-        ...
-
-    def poses(self, found: Findings) -> Poses:
-        """Return the poses (N, 3, 3), (N, 3) in metres that come with what was found.
-
-        NaN where none does; None in the place of both if there never are any.
-        """
-        ...
-
-
-@dataclass(slots=True)
-class ImageSearch:
-    """A detector's search of scenes' images.
-
-    Attributes
-    ----------
-    find, boards
-        The search for markers, and what OpenCV does by means of a board.
-    scenes, targets
-        What the images show.
-    """
-
-    find: FindFunction
-    boards: BoardDetector
-    scenes: Scenes
-    targets: TargetScenes
-    needs_images: bool = True
-    _sides: list[int] = field(init=False)
-    _last: tuple[Grey, str, SearchOutput] | None = None
-
-    def __post_init__(self) -> None:
-        self._sides = self.scenes.frame.max(axis=1).tolist()
-
-    def __call__(self, row: int, image: Grey) -> SearchOutput:
-        """Return what is found in an image of scene ``row``."""
-        target = self.targets.targets[row]
-        dictionary = target.dictionary
-        if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
-            return self._last[2]  # another marker of a photograph
-        found = self.find(image, dictionary, self._sides[row])
-        output = (
-            SearchOutput(*found) if target.is_marker
-            else self.boards.complete(image, target, found)
-        )
-        self._last = image, dictionary, output
-        return output
-
-    def poses(self, found: Findings) -> Poses:  # noqa: ARG002
-        """Return that images have no poses."""
-        return Poses(None, None)
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedSearch:
-    """Detections that another program made, in the place of a search of images.
-
-    Attributes
-    ----------
-    recording, scenes, targets
-        The detections, and the scenes whose images they are of.
-    keys
-        (N,) keys of the scenes' images.
-    """
-
-    recording: Recording
-    scenes: Scenes
-    targets: TargetScenes
-    keys: NDArray[np.uint64]
-    needs_images: bool = False
-
-    def __call__(self, row: int, image: Grey) -> SearchOutput:  # noqa: ARG002
-        """Return what was found in the image of scene ``row``, in pixels of the frame."""
-        quads, ids, _ = self._squares(row)
-        decoded, corners = ids != REJECTED, quads[:, None]
-        return SearchOutput(
-            list(corners[decoded]), ids[decoded] if decoded.any() else None,
-            list(corners[~decoded]),
-        )
-
-    def poses(self, found: Findings) -> Poses:
-        """Return the pose of each detected target: of the target itself, or of a square of it."""
-        count = len(found.flags)
-        poses = Poses(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
-        for row in np.flatnonzero(found.flags == DetectionStatus.detected).tolist():
-            part = self.recording.rows(self.keys[row])
-            of_target = part.start + np.flatnonzero(self.recording.marker_id[part] == OF_TARGET)
-            quads, ids, at = self._squares(row)
-            used = (quads[:, None] == found.corners[found.owner == row]).all(axis=(2, 3))
-            used &= np.isin(ids, self.targets.targets[row].marker_ids)[:, None]
-            chosen = np.concatenate([of_target, at[used.any(axis=1)]])
-            chosen = chosen[np.isfinite(self.recording.translation[chosen]).all(axis=1)][:1]
-            poses.rotation[row : row + len(chosen)] = self.recording.rotation[chosen]
-            poses.translation[row : row + len(chosen)] = self.recording.translation[chosen]
-        return poses
-
-    def _squares(self, row: int) -> tuple[Floats, Integers, Integers]:
-        """Return the squares of an image: corners (n, 4, 2), IDs and rows of the recording (n,).
-
-        Where only a pose was given, the corners are the true camera's image of its square (the
-        first, of an ID that the target lacks); of the pose of the target as a whole all of them,
-        if the image has no corners.
-        """
-        part, target = self.recording.rows(self.keys[row]), self.targets.targets[row]
-        given, ids = self.recording.corners[part], self.recording.marker_id[part].tolist()
-        missing = np.asarray(np.isnan(given).any(axis=(1, 2)))
-        numbers = {marker_id: k for k, marker_id in enumerate(target.marker_ids)}
-        objects = target.corners_m * (self.scenes.size_m[row] if target.is_marker else 1.0)
-        camera = self.scenes.cameras.take(np.array([row]))
-        quads, found, rows = [np.empty((0, 4, 2))], list[int](), list[int]()
-        for i, marker_id in enumerate(ids):
-            shown = {marker_id: numbers.get(marker_id, 0)}
-            if not missing[i]:
-                quads.append(given[[i]])
-            else:
-                if marker_id == OF_TARGET:
-                    shown = numbers if missing.all() else {}
-                points = transform_points(
-                    objects[list(shown.values())].reshape(1, -1, 3),
-                    self.recording.rotation[part][[i]], self.recording.translation[part][[i]],
-                )
-                quads.append(camera.project(points).reshape(-1, 4, 2))
-            found += shown
-            rows += [part.start + i] * len(shown)
-        return (
-            np.concatenate(quads), np.array(found, dtype=np.int64), np.array(rows, dtype=np.int64)
-        )
-
+# Scenes to detections: sources, windows, rendering in groups, search with each detector setting.
 
 def detection_sources(batch: SceneBatch) -> list[DetectionSource]:
     """Return where the detections of a batch come from, by detector setting."""
-    experiment, scenes, targets = batch.experiment, batch.scenes, batch.targets
+    experiment = batch.experiment
     return [
-        RecordedSearch(
-            setting.record().recording, scenes, targets, experiment.image_keys(batch.indices)
-        ) if isinstance(setting, PluginSetting) and is_recording(setting.plugin.name)
-        else ImageSearch(
-            make_detector(setting), make_board_detector(setting, on_board), scenes, targets
+        detection_source(
+            setting, on_board, batch.scenes, batch.targets,
+            lambda: experiment.image_keys(batch.indices),
         )
         for setting, on_board in zip(experiment.detectors, experiment.board_settings, strict=True)
     ]
 
-
-# --------------------------------------------------------------------------------------------------
-# Scenes to detections: windows, rendering in groups, search with each detector setting.
 
 @dataclass(slots=True)
 class SearchResult:

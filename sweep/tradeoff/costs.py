@@ -17,7 +17,6 @@ from scipy import stats
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import (
-    DetectionSource,
     SceneBatch,
     SearchResult,
     detection_sources,
@@ -31,6 +30,7 @@ from sweep.measure.detectors import AnyDetectorSetting, DetectorSetting, full_fr
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.sources import DetectionSource
 from sweep.model.renderers import render_all
 from sweep.typing import Floats, Grey
 

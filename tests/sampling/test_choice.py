@@ -7,122 +7,27 @@ import pytest
 import xarray as xr
 
 import sweep
+from support.searches import DOCUMENT, changed, flags_of
 from support.small_datasets import perfect
 from sweep.analysis.decisions import answers, choice_cells
 from sweep.analysis.requirements import Decision, ErrorShares
-from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule, not_continued
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
 from sweep.sampling.searches import group_dataset, store_cells
 from sweep.tradeoff import choice_search
 
-DOCUMENT = {
-    "pose": {"distance_m": 1.0, "jitter_px": 0.5},
-    "axes": {"size_m": [0.02, 0.08, 0.04], "tilt_deg": [0, 60],
-             "dictionary": ["DICT_4X4_50", "DICT_6X6_50"], "solver": ["ippe", "iterative"]},
-    "require": {"all": ["detection >= 0.9"]},
-    "search": {"smallest": "size_m", "among": ["dictionary"], "max_trials": 400},
-}
-
-
-def changed(**sections):
-    """Return the document with keys of sections replaced; None takes one away."""
-    document = {name: dict(table) for name, table in DOCUMENT.items()}
-    for section, keys in sections.items():
-        for key, value in (keys or {}).items():
-            document.setdefault(section, {})[key] = value
-            if value is None:
-                del document[section][key]
-        if keys is None:
-            del document[section]
-    return document
-
-
-FAULTS = [
-    ({"search": {"smallest": "solver"}}, "search.smallest: solver: each configuration has its own"),
-    ({"search": {"smallest": "dictionary", "among": []}}, "of numbers; dictionary has no order"),
-    ({"search": {"smallest": "distance_m"}}, "list the values of distance_m under [axes]"),
-    ({"search": {"smallest": "trial"}}, "trials are what is counted"),
-    ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
-    ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
-    ({"search": {"among": ["size_m"]}}, "other axes than size_m, which is searched along"),
-    ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
-    ({"search": {"max_trials": 0}}, "search.max_trials = 0: expected"),
-    ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
-    ({"search": {"smalest": 1}}, "search.smalest: unknown key; expected along, smallest"),
-    ({"axes": {"size_m": [0.02]}}, "axis of several values, from easy to hard; size_m has one"),
-    ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
-     "it is drawn for each trial: give distance_m values under [axes]"),
-    ({"require": None}, 'expected what must be met: [require] all = ["detection >= 0.99"]'),
-    ({"require": {"per": ["size_m"]}}, "expected conditions; size_m is what [search] chooses"),
-    ({"require": {"all": ["detection >= 0.9", "detection <= 0.8"]}}, "contradicts"),
-    ({"require": {"all": ["budget_ms <= 2"]}}, "expected what must be met"),
-    ({"require": {"all": ["detection >= 0.9", "budget_ms >= 2"]}}, "milliseconds of a frame: budg"),
-    ({"require": {"all": ["detection >= 0.9", "budget_ms <= 2", "budget_ms <= 1"]}},
-     "there is another budget; delete one"),
-    ({"search": {"smallest": None, "cheapest": True, "among": []},
-      "axes": {"solver": ["ippe"]}},
-     "something to choose: smallest = "),
-]
-
-
-@pytest.mark.parametrize(("change", "line"), FAULTS)
-def test_a_choice_that_cannot_be_made_is_a_line(change, line):
-    with pytest.raises(PipelineError) as caught:
-        make_rule(Pipeline.from_dict(changed(**change)))
-    assert any(line in fault for fault in caught.value.faults), caught.value.faults
-
-
-def test_sobol_points_are_refused_in_one_line_that_names_no_other_number_of_trials():
-    with pytest.raises(PipelineError) as caught:
-        Pipeline.from_dict({**DOCUMENT, "sampling": "sobol"})
-    line, = caught.value.faults
-    assert "expected independent beside [search]" in line
-
-
-def test_values_that_are_no_axis_are_one_fault():
-    with pytest.raises(PipelineError) as caught:
-        Pipeline.from_dict(changed(axes={"size_m": [0.08, 0.08]}))
-    line, = caught.value.faults
-    assert "expected each value once" in line
-
-
-@pytest.mark.parametrize("section", [
-    {"search": DOCUMENT["search"], "require": DOCUMENT["require"]},
-    {"search": {"precision": {"detection_rate": 0.1}}},
-    {"require": {"all": ["detection >= 0.9"]}, "search": {"along": "size_m"}},
-])
-def test_axes_that_are_no_table_are_a_fault_beside_every_rule(section):
-    with pytest.raises(PipelineError, match=r"axes = 3: expected a table: \[axes\]"):
-        Pipeline.from_dict({**section, "axes": 3})
-
-
-def test_a_budget_needs_a_choice():
-    with pytest.raises(PipelineError, match="is the time of a choice"):
-        Pipeline.from_dict(changed(search=None, require={"all": ["budget_ms <= 2"]}))
-
-
-def test_all_faults_come_at_once():
-    with pytest.raises(PipelineError) as caught:
-        Pipeline.from_dict(changed(search={"smallest": "solver", "per": ["size_m"], "other": 1}))
-    assert len(caught.value.faults) == 3
-
 
 def group(pipeline, rates, trials, generator):
     """Return results of a group with detections at rates (size, tilt, dictionary)."""
-    shape = (3, 2, 2, trials)
-    found = generator.random(shape) < np.asarray(rates)[..., None]
-    detection = np.where(found, DetectionStatus.detected, DetectionStatus.rejected)
-    both = np.broadcast_to(found[..., None], (*shape, 2))
-    return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, {
-        "detection": detection.astype(np.uint8),
-        "estimate": np.where(
-            both, EstimateStatus.solved, EstimateStatus.no_detection).astype(np.uint8),
-        "flipped": np.where(both, Flipped.not_flipped, Flipped.no_estimate).astype(np.uint8)})
+    found = generator.random((3, 2, 2, trials)) < np.asarray(rates)[..., None]
+    flags = flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.rejected))
+    of_solvers = {name: np.repeat(flags[name][..., None], 2, axis=-1)
+                  for name in ("estimate", "flipped")}
+    return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, flags | of_solvers)
 
 
 @pytest.mark.parametrize("section", [
@@ -156,11 +61,8 @@ def chosen(monkeypatch):
         found = np.arange(trials) < np.round(trials * np.asarray(rates))[..., None]
         detection = np.where(found, DetectionStatus.detected, DetectionStatus.rejected)
         detection[np.isnan(rates)] = DetectionStatus.not_visible
-        results = group_dataset(GroupResults(
-            pipeline, (0, 0), (3, 2), 1, trials, {
-                "detection": detection.astype(np.uint8),
-                "estimate": np.where(found, EstimateStatus.solved, EstimateStatus.no_detection),
-                "flipped": np.where(found, Flipped.not_flipped, Flipped.no_estimate)}))
+        results = group_dataset(
+            GroupResults(pipeline, (0, 0), (3, 2), 1, trials, flags_of(detection)))
         monkeypatch.setattr(choice_search, "execute", lambda *_, **__: SimpleNamespace(
             store="runs/a.zarr", warnings=()))
         monkeypatch.setattr(choice_search, "open_dataset", lambda _: results)

@@ -9,7 +9,6 @@ from scipy import stats
 from sweep.analysis.decisions import wanted_precisions
 from sweep.analysis.estimator import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
-from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.sampling.rules import GroupResults, make_rule
@@ -105,15 +104,6 @@ def test_a_smaller_half_width_needs_every_trial_that_a_larger_one_needs():
             needed.append(make_rule(pipeline).needed(results))
         for looser, stricter in itertools.pairwise(needed):
             assert (stricter | ~looser).all()
-
-
-def test_unknown_quantities_are_named_all_at_once():
-    with pytest.raises(PipelineError) as error:
-        make_rule(pipeline_of("detection_rte = 0.1, rotation_rmse_rad = 0.1, flips = 0.1"))
-    assert len(str(error.value).splitlines()) == 3
-    assert "did you mean detection_rate?" in str(error.value)
-    with pytest.raises(PipelineError, match="another half-width"):
-        make_rule(pipeline_of("detection_rate = 0.1, detection = 0.2"))
 
 
 @pytest.mark.parametrize("width", [0.49, 0.2, 0.05, 0.01])

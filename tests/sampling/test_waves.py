@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from support.stores import by_hand, same
-from sweep.errors import PipelineError
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import wave_ends
@@ -76,12 +75,3 @@ def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_p
     assert len(set(counts[0])) > 1
     by_hand(other, pipeline, (1, 3, 25))
     assert same(url, other)
-
-
-@pytest.mark.parametrize(("change", "expected"), [
-    ("search.precision={ detection_rte = 0.1 }",
-     "nothing of this name has an interval; did you mean detection_rate?"),
-])
-def test_unknown_quantity_is_refused_by_the_rule(change, expected):
-    with pytest.raises(PipelineError, match=expected.replace("?", r"\?")):
-        make_rule(Pipeline.from_text(TEXT, [change]))

@@ -8,6 +8,26 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import group_dataset, search_rule
 
+DOCUMENT = {
+    "pose": {"distance_m": 1.0, "jitter_px": 0.5},
+    "axes": {"size_m": [0.02, 0.08, 0.04], "tilt_deg": [0, 60],
+             "dictionary": ["DICT_4X4_50", "DICT_6X6_50"], "solver": ["ippe", "iterative"]},
+    "require": {"all": ["detection >= 0.9"]},
+    "search": {"smallest": "size_m", "among": ["dictionary"], "max_trials": 400},
+}
+"""A search for the smallest choice."""
+
+
+def changed(**sections):
+    """Return `DOCUMENT` with keys of sections replaced; None takes one away."""
+    document = {name: dict(table) for name, table in DOCUMENT.items()}
+    for section, keys in sections.items():
+        if isinstance(keys, dict):
+            keys = document.get(section, {}) | keys  # noqa: PLW2901
+            keys = {key: value for key, value in keys.items() if value is not None}  # noqa: PLW2901
+        document[section] = keys
+    return {name: table for name, table in document.items() if table is not None}
+
 
 def pipeline_of(curves, values, text, most):
     """Return a pipeline whose tilts stand for the conditions of curves (conditions, values)."""
@@ -24,7 +44,7 @@ def flags_of(detection):
     detected = detection == DetectionStatus.detected
     unneeded = detection == DetectionStatus.not_needed
     return {
-        "detection": detection,
+        "detection": detection.astype(np.uint8),
         "estimate": np.select([detected, unneeded],
                               [EstimateStatus.solved, EstimateStatus.not_needed],
                               EstimateStatus.no_detection).astype(np.uint8),

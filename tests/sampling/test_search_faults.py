@@ -1,0 +1,71 @@
+"""Faults of the sections [require] and [search] are told in lines, all at once."""
+
+import pytest
+
+from support.searches import DOCUMENT, changed
+from sweep.errors import PipelineError
+from sweep.experiment.pipeline import Pipeline
+from sweep.sampling.rules import make_rule
+
+LIMIT = {"smallest": None, "among": None, "along": "size_m"}
+PRECISION = {"smallest": None, "among": None, "precision": {"detection_rate": 0.1}}
+
+
+def faults_of(**change):
+    with pytest.raises(PipelineError) as caught:
+        make_rule(Pipeline.from_dict(changed(**change)))
+    return caught.value.faults
+
+
+@pytest.mark.parametrize(("change", "line"), [
+    ({"search": {"smallest": "solver"}}, "search.smallest: solver: each configuration has its own"),
+    ({"search": {"smallest": "dictionary", "among": []}}, "of numbers; dictionary has no order"),
+    ({"search": {"smallest": "distance_m"}}, "list the values of distance_m under [axes]"),
+    ({"search": {"smallest": "trial"}}, "trials are what is counted"),
+    ({"search": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
+    ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
+    ({"search": {"among": ["size_m"]}}, "other axes than size_m, which is searched along"),
+    ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
+    ({"search": {"max_trials": 0}}, "search.max_trials = 0: expected"),
+    ({"search": {"max_trials": 1}}, "search.max_trials = 1: expected at least 2"),
+    ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
+    ({"search": {"smalest": 1}}, "search.smalest: unknown key; expected along, smallest"),
+    ({"axes": {"size_m": [0.02]}}, "axis of several values, from easy to hard; size_m has one"),
+    ({"axes": {"size_m": [0.08, 0.08]}}, "expected each value once"),
+    ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
+     "it is drawn for each trial: give distance_m values under [axes]"),
+    ({"require": None}, 'expected what must be met: [require] all = ["detection >= 0.99"]'),
+    ({"require": {"per": ["size_m"]}}, "expected conditions; size_m is what [search] chooses"),
+    ({"require": {"all": ["detection >= 0.9", "detection <= 0.8"]}}, "contradicts"),
+    ({"require": {"all": ["detection >= 90"]}}, "write 0.9 for 90 %"),
+    ({"require": {"all": ["size_px >= 3"]}}, "nothing of this name"),
+    ({"require": {"all": ["budget_ms <= 2"]}}, "expected what must be met"),
+    ({"require": {"all": ["budget_ms <= 2"]}, "search": None}, "is the time of a choice"),
+    ({"require": {"all": ["detection >= 0.9", "budget_ms >= 2"]}}, "milliseconds of a frame: budg"),
+    ({"require": {"all": ["detection >= 0.9", "budget_ms <= 2", "budget_ms <= 1"]}},
+     "there is another budget; delete one"),
+    ({"search": {"smallest": None, "cheapest": True, "among": []}, "axes": {"solver": ["ippe"]}},
+     "something to choose: smallest = "),
+    ({"sampling": "sobol"}, "expected independent beside [search]"),
+    ({"search": LIMIT | {"along": 3}}, "the axis that is searched"),
+    ({"search": LIMIT | {"per": ["size_m"]}}, "other axes than size_m"),
+    ({"search": LIMIT | {"per": ["nothing"]}}, "no such axis"),
+    ({"search": LIMIT | {"among": ["solver"]}}, "beside smallest"),
+    ({"search": PRECISION | {"precision": {"detection_rate": 0.1, "detection": 0.2}}},
+     "another half-width"),
+    *(({"search": search, "axes": 3}, "axes = 3: expected a table: [axes]")
+      for search in ({}, LIMIT, PRECISION)),
+])
+def test_a_search_that_cannot_be_made_is_a_line(change, line):
+    faults = faults_of(**change)
+    assert any(line in fault for fault in faults), faults
+    assert len(faults) == 1 or "axes" in change or "require" in change, faults
+
+
+def test_all_faults_come_at_once():
+    assert len(faults_of(search={"smallest": "solver", "per": ["size_m"], "other": 1})) == 3
+    unknown = dict.fromkeys(("detection_rte", "rotation_rmse_rad", "flips"), 0.1)
+    lines = faults_of(search=PRECISION | {"precision": unknown})
+    assert len(lines) == 3
+    assert "nothing of this name has an interval; did you mean detection_rate?" in lines[0]
+    assert DOCUMENT["search"]["smallest"] == "size_m"

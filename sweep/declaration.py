@@ -77,15 +77,13 @@ class Declaration:
         return self._abbreviated(bare) if found is None and self.abbreviated else found
 
     def _abbreviated(self, word: str) -> str | None:
-        """Return the one choice with a word's number, whose letters before it end as the word's."""
-        letters, number = _letters_and_number(word)
-        if not number or word.isdecimal():
-            return None
+        """Return the one choice that ends as a word, which has the choice's number whole."""
+        ending = _letters_and_digits(word)
         found = {
             choice.casefold(): choice for choice in self.choices
-            for theirs, same in [_letters_and_number(choice)]
-            if same == number and theirs.endswith(letters)
-        }
+            for whole in [_letters_and_digits(choice)] if whole.endswith(ending)
+            and not re.search("[0-9]", whole.removesuffix(ending))
+        } if re.search("[0-9]", ending) and not word.isdecimal() else {}
         return next(iter(found.values())) if len(found) == 1 else None
 
     def _bare(self, word: str) -> str:
@@ -101,16 +99,8 @@ class Declaration:
         return above and number <= self.high and abs(number) < 1e300
 
 
-def _letters_and_number(word: str) -> tuple[str, str]:
-    """Return what stands before the first digit, and the rest, in lower case without separators.
-
-    >>> _letters_and_number("DICT_4X4_50"), _letters_and_number("tag36h11")
-    (('dict', '4x450'), ('tag', '36h11'))
-    """
-    bare = re.sub(r"[^a-z0-9]", "", word.casefold())
-    letters = re.match(r"[a-z]*", bare)
-    count = letters.end() if letters else 0
-    return bare[:count], bare[count:]
+def _letters_and_digits(word: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", word.casefold())
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,7 @@ def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
     """
     text = str(text)
     cut = text if len(text) <= most else text[: most - 3] + "..."
-    if cut.isprintable():
-        return cut
-    return "".join(c if c.isprintable() else _escape(c) for c in cut)
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in cut)
 
 
 def notice(line: str) -> None:
@@ -60,59 +58,33 @@ def notice(line: str) -> None:
         sys.stderr.flush()
 
 
-def _escape(character: str) -> str:
-    short = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}.get(character)
-    code = ord(character)
-    return short or (f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}")
-
-
 def shown(value: Any) -> str:
-    """Return a value as TOML, cut if it is long; the rest is not even formatted.
+    """Return a value as TOML, cut if it is long; most of the rest is not even formatted.
 
     >>> shown({"uniform": [0, 4.5]})
     '{uniform = [0, 4.5]}'
     """
-    text = ""
-    for piece in _pieces(value):
-        text += piece
-        if len(text) > MAX_QUOTE_LENGTH:
-            break
-    return plain(text)
+    return plain(_toml(value))
 
 
-def _pieces(value: Any) -> Iterator[str]:
+def _toml(value: Any) -> str:
+    # No more than so many items are shown.
     if isinstance(value, dict):
-        yield "{"
-        for number, (key, item) in enumerate(value.items()):
-            yield f"{', ' if number else ''}{_key(str(key))} = "
-            yield from _pieces(item)
-        yield "}"
-    elif isinstance(value, (list, tuple)):
-        yield "["
-        for number, item in enumerate(value):
-            yield ", " if number else ""
-            yield from _pieces(item)
-        yield "]"
-    elif isinstance(value, str):
-        yield _quoted(value)
-    elif isinstance(value, bool):
-        yield str(value).lower()
-    elif isinstance(value, int):
-        # Python writes no more than 4300 decimal digits.
-        yield str(value) if value.bit_length() < 10_000 else f"{value:#x}"
-    elif hasattr(value, "isoformat"):
-        yield value.isoformat().replace("+00:00", "Z")
-    else:
-        yield str(value)
-
-
-def _quoted(text: str) -> str:
-    short = itertools.islice(text, MAX_QUOTE_LENGTH + 1)
-    return '"' + "".join("\\" + c if c in '"\\' else plain(c) for c in short) + '"'
+        items = itertools.islice(value.items(), MAX_QUOTE_LENGTH)
+        return "{" + ", ".join(f"{_key(str(key))} = {_toml(item)}" for key, item in items) + "}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_toml, value[:MAX_QUOTE_LENGTH]))}]"
+    if isinstance(value, str):
+        return json.dumps(value[:MAX_QUOTE_LENGTH], ensure_ascii=False)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int) and value.bit_length() >= 10_000:
+        return f"{value:#x}"  # Python writes no more than 4300 decimal digits
+    return value.isoformat().replace("+00:00", "Z") if hasattr(value, "isoformat") else str(value)
 
 
 def _key(key: str) -> str:
-    return key if key.isascii() and key.replace("-", "_").isidentifier() else _quoted(key)
+    return key if key.isascii() and key.replace("-", "_").isidentifier() else _toml(key)
 
 
 def label(value: Any) -> str:
@@ -188,12 +160,10 @@ def nearest_file(path: str | os.PathLike[str]) -> str:
         names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
     except (OSError, ValueError):
         return ""
-    alike = [name for name in names if Path(name).suffix.lower() == wanted.suffix.lower()]
-    stems = {Path(name).stem.casefold(): name for name in alike}
-    close = [stems[stem] for stem in difflib.get_close_matches(
-        wanted.stem.casefold(), list(stems), n=1, cutoff=0.6)]
-    close = close or difflib.get_close_matches(wanted.name, names, n=1, cutoff=0.8)
-    return f"; did you mean {plain(wanted.with_name(close[0]), 300)}?" if close else ""
+    stems = {Path(name).stem: name for name in names
+             if Path(name).suffix.lower() == wanted.suffix.lower()}
+    close = stems.get(similar(wanted.stem, stems)) or similar(wanted.name, names, 0.8)
+    return f"; did you mean {plain(wanted.with_name(close), 300)}?" if close else ""
 
 
 def _letters(word: str) -> str:

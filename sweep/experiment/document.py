@@ -383,7 +383,8 @@ def read_keys(
     reading = Reading(
         seed=header["seed"], sampling=header["sampling"], title=header["title"], fixed={},
         given=written.keys(), written=written, distributions={}, axes=[], plugins=tuple(plugins),
-        folder=folder, files={each.file: each.digest for each in plugins if each.file},
+        folder=folder, files={each.file: each.digest for each in plugins if each.file} | dict(
+            recorded.files or {}),
         document=document, source=source, recorded=recorded,
     )
     reading.tell(lines)

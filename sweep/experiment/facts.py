@@ -100,12 +100,6 @@ class Part:
     switch: str = ""
 
 
-def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") -> Part:
-    """Return a part that is active if there are values, which are its reason."""
-    text = ", ".join(values)
-    return Part(name, bool(text), form.format(text) if text else otherwise)
-
-
 class Facts:
     """What an experiment's camera and poses are, which parts are active, and what may surprise.
 
@@ -440,11 +434,10 @@ class Facts:
         ])
         lens = any(map(canonical_distortion, grid.values_of("distortion")))
         image = grid.any_value("background", lambda value: isinstance(value, str))
-        guarded = grid.any_value("guarded", bool)
-        whole = self._reasons_for_the_frame(on, image=image)
         noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
         coarse = any("noise" in effect.worsens for effect in on)
-        noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
+        around = f" px around the {grid.target_word}'s pixels" + (
+            f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
         windows = {margin_px(each) for each in settings if full_frame_reason(each) is None}
         if image or "full" in grid.values_of("window"):
             windows = set()
@@ -452,26 +445,32 @@ class Facts:
             name for name in PARAMETERS
             if name.startswith("believed_") and grid.fixed.get(name, "varies") is not None
         ] + ["believed: calibration"] * calibrated
-        return [
-            Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
-            _listed("random draws", draws, "nothing is random",
-                    "{}, Sobol' points" if grid.sampling == "sobol" else "{}"),
-            Part("background image", image, "background names a file" if image else "a level"),
-            _listed("window", map(str, sorted(windows)), "the full frame",
-                    f"{{}} px around the {grid.target_word}'s pixels{noise}"),
-            _listed("plug-ins", map(_described, grid.plugins), "none is named"),
-            Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
-            Part("renderer", True, ", ".join(sorted(set(grid.values_of("renderer"))))),
-            *map(self._effect, effects),
-            Part("solver guard", guarded,
-                 "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP"),
-            _listed("accuracy bound", sorted(set(grid.values_of("bound")) - {"none"}),
-                    "bound is none", "bound is {}"),
-            _listed("pixels kept", filter(self._needs_images, grid.values_of("solver")),
-                    "no solver needs them", "solver {} needs them"),
-            _listed("wrong assumptions", assumptions,
-                    "the estimator knows the true camera and size"),
-        ]
+        with_pixels = {each.name for each in grid.plugins if each.needs_images} | {
+            name for name, each in SOLVERS.items() if each.needs_images}
+        # Why each is active, and what is said if nothing is a reason.
+        reasons: dict[str, tuple[Iterable[str], str]] = {
+            "lens distortion": (["distortion is given"] * lens, "distortion is empty"),
+            "random draws": (
+                [*draws, *["Sobol' points"] * (grid.sampling == "sobol")], "nothing is random"),
+            "background image": (["background names a file"] * image, "a level"),
+            "window": ([", ".join(map(str, sorted(windows))) + around] * bool(windows),
+                       "the full frame"),
+            "plug-ins": (map(_described, grid.plugins), "none is named"),
+            "full frame": (self._reasons_for_the_frame(on, image=image), "no setting needs it"),
+            "renderer": (sorted(set(grid.values_of("renderer"))), ""),
+            "solver guard": (["guarded = true"] * grid.any_value("guarded", bool),
+                             "guarded = false: plain cv2.solvePnP"),
+            "accuracy bound": (
+                [f"bound is {each}" for each in sorted(set(grid.values_of("bound")) - {"none"})],
+                "bound is none"),
+            "pixels kept": (
+                [f"solver {each} needs them" for each in grid.values_of("solver")
+                 if each in with_pixels], "no solver needs them"),
+            "wrong assumptions": (assumptions, "the estimator knows the true camera and size"),
+        }
+        listed = [Part(name, bool(text := ", ".join(each)), text or otherwise)
+                  for name, (each, otherwise) in reasons.items()]
+        return [*listed, *map(self._effect, effects)]
 
     def _reasons_for_the_frame(self, on: Sequence[Effect], *, image: bool) -> list[str]:
         """Return why the whole frame is searched, given the effects that are on."""
@@ -489,18 +488,12 @@ class Facts:
 
     def _effect(self, effect: Effect) -> Part:
         switch, drawn = effect.switch, self.grid.distributions.get(effect.switch)
-        values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
-        extent = str(effect.off_text)
         if drawn is not None:
             return Part(effect.label, True, f"{switch} is drawn: {drawn}", switch)
-        if values:
-            extent = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) else (
-                _text(values))
-        return Part(effect.label, bool(values), f"{switch} is {extent}", switch)
-
-    def _needs_images(self, solver: str) -> bool:
-        plugin = self.grid.plugin("estimator", solver)
-        return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
+        values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
+        text = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) or not values \
+            else _text(values)
+        return Part(effect.label, bool(values), f"{switch} is {text or effect.off_text}", switch)
 
 
 def _described(plugin: DeclaredPlugin) -> str:

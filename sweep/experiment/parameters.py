@@ -242,12 +242,11 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
     PluginError
         If a setting has a name of ours, or of another plug-in's that is declared otherwise.
     """
-    gathered: dict[str, Parameter] = {}
-    owners: dict[str, str] = {}
+    gathered = dict(PARAMETERS)
     for plugin in plugins:
         section = section_of_settings(plugin.kind)
         if plugin.kind in NAMED_BY:
-            by = gathered.get(NAMED_BY[plugin.kind].name, NAMED_BY[plugin.kind])
+            by = gathered[NAMED_BY[plugin.kind].name]
             gathered[by.name] = dataclasses.replace(by, declaration=dataclasses.replace(
                 by.declaration, choices=(*by.declaration.choices, plugin.name)
             ))
@@ -260,10 +259,8 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
             if name in PARAMETERS:
                 raise PluginError(f"another name for its setting {name}: the pipeline has this one")
             if gathered.setdefault(name, parameter) != parameter:
-                raise PluginError(
-                    f"its setting {name} to be declared as that of {owners[name]}, or another name"
-                )
-            owners.setdefault(name, plugin.name)
+                raise PluginError(f"its setting {name} to be declared as that of another plug-in, "
+                                  "or another name")
             try:
                 if setting.default is not None:
                     parameter.check(setting.default)
@@ -271,4 +268,4 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
                 raise PluginError(
                     f"a default of its setting {name} that is allowed: {error}"
                 ) from None
-    return {**PARAMETERS, **gathered} if gathered else PARAMETERS
+    return gathered

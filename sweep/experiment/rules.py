@@ -288,10 +288,8 @@ def read_camera_file(reading: Reading) -> None:
     written = reading.fixed.get("camera_file")
     if written is None:
         return
-    known = reading.recorded.cameras
-    if known is None:
-        known = reading.recorded.files
-    if known is not None and reading.given >= {*FILE_VALUES}:
+    known = {**(reading.recorded.files or {}), **(reading.recorded.cameras or {})}
+    if reading.given >= {*FILE_VALUES}:
         path, _ = file_and_camera(written, known.__contains__)
         if path in known:
             reading.files[path] = known[path]
@@ -371,10 +369,7 @@ def check_backgrounds(reading: Reading) -> None:
     """Demand background images that can be read and have the frame's size."""
     sizes = {}
     for value in reading.values_of("background"):
-        if not isinstance(value, str):
-            continue
-        if reading.recorded.files is not None:
-            reading.files[value] = reading.recorded.files.get(value, "")
+        if not isinstance(value, str) or reading.recorded.files is not None:
             continue
         path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
         try:
@@ -423,7 +418,6 @@ def photographs_alone(reading: Reading) -> None:
     if SEARCH in reading.document:
         reading.fault(SEARCH, reading.document[SEARCH], "no such section: photographs are given")
     if reading.recorded.files is not None:
-        reading.files.update(reading.recorded.files)
         return
     sizes = {}
     trials = len(reading.values_of(TRIAL) or (0,))

@@ -111,7 +111,7 @@ def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):
         Pipeline.from_text(both, folder=folder)
     assert str(refused.value) == (
         'pipeline: axes.detector = "other:TURNED": expected its setting shift_px to be declared '
-        "as that of mine:TURNED, or another name"
+        "as that of another plug-in, or another name"
     )
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sweep.evaluation import block, inspection
     from sweep.exchange import answers, export, score
     from sweep.execution import forecast, limit_search, progress, runner, status
-    from sweep.experiment import cell_selection, parameters, pipeline, sampling
+    from sweep.experiment import parameters, pipeline, sampling
     from sweep.fitting import folders
     from sweep.integrity import repair, reproduction, verification
     from sweep.photographs import folder, prepare, twins

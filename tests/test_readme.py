@@ -8,9 +8,8 @@ import pytest
 
 from sweep.cli import main
 from sweep.evaluation.inspection import inspect_scene
-from sweep.experiment.cell_selection import cell
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 
 TOP = Path(__file__).parent.parent
 README = (TOP / "README.md").read_text()

@@ -295,10 +295,10 @@ def show(
     """
     read = read_pipeline(pipeline, settings)
     check_png(output)
-    single = library.cell_selection.cell(read, ",".join(at))
+    single = library.pipeline.cell(read, ",".join(at))
     scene = library.inspection.inspect_scene(single, whole_frame=full)
     write_png(output, scene.image if plain else library.scenes.draw_scene(
-        scene, library.cell_selection.coordinates_text(read, single)))
+        scene, library.pipeline.coordinates_text(read, single)))
     return findings(
         [f"{output}: {scene.detection.name}, {scene.estimate.name}"],
         {"output": output, "detection": scene.detection, "estimate": scene.estimate,
@@ -386,7 +386,7 @@ def _written_image(again: Reproduction, output: str, *, plain: bool) -> str:
     if again.inspection is not None and not plain:
         image = library.scenes.draw_scene(
             again.inspection,
-            library.cell_selection.coordinates_text(again.pipeline, again.cell_pipeline))
+            library.pipeline.coordinates_text(again.pipeline, again.cell_pipeline))
     write_png(output, image)
     return f"{output}: image of the cell"
 

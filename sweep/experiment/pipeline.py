@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 
-from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL
+from sweep.declaration import Declaration, Declared
+from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL, Axis
 from sweep.experiment.document import (
     HEADER,
     REQUIRE,
@@ -54,7 +56,7 @@ from sweep.experiment.sampling import (
     read_required,
     read_search,
 )
-from sweep.messages import MAX_FAULTS, nearest, plain, refusal
+from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 from sweep.model.board_kinds import used_by
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -106,8 +108,6 @@ def parse_settings(
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"{start}unknown parameter{hint}")
-        elif is_zip(value) and section in ("", "axes"):
-            chosen[name] = value
         elif home and section not in ("", home, "axes"):
             faults.append(f"{start}expected {name} or {home}.{name}")
         else:
@@ -397,30 +397,6 @@ class Pipeline(Grid):
         """
         return self.text
 
-    def fixed_at(self, chosen: Mapping[str, Any], source: str = "--at") -> Pipeline:
-        """Return the pipeline with parameters fixed at chosen values, checked as a file is.
-
-        The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen,
-        and what they replace, such as ``side_px`` for ``distance_m``.
-
-        Raises
-        ------
-        PipelineError
-            One line for each fault, beginning with ``source``.
-        """
-        document = _document(self.text, source)
-        for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
-            document.pop(section, None)
-        axes = document.get("axes", {})
-        for name in [name for name, value in axes.items() if name == TRIAL or is_zip(value)]:
-            del axes[name]
-        apply_settings(document, {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in chosen.items()
-        }, self.parameters)
-        recorded = Recorded(cameras=self.files, plugins=self.plugins)
-        reading = read_keys(document, source, self.folder, recorded)
-        return _checked(reading, document_text(document), self.name)
 
 
 def _similar(path: Path) -> str:
@@ -485,3 +461,139 @@ def _checked(
         "folder": str(Path(reading.folder).resolve()),
     }, name=name, title=reading.title, text=text, stopping=stopping, source=reading.source,
         **required)
+
+
+# --------------------------------------------------------------------------------------------------
+# A cell of a grid, selected by its coordinates: ``distance_m=0.3,tilt_deg=45``.
+
+_PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
+"""A part between commas; commas within a list or within quotes do not separate."""
+
+_TRIAL = Declared(TRIAL, (int,), 0, Declaration("number of the draw", low=0, high=1e18))
+
+
+def cell(pipeline: Pipeline, at: str) -> Pipeline:
+    """Return the pipeline with every axis but ``trial`` fixed, and a single trial.
+
+    It is checked as a file is. What nothing chooses stays, but for what chosen values replace, such
+    as ``side_px`` for ``distance_m``.
+
+    Parameters
+    ----------
+    pipeline
+        The grid.
+    at
+        Coordinates as ``--at`` takes them; axes without one take their first value. Any value
+        that a parameter admits is accepted, on the grid or not.
+
+    Raises
+    ------
+    PipelineError
+        One line for each invalid part of ``at``.
+    """
+    named = parse_selection(at, pipeline)
+    chosen: dict[str, Any] = {}
+    for axis in pipeline.axes:
+        # Values that are not on the grid replace those of its first cell.
+        index = axis.index_of(named) if axis.columns.keys() & named.keys() else 0
+        chosen |= axis.at(index or 0)
+    chosen |= named
+    trial = chosen.pop(TRIAL, 0)
+    for other in displaced_by(named):
+        chosen.pop(other, None)
+    document = _document(pipeline.text, "--at")
+    for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
+        document.pop(section, None)
+    axes = document.get("axes", {})
+    for name in [name for name, value in axes.items() if name == TRIAL or is_zip(value)]:
+        del axes[name]
+    apply_settings(document, {
+        name: list(value) if isinstance(value, tuple) else value for name, value in chosen.items()
+    }, pipeline.parameters)
+    recorded = Recorded(cameras=pipeline.files, plugins=pipeline.plugins)
+    reading = read_keys(document, "--at", pipeline.folder, recorded)
+    single = _checked(reading, document_text(document), pipeline.name)
+    return replace(single, axes=(Axis(TRIAL, {TRIAL: range(trial, trial + 1)}),))
+
+
+def parse_selection(at: str, pipeline: Pipeline) -> dict[str, Any]:
+    """Return the values of the parameters that ``--at`` names.
+
+    An axis of the pipeline along which parameters go together is named by one of its labels, in
+    quotes, or by a number from 0.
+
+    Raises
+    ------
+    PipelineError
+        One line for each invalid part of ``at``.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1}})
+    >>> parse_selection("distance_m=0.3,solver=ippe", pipeline)
+    {'distance_m': 0.3, 'solver': 'ippe'}
+    """
+    faults: list[str] = []
+    named: dict[str, Any] = {}
+    declared: dict[str, Declared] = {**pipeline.parameters, TRIAL: _TRIAL}
+    together = {axis.name: axis for axis in pipeline.axes if axis.zipped}
+    for part in map(str, _PART.findall(at)):
+        name, equals, written = (piece.strip() for piece in part.partition("="))
+        try:
+            if not equals or not written:
+                raise ValueError("name=value, such as tilt_deg=45")
+            try:
+                value = read_value(written)
+            except ValueError:
+                value = written
+            if name in together:
+                row = together[name].at(_row(together[name], value))
+            elif name in declared:
+                row = {name: declared[name].check(value)}
+            else:
+                known = [*declared, *together]
+                hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
+                faults.append(f"--at {plain(part)}: unknown parameter{hint}")
+                continue
+        except ValueError as error:
+            faults.append(f"--at {plain(part)}: expected {error}")
+            continue
+        faults += [f"--at {plain(part)}: {other} is given twice" for other in row if other in named]
+        named |= row
+    if faults:
+        raise refusal(faults)
+    return named
+
+
+def _row(axis: Axis, value: Any) -> int:
+    """Return the index along an axis that a label or a number names; ValueError for others."""
+    if isinstance(value, str) and value in axis.values:
+        return axis.values.index(value)
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(axis):
+        return value
+    raise ValueError(f'a number from 0 to {len(axis) - 1}, or a label such as "{axis.values[0]}"')
+
+
+def selection_text(coordinates: Mapping[str, Any]) -> str:
+    """Return a cell's coordinates as ``--at`` takes them.
+
+    >>> selection_text({"distance_m": 0.3, "guarded": True, "distortion": (0.1, 0.0)})
+    'distance_m=0.3,guarded=true,distortion=[0.1,0.0]'
+    """
+    return ",".join(f"{name}={_written(value)}" for name, value in coordinates.items())
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return label(value).replace(", ", ",") if isinstance(value, tuple) else label(value)
+
+
+def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:
+    """Return the coordinates of a cell on its grid, in words: "distance_m 0.3, tilt_deg 45"."""
+    parts = []
+    for name in (name for axis in pipeline.axes for name in axis.columns):
+        value = chosen.axes[0].values[0] if name == TRIAL else chosen.fixed[name]
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        parts.append(f"{name} {shown}")
+    return ", ".join(parts)

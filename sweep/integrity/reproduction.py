@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
-from sweep.experiment.cell_selection import cell, parse_selection, selection_text
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell, parse_selection, selection_text
 from sweep.experiment.schema import Variable
 from sweep.integrity.recomputation import StoredValues, compare, current_pipeline, stored_cell
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError

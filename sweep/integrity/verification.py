@@ -16,10 +16,9 @@ from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.waves import InWaves
-from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.integrity.recomputation import (
     StoredValues,
     compare,

@@ -14,7 +14,6 @@ from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes, is_replic
 from sweep.analysis.decisions import CONFIDENCE
 from sweep.analysis.requirements import Cause, Decision, Verdict, described
 from sweep.errors import ArgumentError
-from sweep.experiment.cell_selection import parse_selection
 from sweep.experiment.draws import REPLICATES
 from sweep.messages import label, nearest, quoted
 from sweep.report.table import (
@@ -29,7 +28,7 @@ from sweep.report.table import (
 if TYPE_CHECKING:
     from sweep.analysis.comparisons import Regression
     from sweep.analysis.decisions import Answer
-    from sweep.experiment.pipeline import Pipeline
+    from sweep.experiment.pipeline import Pipeline, parse_selection
     from sweep.tradeoff.choice_search import Choice
 
 WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.experiment.cell_selection import cell, coordinates_text, selection_text
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values

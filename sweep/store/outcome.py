@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.experiment.cell_selection import selection_text
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain
 from sweep.processor import differing_processors

@@ -13,7 +13,7 @@ from support.here import Here
 from sweep import Pipeline, PipelineError
 from sweep.conformance.check import check_plugin
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.cell_selection import cell
+from sweep.experiment.pipeline import cell
 from sweep.isolation.child_process import Child
 from sweep.plugins.loading import load
 

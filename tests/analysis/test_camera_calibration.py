@@ -9,8 +9,7 @@ from sweep.analysis import calibration_summary, camera_calibrations
 from sweep.errors import ArgumentError, DatasetError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.status import close
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.store.lifecycle import open_dataset
 
 PIPELINE = {

@@ -14,8 +14,7 @@ from sweep import cli
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 
 TEXT = """
 title = "Exported"

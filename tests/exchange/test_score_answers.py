@@ -18,8 +18,7 @@ from sweep.evaluation.inspection import inspect_scene
 from sweep.exchange.answers import Conventions
 from sweep.exchange.export import export
 from sweep.exchange.score import prepare
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.lifecycle import open_store
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus
 
 TEXT = """
@@ -72,7 +72,7 @@ def test_each_of_several_kinds_uses_its_own_keys():
 ])
 def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind, kept):
     axis = Pipeline.from_text(OF_BOARDS + AXIS, [])
-    fixed = axis.fixed_at({"kind": kind, "size_m": 0.03})
+    fixed = cell(axis, f"kind={kind},size_m=0.03")
     assert {name for name in fixed.given if axis.parameters[name].section == "board"} == {
         "kind", *kept
     }

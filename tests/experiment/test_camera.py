@@ -12,8 +12,7 @@ from support.here import calls_here
 from support.lengths import first_of
 from sweep.cli import main
 from sweep.execution.runner import execute
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 
 

@@ -11,8 +11,7 @@ import pytest
 from support.stores import by_hand
 from sweep.errors import PipelineError, StoreError
 from sweep.execution.runner import execute
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.store.lifecycle import open_store
 
 MATRIX = [[612.34567890123456, 0, 321.123456789], [0, 611.98765432109876, 1 / 3 + 238],

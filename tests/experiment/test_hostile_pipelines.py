@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH, shown
 
 POSE = "[pose]\ndistance_m = 1\n"

@@ -13,9 +13,8 @@ from support.lengths import first_of, lengths
 from sweep.errors import PipelineError
 from sweep.evaluation.search import visibility_flags
 from sweep.evaluation.variables import GEOMETRY
-from sweep.experiment.cell_selection import cell
 from sweep.experiment.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import module_count
 from sweep.model.scene import build_scenes

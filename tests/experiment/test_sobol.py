@@ -6,7 +6,6 @@ from scipy import stats
 
 import sweep
 from sweep.errors import PipelineError
-from sweep.experiment.cell_selection import cell
 from sweep.experiment.draws import (
     BITS,
     REPLICATES,
@@ -14,6 +13,7 @@ from sweep.experiment.draws import (
     scrambled,
     sobol_uniform,
 )
+from sweep.experiment.pipeline import cell
 from sweep.store.provenance import fingerprint
 
 

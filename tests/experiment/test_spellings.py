@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError, StoreError
-from sweep.experiment.cell_selection import parse_selection
 from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.photographs import read_board
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, parse_selection
 from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS
 from sweep.messages import nearest
@@ -127,7 +126,7 @@ def test_the_canonical_value_is_what_is_kept_and_compared():
         f'[axes]\nsolver = ["SOLVEPNP_IPPE", "Sqpnp"]\n{rest}\ndictionary = "dict_5x5_50"')
     assert other.axes == plain.axes
     assert dict(other.fixed) == dict(plain.fixed)
-    assert parse_selection("solver=SOLVEPNP_IPPE") == {"solver": "ippe"}
+    assert parse_selection("solver=SOLVEPNP_IPPE", plain) == {"solver": "ippe"}
     with pytest.raises(PipelineError, match="each value once"):
         Pipeline.from_text('[axes]\nsolver = ["ippe", "SOLVEPNP_IPPE"]')
     set_so = Pipeline.from_text(

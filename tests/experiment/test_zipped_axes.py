@@ -6,9 +6,8 @@ import pytest
 import sweep
 from sweep.errors import PipelineError
 from sweep.experiment.axes import combinations
-from sweep.experiment.cell_selection import cell, parse_selection, selection_text
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import parse_settings
+from sweep.experiment.pipeline import cell, parse_selection, parse_settings, selection_text
 
 POSE = {"pose": {"distance_m": 0.5}}
 

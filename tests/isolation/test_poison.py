@@ -11,9 +11,9 @@ import xarray as xr
 from support.commands import command, complaints
 from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
-from sweep.experiment.cell_selection import cell as cell_at
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import cell as cell_at
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store

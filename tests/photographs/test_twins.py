@@ -9,10 +9,9 @@ from support.board_photographs import POSES, SIZE, VIEW, board, write_set
 from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.cell_selection import cell
 from sweep.experiment.grid import Block
 from sweep.experiment.photographs import read_record
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus
 from sweep.photographs.prepare import prepare
 from sweep.photographs.twins import read_scene, twin_pipeline

@@ -7,8 +7,7 @@ import pytest
 
 from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.isolation.crash_isolation import use
 from sweep.measure.flags import DetectionStatus
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sweep.evaluation.inspection import inspect_scene
-from sweep.experiment.cell_selection import cell
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.report import scenes as scene_drawing
 from sweep.report.scenes import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
 

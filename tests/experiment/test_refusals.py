@@ -163,48 +163,49 @@ BROKEN = [
 ]
 
 # Sections of a document, and what each of its lines must hold.
-CAMERAS = [
-    ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
-    ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
-     ["vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"]),
-    ({"hfov_deg": 60, "fy_px": 500}, ["hfov_deg = 60: expected fy_px or hfov_deg, not both"]),
-    ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
-     ["pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"]),
-    ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
-    ({"pixel_size_um": 0.003, "focal_length_mm": 4},
-     ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
-    *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])
-      for bad in (180, 360, 0, -60)),
-    ({"fov_deg": 60}, ["camera.fov_deg: unknown key; did you mean"]),
-]
-POSES = [
-    ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
-      ("pose.camera_x_m = 3: expected distance_m, roll_deg or camera_x_m, marker_z_m, not both; "
-       "delete one of them")),
-     ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
-     ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
-      "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
-     ({"camera_x_m": "left"},
-      'pose.camera_x_m = "left": expected a number from -1e+12 to 1e+12')]
-ZIPPED = [
-    ({"fx_px": [600, 800], "fy_px": [600]}, ["axes.lens", "fx_px has 2", "fy_px has 1"]),
-    ({"fx_px": [600, 800]}, ["axes.lens", "at least two parameters"]),
-    ({}, ["axes.lens", "at least two parameters"]),
-    ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]}, ["axes.lens", "of one stage"]),
-    ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]}, ["axes.lens", "600, 600 is repeated"]),
-    ({"fx_px": [600, 800], "fy": [600, 800]}, ["axes.lens.fy: ", "did you mean fy_px?"]),
-    ({"fx_px": [600, 800], "trial": 2}, ["axes.lens.trial = 2", "an axis of its own"]),
-    ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}}, ["axes.lens.fy_px", "[camera]"]),
-    ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
-     ["axes.lens.fy_px", "a name of your own"]),
-    ({"fx_px": [600, -1], "fy_px": [600, 800]}, ["axes.lens.fx_px", "(not -1)"]),
-    ({"fx_px": 600, "fy_px": [700]}, ["axes.lens.fx_px = 600", "expected a list"]),
-    ({"distance_m": [1, 2], "tilt_deg": [1, 2]}, ["axes.lens.distance_m", "pose.distance_m"]),
-    ({"side_px": [10, 20], "tilt_deg": [1, 2]}, ["side_px", "distance_m or side_px, not both"]),
-    ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},
-     ["marker_id", "IDs from 0 to 49"]),
-    ({"adaptiveThreshWinSizeMin": [3, 9], "adaptiveThreshWinSizeMax": [23, 5]},
-     ["adaptiveThreshWinSizeMax", "at least adaptiveThreshWinSizeMin"]),
+SECTIONS = [
+    *(({"camera": camera, "pose": {"distance_m": 1.0}}, lines) for camera, *lines in (
+        ({"hfov_deg": 60, "vfov_deg": 40}, "vfov_deg = 40: expected hfov_deg or vfov_deg, not"),
+        ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
+         "vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"),
+        ({"hfov_deg": 60, "fy_px": 500}, "hfov_deg = 60: expected fy_px or hfov_deg, not both"),
+        ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
+         "pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"),
+        ({"pixel_size_um": 3}, "pixel_size_um = 3: expected focal_length_mm beside it"),
+        ({"pixel_size_um": 0.003, "focal_length_mm": 4},
+         "camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"),
+        *(({"hfov_deg": bad}, f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9")
+          for bad in (180, 360, 0, -60)),
+        ({"fov_deg": 60}, "camera.fov_deg: unknown key; did you mean"),
+    )),
+    *(({"pose": pose}, [line]) for pose, line in (
+        ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
+         "camera_x_m = 3: expected distance_m, roll_deg or camera_x_m, marker_z_m, not both"),
+        ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
+        ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
+         "frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
+        ({"camera_x_m": "left"}, 'camera_x_m = "left": expected a number from -1e+12 to 1e+12'),
+    )),
+    *(({"pose": {"distance_m": 0.5}, "axes": {"lens": {"zip": zipped}}}, [line])
+      for zipped, line in (
+        ({"fx_px": [600, 800], "fy_px": [600]}, "lens: .* fx_px has 2, fy_px has 1"),
+        ({"fx_px": [600, 800]}, "axes.lens = .* at least two parameters"),
+        ({}, "axes.lens = .* at least two parameters"),
+        ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]}, "axes.lens: .* of one stage"),
+        ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]}, "lens: .* 600, 600 is repeated"),
+        ({"fx_px": [600, 800], "fy": [600, 800]}, "axes.lens.fy: .* did you mean fy_px?"),
+        ({"fx_px": [600, 800], "trial": 2}, "axes.lens.trial = 2: .* an axis of its own"),
+        ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}}, "axes.lens.fy_px = .* [camera]"),
+        ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
+         "axes.lens.fy_px = .* a name of your own"),
+        ({"fx_px": [600, -1], "fy_px": [600, 800]}, "axes.lens.fx_px = .* (not -1)"),
+        ({"fx_px": 600, "fy_px": [700]}, "axes.lens.fx_px = 600: expected a list"),
+        ({"distance_m": [1, 2], "tilt_deg": [1, 2]}, "axes.lens.distance_m = .* pose.distance_m"),
+        ({"side_px": [10, 20], "tilt_deg": [1, 2]}, "side_px = .* distance_m or side_px, not both"),
+        ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},
+         "marker_id = 50: expected IDs from 0 to 49"),
+        ({"adaptiveThreshWinSizeMin": [3, 9], "adaptiveThreshWinSizeMax": [23, 5]},
+         "adaptiveThreshWinSizeMax = 5: expected at least adaptiveThreshWinSizeMin"))),
 ]
 NAMES = [
     *(({name: TOGETHER}, f"axes.{name}: expected another name: the dataset")
@@ -216,35 +217,21 @@ NAMES = [
     ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
     ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
 ]
+BROKEN += [({"pose": {"distance_m": 0.5}, "axes": axes}, message) for axes, message in NAMES]
 
 
 @pytest.mark.parametrize(("given", "message"), BROKEN, ids=[message for _, message in BROKEN])
-def test_a_broken_text_is_told_with_key_value_and_expectation(given, message):
+def test_a_broken_document_is_told_with_key_value_and_expectation(given, message):
     lines = refusal(*(given if isinstance(given, tuple) else (given,)))
     assert any(message in line for line in lines), lines
 
 
-@pytest.mark.parametrize(("camera", "lines"), CAMERAS)
-def test_a_camera_that_cannot_be_is_refused_in_a_line_for_each(camera, lines):
-    told = refusal({"camera": camera, "pose": {"distance_m": 1.0}})
+@pytest.mark.parametrize(("sections", "lines"), SECTIONS, ids=[lines[0] for _, lines in SECTIONS])
+def test_each_fault_is_one_line(sections, lines):
+    told = refusal(sections)
     assert len(told) == len(lines)
-    assert all(expected in line for expected, line in zip(lines, told, strict=True)), told
-
-
-@pytest.mark.parametrize(("pose", "line"), POSES)
-def test_contradictions_of_a_pose_are_refused_in_a_line_that_says_what_to_delete(pose, line):
-    assert refusal({"pose": pose}) == [line]
-
-
-@pytest.mark.parametrize(("given", "named"), ZIPPED)
-def test_what_cannot_go_together_is_one_line(given, named):
-    (line,) = refusal({"pose": {"distance_m": 0.5}, "axes": {"lens": {"zip": given}}})
-    assert all(each in line for each in named), line
-
-
-@pytest.mark.parametrize(("axes", "named"), NAMES)
-def test_names_are_identifiers_of_their_own_and_a_member_is_given_once(axes, named):
-    assert any(named in line for line in refusal({"pose": {"distance_m": 0.5}, "axes": axes}))
+    for expected, line in zip(lines, told, strict=True):
+        assert all(part in line for part in expected.split(" .* ")), told
 
 
 @pytest.mark.parametrize("command", ["run", "plan"])

@@ -106,20 +106,10 @@ def test_of_a_misspelled_file_the_nearest_in_its_folder_is_named(
         open_store("smok.zarr")
 
 
-@pytest.mark.parametrize(
-    ("name", "written", "value"),
-    [
-        ("renderer", "Exact", "exact"), ("renderer", "Supersample-4-Jittered",
-                                         "supersample-4-jittered"),
-        ("window", "FULL", "full"), ("bound", "Known_Blur", "known_blur"),
-        ("solver", "Photometric", "photometric"),
-    ],
-)
-def test_every_choice_is_understood_in_any_case(name, written, value):
-    assert PARAMETERS[name].check(written) == value
-
-
 def test_the_canonical_value_is_what_is_kept_and_compared():
+    for name, written in (("renderer", "Exact"), ("renderer", "Supersample-4-Jittered"),
+                          ("window", "FULL"), ("bound", "Known_Blur"), ("solver", "Photometric")):
+        assert PARAMETERS[name].check(written) == written.lower()
     rest = "[pose]\nside_px = 40\n[marker]\nsize_m = 0.1"
     plain = Pipeline.from_text(f'[axes]\nsolver = ["ippe", "sqpnp"]\n{rest}')
     other = Pipeline.from_text(

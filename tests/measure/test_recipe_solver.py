@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.support.recipes import added, printed_by
 
@@ -75,6 +76,7 @@ print(json.dumps({
 '''
 
 
+@pytest.mark.system
 def test_solver_is_one_class_and_one_record(tmp_path):
     file = "measure/estimators.py"
     folder = added(

@@ -27,7 +27,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.polygon import side_lengths
-from sweep.plugins.recording import OF_TARGET, REJECTED, SUFFIX, Recording
+from sweep.plugins.recording import OF_TARGET, RECORDINGS, REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers
 
@@ -214,7 +214,8 @@ def prepare(
             for line in hints(images.pipeline, answers, images.numbers, images.origins,
                               conventions or Conventions())
         ]
-        recordings.append((home / f"{label}{SUFFIX}", _recording(answers, images).content()))
+        content = RECORDINGS.content(_recording(answers, images))
+        recordings.append((home / f"{label}{SUFFIX}", content))
     written = tuple(path for path, _ in recordings if not path.exists())
     detectors = [f"{label}{SUFFIX}" for label in labels]
     solver = "recorded" if poses and not beside else ""

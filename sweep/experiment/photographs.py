@@ -28,7 +28,7 @@ from sweep.model.board_kinds import KINDS
 from sweep.model.image_file import Part, reference
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
-from sweep.plugins.array_file import array_file, read_arrays
+from sweep.plugins.array_file import ArrayFile
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -98,12 +98,7 @@ def board_of(document: Mapping[str, Any], source: str) -> Board:
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""
 
-VERSION = 2
-
 POSE = 6
-
-_ARRAYS = ("paths", "digests", "part", "marker_id", "rotation", "translation", "std",
-           "source", "board")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,58 +157,33 @@ class PhotographRecord:
         numbers = {each: number for number, each in enumerate(board.marker_ids)}
         return [BoardMarker(board, numbers[each]) for each in marker_id.tolist()]
 
-    def content(self) -> bytes:
-        """Return the content of its file: the same bytes for the same record."""
-        size = np.array([self.width_px, self.height_px])
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        return array_file({"version": VERSION, **arrays, "size": size})
+    @property
+    def size(self) -> Integers:
+        """Width and height in px, (2,)."""
+        return np.array([self.width_px, self.height_px])
 
 
-def read_record(path: str | Path) -> tuple[PhotographRecord, str]:
-    """Return a record and the SHA-256 of its file, which is read once in each process.
-
-    Raises
-    ------
-    PluginError
-        If it cannot be read, or is none; in words that follow "expected".
-    """
-    try:
-        state = Path(path).stat()
-        return _read(str(path), state.st_mtime_ns, state.st_size)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise PluginError(
-            f"a record of photographs that `sweep photos` writes ({plain(reason)})"
-        ) from None
-
-
-@lru_cache(maxsize=8)
-def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str]:  # noqa: ARG001
-    arrays, digest = read_arrays(path)
-    try:
-        if int(arrays["version"]) != VERSION:
-            raise ValueError("of another version")
-        record = PhotographRecord(
-            tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
-            Part(str(arrays["part"])), int(arrays["size"][0]), int(arrays["size"][1]),
-            arrays["marker_id"], arrays["rotation"], arrays["translation"], arrays["std"],
-            arrays["source"], str(arrays["board"]),
-        )
-    except (KeyError, IndexError, TypeError, AttributeError):
-        raise ValueError("it is none") from None
-    grid = (len(record.paths), len(record.marker_id))
-    shapes = {
-        "digests": (grid[0],), "rotation": (*grid, 3, 3), "translation": (*grid, 3),
-        "std": (*grid, POSE), "source": grid,
-    }
-    for name, shape in shapes.items():
-        if np.shape(arrays[name]) != shape:
-            raise ValueError(f"damaged: {name}")
+def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
+    width_px, height_px = arrays["size"].tolist()
+    record = PhotographRecord(
+        tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
+        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"], arrays["rotation"],
+        arrays["translation"], arrays["std"], arrays["source"], str(arrays["board"]),
+    )
     try:
         record.on_board(record.marker_id)
     except (SweepError, AttributeError, KeyError, TypeError, ValueError):
         raise ValueError("damaged: board") from None
-    return record, digest
+    return record
+
+
+PHOTOGRAPH_RECORDS = ArrayFile("a record of photographs that `sweep photos` writes", 2, {
+    "paths": ("U", ("P",)), "digests": ("U", ("P",)), "part": ("U", ()),
+    "marker_id": ("i8", ("M",)), "rotation": ("f8", ("P", "M", 3, 3)),
+    "translation": ("f8", ("P", "M", 3)), "std": ("f8", ("P", "M", POSE)),
+    "source": ("u1", ("P", "M")), "board": ("U", ()), "size": ("i8", (2,)),
+}, _made)
+"""Files of records."""
 
 
 BESIDE_MODULES = 4.0
@@ -273,7 +243,7 @@ def recorded_poses(
     for name in dict.fromkeys(names):
         rows = np.flatnonzero([each == name for each in names])
         home = Path(folder) / name
-        record, _ = read_record(home)
+        record, _ = PHOTOGRAPH_RECORDS.read(home)
         known = record.index_of(marker_id[rows])
         numbers = trials[rows] % len(record.paths) if simulated else trials[rows]
         if (known < 0).any() or (numbers >= len(record.paths)).any():

@@ -30,7 +30,7 @@ from sweep.experiment.parameters import (
     WORLD,
     Stage,
 )
-from sweep.experiment.photographs import read_record
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV, DetectorSetting
 from sweep.measure.estimators import SOLVERS
@@ -424,7 +424,7 @@ def photographs_alone(reading: Reading) -> None:
     for name in dict.fromkeys(reading.values_of(PHOTOGRAPHS)):
         path = Path(reading.folder) / name
         try:
-            record, reading.files[name] = read_record(path)
+            record, reading.files[name] = PHOTOGRAPH_RECORDS.read(path)
         except PluginError as error:
             reading.refuse_value(PHOTOGRAPHS, name, str(error))
             continue

@@ -21,7 +21,7 @@ from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import SUFFIX, PhotographRecord, read_board, read_record
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord, read_board
 from sweep.experiment.pipeline import Pipeline
 from sweep.fitting.fit import MARKERS, Say, SceneFit, Term, fit_scene, scene_views, shortened
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_scenes
@@ -149,7 +149,7 @@ def held_out(
            for name in ("rotation", "translation", "std", "source")},
     )
     name = "held-out"
-    write_whole(folder / f"{name}{SUFFIX}", chosen.content())
+    write_whole(folder / f"{name}{SUFFIX}", PHOTOGRAPH_RECORDS.content(chosen))
     document = read_document(pipeline.to_toml())
     axes = document["axes"]
     document["scene"][PHOTOGRAPHS] = f"{name}{SUFFIX}"
@@ -335,7 +335,7 @@ def fit_folder(
         )
         pipeline = prepared.pipeline
         name = name_of(Path(folders[0]))
-        record, _ = read_record(home / pipeline.values_of(PHOTOGRAPHS)[0])
+        record, _ = PHOTOGRAPH_RECORDS.read(home / pipeline.values_of(PHOTOGRAPHS)[0])
         taken = photograph_scenes(pipeline)
         views, lines = scene_views(taken, target, markers)
         found, gap = fit_scene(views, taken, target, say=say), None

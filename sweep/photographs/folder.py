@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange.images import write_errors
-from sweep.experiment.photographs import SUFFIX, PhotographRecord
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, FindFunction, make_detector
 from sweep.messages import nearest_file, plain
@@ -387,7 +387,7 @@ def write_record(
         f"{name}-{side}{SUFFIX}" for side in ("left", "right")
     ]
     contents = [
-        _content(folder, part, markers, poses, home).content()
+        PHOTOGRAPH_RECORDS.content(_content(folder, part, markers, poses, home))
         for folder, part, poses in zip(found, parts, truth, strict=True)
     ]
     with write_errors(home):

@@ -7,18 +7,17 @@ exported.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import PluginError
-from sweep.messages import plain
 from sweep.plugins import Plugin
-from sweep.plugins.array_file import array_file, read_arrays
+from sweep.plugins.array_file import ArrayFile
 from sweep.typing import Floats
 
 SUFFIX = ".npz"
@@ -28,15 +27,6 @@ REJECTED = -1
 
 OF_TARGET = -2
 """The ID of a pose that is of the target as a whole, not of one of its markers."""
-
-VERSION = 1
-
-_ARRAYS = {
-    "exported": (np.uint64, ()), "image": (np.uint64, ()), "marker_id": (np.int64, ()),
-    "corners": (np.float64, (4, 2)), "rotation": (np.float64, (3, 3)),
-    "translation": (np.float64, (3,)),
-}
-"""Arrays of a recording: type, and shape of each row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +71,20 @@ class Recording:
         first = int(np.searchsorted(self.image, key, "left"))
         return slice(first, int(np.searchsorted(self.image, key, "right")))
 
-    def content(self) -> bytes:
-        """Return the content of its file: the same bytes for the same detections."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        return array_file({"version": np.int64(VERSION), **arrays})
+
+def _made(arrays: Mapping[str, NDArray[Any]]) -> Recording:
+    for name in ("exported", "image"):
+        if (arrays[name][1:] < arrays[name][:-1]).any():
+            raise ValueError(f"damaged: {name}")
+    return Recording(**{name: arrays[name] for name in RECORDINGS.arrays})
+
+
+RECORDINGS = ArrayFile("detections that `sweep score` recorded", 1, {
+    "exported": ("u8", ("E",)), "image": ("u8", ("M",)), "marker_id": ("i8", ("M",)),
+    "corners": ("f8", ("M", 4, 2)), "rotation": ("f8", ("M", 3, 3)),
+    "translation": ("f8", ("M", 3)),
+}, _made)
+"""Files of recordings."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,34 +124,7 @@ def recorded_detector(name: str, folder: str) -> RecordedDetector:
     PluginError
         If it cannot be read, or is none; in words that follow "expected".
     """
-    path = Path(folder) / name
-    try:
-        state = path.stat()
-        return _read(str(path), state.st_mtime_ns, state.st_size)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise PluginError(
-            f"the file {plain(name)} in {plain(folder)} that `sweep score` made ({plain(reason)})"
-        ) from None
-
-
-@lru_cache(maxsize=8)
-def _read(path: str, modified_ns: int, size: int) -> RecordedDetector:  # noqa: ARG001  (the key)
-    """Return a file's detector; OSError or ValueError if there is none."""
-    read, digest = read_arrays(path)
-    if not read.keys() >= {"version", *_ARRAYS}:
-        raise ValueError("it is none")
-    if read["version"].size != 1 or int(read["version"]) != VERSION:
-        raise ValueError("of another version")
-    arrays = {name: read[name] for name in _ARRAYS}
-    for name, (kind, shape) in _ARRAYS.items():
-        values = arrays[name]
-        rows = len(arrays["exported" if name == "exported" else "image"])
-        if values.dtype != kind or values.shape != (rows, *shape):
-            raise ValueError(f"damaged: {name}")
-        if not shape and kind is np.uint64 and (values[1:] < values[:-1]).any():
-            raise ValueError(f"damaged: {name}")
+    recording, digest = RECORDINGS.read(Path(folder) / name)
     return RecordedDetector(
-        meaning="detections that another program made", recording=Recording(**arrays),
-        digest=digest,
+        meaning="detections that another program made", recording=recording, digest=digest,
     )

@@ -18,7 +18,7 @@ from support.board_photographs import (
     write_set,
 )
 from sweep.errors import ArgumentError, PipelineError
-from sweep.experiment.photographs import read_record
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.measure.flags import TruthSource
 from sweep.photographs.prepare import prepare
 
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
 
 
 def record_of(prepared, name=None):
-    return read_record(f"{prepared.pipeline.folder}/{name or prepared.pipeline.name}"
+    return PHOTOGRAPH_RECORDS.read(f"{prepared.pipeline.folder}/{name or prepared.pipeline.name}"
                        ".photographs.npz")[0]
 
 

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 import sweep
 from support.board_photographs import POSES, board, marker_poses, write_set
 from sweep.errors import PluginError
-from sweep.experiment.photographs import read_record
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.measure.flags import EstimateStatus
 
 ALARM = 1e-7
@@ -65,13 +65,13 @@ def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
 def test_the_board_is_in_the_record(made, tmp_path):
     folder, _ = made
     path = folder / "shots.photographs.npz"
-    record, _ = read_record(path)
+    record, _ = PHOTOGRAPH_RECORDS.read(path)
     ids = np.array([9, 0])
     on_board = record.on_board(ids)
     assert [each.board.marker_ids[each.number] for each in on_board] == [9, 0]
     np.testing.assert_array_equal(on_board[0].board.corners_m, board().corners_m)
     other = tmp_path / "other.photographs.npz"
     for damaged in ("[]", "{}", "no JSON", record.board.replace("5", "2")):
-        other.write_bytes(dataclasses.replace(record, board=damaged).content())
+        other.write_bytes(PHOTOGRAPH_RECORDS.content(dataclasses.replace(record, board=damaged)))
         with pytest.raises(PluginError, match="damaged: board"):
-            read_record(other)
+            PHOTOGRAPH_RECORDS.read(other)

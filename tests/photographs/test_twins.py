@@ -10,7 +10,7 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import scene_image
 from sweep.experiment.grid import Block
-from sweep.experiment.photographs import read_record
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus
 from sweep.photographs.prepare import prepare
@@ -39,7 +39,7 @@ def all_indices(pipeline):
 
 
 def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
-    record, _ = read_record(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record, _ = PHOTOGRAPH_RECORDS.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
     twins = twin_pipeline(prepared, SCENE, repeats=2)
     columns = run_cells(twins, all_indices(twins)).columns
     shown = record.shown
@@ -76,7 +76,7 @@ def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared)
 def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_id):
     scene = {"black": 35, "white": 210, "background": 120, "blur_px": 0.6}
     twin = cell(twin_pipeline(prepared, scene), f"trial=0,marker_id={marker_id}")
-    record, _ = read_record(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record, _ = PHOTOGRAPH_RECORDS.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
     turn = record.rotation[0, marker_id]
     corners = board().corners_m[marker_id]
     # The whole board at a pose that has the marker where the twin has it.

@@ -383,13 +383,7 @@ _TO_BEARINGS = Step(CENTRE, ("distance_m", *BEARINGS), BEARINGS, _bearings)
 # numbers rounded to 12 significant digits. Whether a value is fixed or an axis, in which order
 # and on which grid, does not matter; nor do renderer, window, levels, detector or estimator.
 
-_DEFAULT_VIEW = dict(
-    zip(
-        ("fx_px", "fy_px"),
-        intrinsics(*(PARAMETERS[name].default for name in VIEW_PARAMETERS))[:2],
-        strict=True,
-    )
-)
+_DEFAULT_FOCAL_PX = intrinsics(*(PARAMETERS[name].default for name in VIEW_PARAMETERS))[:2]
 _PLAIN = (
     "width_px", "height_px",
     *(p.name for p in PARAMETERS.values()
@@ -426,8 +420,8 @@ def geometry_keys(
     values = canonical_pose(values, distributions)
     fx, fy, cx, cy = map(Column.of, intrinsics(*(values[name].values for name in VIEW_PARAMETERS)))
     columns = {
-        "fx_px": key_texts("fx_px", fx, _DEFAULT_VIEW["fx_px"]),
-        "fy_px": key_texts("fy_px", fy, _DEFAULT_VIEW["fy_px"]),
+        "fx_px": key_texts("fx_px", fx, _DEFAULT_FOCAL_PX[0]),
+        "fy_px": key_texts("fy_px", fy, _DEFAULT_FOCAL_PX[1]),
         "distortion": key_texts("distortion", values["distortion"].map(canonical_distortion), ()),
     }
     for name, centre, length in (("cx_px", cx, "width_px"), ("cy_px", cy, "height_px")):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -25,7 +25,7 @@ from sweep.experiment.draws import (
     uniform,
 )
 from sweep.experiment.grid import Block, Grid
-from sweep.experiment.parameters import PARAMETERS, Stage
+from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.bound import BoundSetting
@@ -256,25 +256,24 @@ class Experiment:
             effect.switch in drawn or values[effect.switch].differs_from(effect.off)
             for effect in self.effects if effect.random
         )
-        poses = {} if values["photographs"].missing else self._photographed(values, trials)
+        poses = {} if values[PHOTOGRAPHS].missing else recorded_poses(
+            values, trials, grid.folder, simulated=grid.is_simulated)
         if grid.shows_photographs:
             return values | poses
-        calibration = grid.calibration
-        if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
-            resolve_pose(values)
-            return values | poses
-        keys = geometry_keys(values, drawn, count)
+        given = dict(values)
+        keys = cache(partial(geometry_keys, given, drawn, count))
+        # What is drawn for a photograph is the same for all its markers; their noise is not.
+        shared = cache(partial(geometry_keys, given | ANY_MARKER, drawn, count)) if poses else keys
         # Quantities that are drawn together: the jitter comes after the distributions, so that
         # whether there is any changes nothing for them.
+        calibration = grid.calibration
         calibrated = () if calibration is None else calibration.names
         together = [*sorted(drawn), *SHIFTS, *(CALIBRATED + name for name in calibrated)]
 
-        def draw(quantity: str, keys: NDArray[np.uint64] = keys) -> Floats:
+        def draw(quantity: str, keys: Callable[[], NDArray[np.uint64]] = keys) -> Floats:
             dimension = together.index(quantity) if grid.sampling == "sobol" else None
-            return uniform(grid.seed, quantity, keys, trials, dimension)
+            return uniform(grid.seed, quantity, keys(), trials, dimension)
 
-        # What is drawn for a photograph is the same for all its markers; their noise is not.
-        shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
         for name, distribution in drawn.items():
             values[name] = Column.of(distribution.at(draw(name, shared)))
         if (jitter > 0).any():
@@ -283,20 +282,9 @@ class Experiment:
         if calibration is not None:
             values |= calibrated_columns(calibration, values, count, draw)
         if noisy:
-            values["noise_key"] = Column.of(bits(grid.seed, "noise", keys, trials))
+            values["noise_key"] = Column.of(bits(grid.seed, "noise", keys(), trials))
         resolve_pose(values)
         return values | poses
-
-    def _photographed(
-        self, values: Mapping[str, Column], trials: NDArray[np.int64]
-    ) -> dict[str, Column]:
-        """Return the parameters of scenes at the poses of photographs ``trials`` (N,)."""
-        names = values["photographs"].listed(len(trials))
-        ids = values["marker_id"].broadcast(len(trials), np.int64)
-        poses = recorded_poses(
-            names, self.grid.folder, trials, ids, simulated=self.grid.is_simulated
-        )
-        return {name: Column.of(column) for name, column in poses.items()}
 
     # A key of each image: a function of its scene's own parameters and draws, not of the grid.
     #

@@ -240,10 +240,7 @@ class Blocks:
     @property
     def counts(self) -> tuple[int, ...]:
         """Blocks along each scene axis."""
-        return tuple(
-            -(-length // extent)
-            for length, extent in zip(self.lengths, self.extents, strict=True)
-        )
+        return tuple(-(-a // b) for a, b in zip(self.lengths, self.extents, strict=True))
 
     def __len__(self) -> int:
         return math.prod(self.counts)
@@ -254,15 +251,13 @@ class Blocks:
     def __getitem__(self, number: int) -> Block:
         """Return a block by its number; the last axis counts fastest."""
         index = np.unravel_index(number, self.counts) if self.counts else ()
-        starts = tuple(int(i) * e for i, e in zip(index, self.extents, strict=True))
-        stops = tuple(
-            min(start + extent, length)
-            for start, extent, length in zip(starts, self.extents, self.lengths, strict=True)
-        )
-        return Block(starts, stops)
+        starts = np.multiply(index, self.extents).astype(np.int64)
+        stops = np.minimum(starts + self.extents, self.lengths)
+        return Block(tuple(starts.tolist()), tuple(map(int, stops)))
 
     def number(self, block: Block) -> int:
         """Return the number of a block."""
-        index = [start // extent
-                 for start, extent in zip(block.starts, self.extents, strict=True)]
-        return int(np.ravel_multi_index(index, self.counts)) if index else 0
+        if not self.counts:
+            return 0
+        index = np.floor_divide(block.starts, self.extents)
+        return int(np.ravel_multi_index(index.tolist(), self.counts))

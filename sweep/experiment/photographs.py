@@ -7,7 +7,7 @@ and the poses are those of the record; with ``simulated`` the images are not the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +25,7 @@ from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbou
 from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
 from sweep.model.board_kinds import KINDS
+from sweep.model.camera import Column
 from sweep.model.image_file import Part, reference
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
@@ -210,9 +211,8 @@ def along_photographs(axes: Iterable[Axis]) -> list[bool]:
 
 
 def recorded_poses(
-    names: Sequence[str], folder: str, trials: NDArray[np.int64], marker_id: NDArray[np.int64],
-    *, simulated: bool = False,
-) -> dict[str, Any]:
+    values: Mapping[str, Column], trials: NDArray[np.int64], folder: str, *, simulated: bool = False
+) -> dict[str, Column]:
     """Return the parameters of N scenes that are photographs, by name.
 
     They are the image, the pose (NaN where a photograph does not show the marker), ``truth`` (N,)
@@ -221,10 +221,12 @@ def recorded_poses(
 
     Parameters
     ----------
-    names, folder
-        The records' files (N,), and where relative paths start.
-    trials, marker_id
-        (N,) each: numbers of the photographs, and the markers.
+    values
+        The records' files and the markers' IDs.
+    trials
+        Numbers of the photographs (N,).
+    folder
+        Where relative paths start.
     simulated
         Whether the images are simulated, each marker by itself: in place of the image there is
         ``neighbourhood``, the marker with its board's other prints around it (None of a single
@@ -236,6 +238,8 @@ def recorded_poses(
         If a record cannot be read, or has no such photograph or marker.
     """
     count = len(trials)
+    names = values[PHOTOGRAPHS].listed(count)
+    marker_id = values["marker_id"].broadcast(count, np.int64)
     images: list[str] = [""] * count
     rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
     std, source = np.full((count, POSE), np.nan), np.zeros(count, dtype=np.uint8)
@@ -260,13 +264,13 @@ def recorded_poses(
         std[rows], source[rows] = record.std[at], record.source[at]
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
-    source_of_images = (
+    columns: dict[str, Any] = (
         {"neighbourhood": [_around(each) for each in on_board]} if simulated
         else {"renderer": PHOTOGRAPH, "background": images}
-    )
-    return source_of_images | {
+    ) | {
         "on_board": on_board,
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
         "truth": source, "truth_std": std,
     }
+    return {name: Column.of(column) for name, column in columns.items()}

@@ -38,7 +38,7 @@ from sweep.experiment.parameters import (
     read_plugins,
     section_of_settings,
 )
-from sweep.messages import MAX_FAULTS, nearest, plain, shown, similar
+from sweep.messages import MAX_FAULTS, plain, shown, similar
 from sweep.model.image_file import read_regular
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -91,13 +91,10 @@ def read_document(text: str) -> dict[str, Any]:
         raise ValueError(f"not TOML: expected keys of at most {MAX_PARTS} parts")
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"not TOML: {plain(error, 300)}") from None
     except RecursionError:
         raise ValueError("not TOML: nested too deeply") from None
-    except ValueError:
-        # Python reads no more than 4300 digits.
-        raise ValueError("not TOML: a number of too many digits") from None
+    except ValueError as error:  # also if a number has more digits than Python reads
+        raise ValueError(f"not TOML: {plain(error, 300)}") from None
 
 
 def read_value(written: str) -> Any:
@@ -311,11 +308,6 @@ class Reading(Grid):
     def refuse_value(self, name: str, value: Any, expected: str) -> None:
         """Note a fault of one of a parameter's values."""
         self.fault(f"{self.parameters[name].section}.{name}", value, expected)
-
-    def unknown(self, key: str, problem: str, word: str, known: Collection[str]) -> None:
-        """Note an unknown key, with the nearest known one if the line will be printed."""
-        hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
-        self.note(plain(key), f"{problem}{hint}")
 
     def unknown_key(
         self, section: str, key: str, known: Collection[str], expected: str = ""

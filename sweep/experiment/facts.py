@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -123,15 +122,15 @@ class Facts:
             indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
             return max(math.prod(lengths), 1), self.experiment.scene_values(indices)
         first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
-        # The last axis of a product varies fastest.
-        order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
-        ends = itertools.product(*(sorted({0, lengths[k] - 1}) for k in order))
-        corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
-        chosen = np.random.default_rng(0)
-        anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
+        order = sorted(range(len(axes)), key=lambda k: first.isdisjoint(axes[k].columns))
+        # The bits of a corner's number say at which end of each axis it is, in that order.
+        corners = np.arange(min(2 ** len(axes), MAX_CORNERS))
+        anywhere = np.random.default_rng(0)
         return MAX_SAMPLE, self.experiment.scene_values([
-            np.concatenate([corners[:, order.index(k)], other]).astype(np.intp)
-            for k, other in enumerate(anywhere)
+            np.concatenate([
+                (corners >> order.index(k) & 1) * (length - 1),
+                anywhere.integers(0, length, MAX_SAMPLE - len(corners)),
+            ]).astype(np.intp) for k, length in enumerate(lengths)
         ])
 
     # The camera.
@@ -179,19 +178,18 @@ class Facts:
     @property
     def camera_line(self) -> str:
         """The camera in one line."""
-        camera, side = self.camera, self.camera["side_px"]
+        camera = self.camera
         focal = f"fx = fy = {_text(camera['fx_px'])} px" if camera["square"] else (
             f"fx = {_text(camera['fx_px'])} px, fy = {_text(camera['fy_px'])} px "
             f"(pixels are not square: fy/fx = {_text(camera['aspect'], 4)})")
-        line = (f"{self._frame}, {focal}, HFOV {_text(camera['hfov_deg'], 4)}°, "
-                f"VFOV {_text(camera['vfov_deg'], 4)}°")
-        if side is None:
-            return line
-        if camera["boards"]:
-            return f"{line}, the markers have sides of {_text(side, 4)} px"
-        far, near = side
-        return f"{line}, the marker's side is " + (f"{far:.4g} px" if far == near else (
-            f"{near:.4g} px at the nearest pose, {far:.4g} px at the farthest"))
+        sides = camera["side_px"] and f", {self._whose} {_text(camera['side_px'], 4)} px"
+        return (f"{self._frame}, {focal}, HFOV {_text(camera['hfov_deg'], 4)}°, "
+                f"VFOV {_text(camera['vfov_deg'], 4)}°{sides or ''}")
+
+    @property
+    def _whose(self) -> str:
+        """Whose sides the camera sees, in words."""
+        return "the markers' sides are" if self.camera["boards"] else "the marker's side is"
 
     @property
     def camera_attributes(self) -> dict[str, Any]:
@@ -262,17 +260,13 @@ class Facts:
     def _side_notes(self) -> Iterator[str]:
         """Yield a line if no marker of the grid is of a size that can be detected."""
         far, near = self.camera["side_px"] or (0.0, math.inf)
-        whose = "the markers' sides are" if self.camera["boards"] else "the marker's side is"
-        units = (
-            "" if "side_px" in self.grid.given
-            else "; are size_m and the distances in metres?" if "size_m" in self.grid.given
-            else f"; size_m is not given: {self.grid.fixed['size_m']:g} m"
-        )
+        units = "" if "side_px" in self.grid.given else (
+            f"; size_m = {_text(self._numbers('size_m'))}: are it and the distances in metres?")
         if near < min(map(module_count, self.grid.values_of("dictionary"))):
-            yield (f"{whose} at most {near:.4g} px, less than a pixel a module: too small to be "
-                   f"read{units}")
+            yield (f"{self._whose} at most {near:.4g} px, less than a pixel a module: too small to "
+                   f"be read{units}")
         elif far > max(self.camera["width_px"][1], self.camera["height_px"][1]):
-            yield f"{whose} at least {far:.4g} px, more than the frame's{units}"
+            yield f"{self._whose} at least {far:.4g} px, more than the frame's{units}"
 
     def _belief_notes(self) -> Iterator[str]:
         given, calibrated = self.grid.given, self.grid.calibration is not None
@@ -315,16 +309,11 @@ class Facts:
         return {name: list(_ends(numbers)) for name, numbers in self.views.items()}
 
     @property
-    def _poses(self) -> int:
-        """The number of scene cells of the grid."""
-        return len(self.experiment.all_scenes)
-
-    @property
     def pose_line(self) -> str:
         """The poses in one line."""
         count, _ = self._sample
         tilt, angle, distance = (_text(numbers, 4) for numbers in self.views.values())
-        sample = "" if count == self._poses else f" ({count:,} poses looked at)"
+        sample = f" ({count:,} poses looked at)" * (count < len(self.experiment.all_scenes))
         return f"tilt {tilt}°, viewing angle {angle}°, {distance} m away{sample}"
 
     @cached_property
@@ -334,7 +323,7 @@ class Facts:
 
     def _share(self, chosen: Masks) -> str:
         """Return the share of the poses that are ``chosen``, in words."""
-        whole = len(chosen) == self._poses
+        whole = len(chosen) >= len(self.experiment.all_scenes)
         if chosen.all():
             return "all poses" if whole else f"all {len(chosen):,} poses looked at"
         return f"{'' if whole else 'about '}{100 * chosen.mean():.2g} % of the poses"
@@ -342,8 +331,8 @@ class Facts:
     def _visibility_notes(self) -> Iterator[str]:
         """Yield a line for each reason for which markers are not wholly seen; the first counts."""
         scenes, target = self._scenes, self.grid.target_word
-        world = not self.grid.given.isdisjoint(WORLD)
-        framed = not self.grid.given.isdisjoint(("frame_x", "frame_y"))
+        within = f"; frame_x and frame_y place a {target} within it" * (
+            self.grid.given.isdisjoint((*WORLD, "frame_x", "frame_y")))
         left = np.ones(len(scenes), dtype=bool)
 
         def outside() -> Masks:
@@ -359,13 +348,9 @@ class Facts:
              f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
             (lambda: not_modelled(scenes),
              "lie where the lens folds, or bend or move out of what is modelled: not_modelled"),
-            (outside,
-             f"are outside the frame{' of the camera' * world}: not_visible"
-             + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
+            (outside, f"are outside the frame: not_visible{within}"),
             (lambda: ((corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)).any((1, 2)),
-             "are cut off by the frame's edge" + (
-                 f"; where the {target} is too large for the frame, frame_x and frame_y put it in "
-                 "the middle" if framed else "")),
+             "are cut off by the frame's edge"),
         )
         for reason, what in reasons:
             chosen = np.asarray(left & reason())

@@ -48,24 +48,24 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     for name, axis in axes.items():
         if axis is not None and values[name] in list(axis.values):
             chosen |= axis.at(list(axis.values).index(values[name]))
-    unused = set()
-    if (detector := chosen.get("detector")) is not None:
-        unused |= _settings_of_others(pipeline, "detector", detector)
-        unused |= set() if detector == OPENCV else {*OPENCV_FIELDS}
-    if (solver := chosen.get("solver")) is not None:
-        unused |= _settings_of_others(pipeline, "estimator", solver)
-        unused |= set() if solver in SOLVERS and SOLVERS[solver].guarded else {"guarded"}
-        unused |= frozenset().union(*PIXEL_SETTINGS.values()) - PIXEL_SETTINGS.get(solver, set())
+    unused: set[str] = set()
+    for name, table in _settings_of(pipeline).items():
+        if name in chosen:
+            unused |= set().union(*table.values()) - table.get(chosen[name], set())
     return {name: value for name, value in values.items()
             if (axis := axes[name]) is None or not unused.issuperset(axis.columns)}
 
 
-def _settings_of_others(pipeline: Grid, kind: str, name: str) -> set[str]:
-    """Return the settings of the plug-ins of a kind that the one of this name does not have."""
-    own = pipeline.plugin(kind, name)
-    every = {each.name for plugin in pipeline.plugins if plugin.kind == kind
-             for each in plugin.settings}
-    return every - {each.name for each in (own.settings if own is not None else ())}
+def _settings_of(pipeline: Grid) -> dict[str, dict[str, set[str]]]:
+    """Return the settings that each detector and each solver has, of those that others lack."""
+    plugged: dict[str, dict[str, set[str]]] = {"detector": {}, "estimator": {}}
+    for plugin in pipeline.plugins:
+        plugged.setdefault(plugin.kind, {})[plugin.name] = {each.name for each in plugin.settings}
+    return {
+        "detector": {OPENCV: {*OPENCV_FIELDS}, **plugged["detector"]},
+        "solver": {name: {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded}
+                   for name, solver in SOLVERS.items()} | plugged["estimator"],
+    }
 
 
 def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -138,7 +138,7 @@ def _differs(believed: Any, truth: Any) -> bool:
     if believed is None or truth is None:
         return False
     if isinstance(believed, tuple):
-        return bool(canonical_distortion(believed) != truth)
-    if isinstance(believed, str):
+        believed = canonical_distortion(believed)
+    if not isinstance(believed, (int, float)):
         return bool(believed != truth)
     return not math.isclose(believed, truth, rel_tol=1e-9)

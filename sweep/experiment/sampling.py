@@ -16,7 +16,7 @@ from sweep.experiment.axes import TRIAL, Axis, parse_trial
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.parameters import Stage
-from sweep.messages import plain, shown
+from sweep.messages import nearest, plain, shown
 
 # --------------------------------------------------------------------------------------------------
 # Numbers of trials at which waves end: after each, it is decided what else is needed.
@@ -344,7 +344,7 @@ def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> A
     else:
         known = [*(each.name for each in reading.axes),
                  *(each for each in reading.parameters if not scene or _is_of_scene(reading, each))]
-        reading.unknown(path, f"{name}: no such axis", name, known)
+        reading.note(path, f"{name}: no such axis{nearest(name, known)}")
         return None
     where = "scene" if scene else "grid"
     reading.note(path, f"{name}: {problem}; expected an axis of the {where}")

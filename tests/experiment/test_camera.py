@@ -179,7 +179,7 @@ def test_sides_of_a_board_s_markers_are_their_own():
         ]}, "axes": {"distance_m": [1, 2]},
     })
     assert board.facts.camera["side_px"] == pytest.approx((3, 24))
-    assert "the markers have sides of 3 to 24 px" in board.facts.camera_line
+    assert "the markers' sides are 3 to 24 px" in board.facts.camera_line
 
 
 def test_sides_of_poses_in_the_world_are_named():
@@ -232,11 +232,11 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
     ({"camera": {"fx_px": 4.0}}, "HFOV 178.6°: hardly any pinhole camera is as wide; is a focal"),
     ({"camera": {"hfov_deg": 1.2217}}, "hfov_deg = 1.2217: in degrees; 1.2217 radians would be 70"),
     ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 60}},
-     "more than the frame's; are size_m and the distances in metres?"),
+     "more than the frame's; size_m = 60: are it and the distances in metres?"),
     ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 0.06}, "pose": {"distance_m": 300}},
-     "at most 0.1109 px, less than a pixel a module: too small to be read; are size_m and"),
+     "at most 0.1109 px, less than a pixel a module: too small to be read; size_m = 0.06: are"),
     ({"camera": {"hfov_deg": 60}},
-     "less than a pixel a module: too small to be read; size_m is not given: 0.01 m"),
+     "less than a pixel a module: too small to be read; size_m = 0.01: are it"),
     ({"camera": {"fx_px": 600, "calibration_sd": [1, 1, 1, 1]}},
      "calibration_sd has no effect: no estimator has believed = calibration"),
     ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},

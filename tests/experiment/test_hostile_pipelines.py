@@ -75,7 +75,7 @@ HOSTILE = {
     "a title": (f'title = "{"k" * 1000}"\n' + POSE, "one line of at most 200 characters"),
     "a path": (POSE + f'[scene]\nbackground = "{"a/" * 100_000}"', "(File name too long)"),
     # Numbers without end.
-    "digits": (POSE + "tilt_deg = 1" + "0" * 100_000, "not TOML: a number of too many digits"),
+    "digits": (POSE + "tilt_deg = 1" + "0" * 100_000, "not TOML: Exceeds the limit (4300 digits)"),
     **{
         f"hexadecimal digits, {name}": (text % ("0x1" + "0" * 20_000), expected)
         for name, text, expected in (

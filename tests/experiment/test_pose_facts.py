@@ -24,7 +24,7 @@ def told(pose, axes=None, **sections):
       "distance_m counts along the optical axis: off it, the marker's centre is up to 1.22 times"]),
     ({"distance_m": 0.3, "view_angle_deg": 0, "y_m": 0.134}, {"trial": 1},
      ["all poses are cut off by the frame's edge"]),
-    ({"distance_m": 0.01, "frame_x": 0.5}, {}, ["frame's edge; where the marker is too large"]),
+    ({"distance_m": 0.01, "frame_x": 0.5}, {}, ["are cut off by the frame's edge"]),
     ({"distance_m": 0.3, "azimuth_deg": {"uniform": [0, 360]}}, {"trial": 4},
      ["azimuth_deg has no effect"]),
     ({"distance_m": 0.3}, {"azimuth_deg": [0, 90], "tilt_deg": [0, 30]}, []),
@@ -37,7 +37,7 @@ def told(pose, axes=None, **sections):
      ["50 % of the poses have a corner behind the camera: not_visible"]),
     ({"camera_z_m": 1}, {"marker_x_m": [0.5], "marker_yaw_deg": [0, 180]},
      ["50 % of the poses show the marker's back",
-      "50 % of the poses are outside the frame of the camera: not_visible"]),
+      "50 % of the poses are outside the frame: not_visible"]),
 ])
 def test_what_may_surprise_of_poses_is_a_line_each(pose, axes, named):
     lines = told(pose, axes)

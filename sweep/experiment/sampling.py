@@ -315,22 +315,14 @@ def _is_of_scene(reading: Reading, name: str) -> bool:
     return name in reading.parameters and reading.parameters[name].stage is Stage.scene
 
 
-_NO_CONDITION = {
-    REQUIRE: ("intervals are over the draws", "configurations are always told apart"),
-    SEARCH: ("trials are what is counted", "each configuration has its own answer"),
-}
-"""Section -> why neither ``trial`` nor an axis of configurations is one of its conditions."""
-
-
 def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> Axis | None:
     """Return an axis, of the scene or any but ``trial``, by name, or note why there is none."""
     axis, together = reading.axis(name), reading.axis_of(name)
     parameter = reading.parameters.get(name)
-    of_trials, of_settings = _NO_CONDITION[path.partition(".")[0]]
     if name == TRIAL:
-        problem = of_trials
+        problem = "trials are what is counted, and what intervals are over"
     elif scene and (owner := axis or parameter) is not None and owner.stage is not Stage.scene:
-        problem = of_settings
+        problem = "each configuration has its own answer"
     elif axis is not None:
         return axis
     elif together is not None:

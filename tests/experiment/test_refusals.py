@@ -83,7 +83,7 @@ BROKEN = [
      "pose = 3: expected a table: [pose]"),
     (P + '[require]\nall = ["detection"]', 'require.all = "detection": expected NAME >= NUMBER'),
     (P + '[require]\nall = ["detection >= 0.9"]\nper = ["solver"]',
-     "require.per: solver: configurations are always told apart"),
+     "require.per: solver: each configuration has its own answer"),
     (P + '[require]\nper = ["distance_m"]', "what is required, too"),
     ("seed = -1\n[pose]\ndistance_m = 1", "seed = -1: expected a whole number from 0"),
     ("[pose\ndistance_m = 1", "not TOML: "),

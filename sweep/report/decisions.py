@@ -15,6 +15,7 @@ from sweep.analysis.decisions import CONFIDENCE
 from sweep.analysis.requirements import Cause, Decision, Verdict, described
 from sweep.errors import ArgumentError
 from sweep.experiment.draws import REPLICATES
+from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, quoted
 from sweep.report.table import (
     Findings,
@@ -28,7 +29,7 @@ from sweep.report.table import (
 if TYPE_CHECKING:
     from sweep.analysis.comparisons import Regression
     from sweep.analysis.decisions import Answer
-    from sweep.experiment.pipeline import Pipeline, parse_selection
+    from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
 WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",

@@ -376,9 +376,12 @@ def rectangles(boxes: Floats, per_side: int = 1) -> Floats:
 
 def in_space(boxes: Floats, planes: Floats, per_side: int = 1) -> Floats:
     """Return points (n, 4 · per_side, 3) along boxes (n, 4) of sheets in ``planes`` (n, 3, 3)."""
-    flat = rectangles(boxes, per_side)
-    points = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=2)
+    points = _homogeneous(rectangles(boxes, per_side))
     return np.ascontiguousarray(points @ np.swapaxes(planes, 1, 2))
+
+
+def _homogeneous(points: Floats) -> Floats:
+    return np.concatenate([points, np.ones_like(points[..., :1])], axis=2)
 
 
 def box_corners(boxes: Floats) -> Floats:
@@ -518,6 +521,12 @@ def sheet_boxes(board: Board) -> Floats:
 
 
 @lru_cache(maxsize=64)
+def _corners(board: Board) -> Floats:
+    """Return the corners (P, 4, 3) of each of a board's sheets as (column, row, 1)."""
+    return _homogeneous(rectangles(sheet_boxes(board)))
+
+
+@lru_cache(maxsize=64)
 def sheets_m(board: Board) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the board's frame."""
     return outlines(board, sheet_planes(board, np.eye(3), np.zeros(3), 1.0))
@@ -525,7 +534,7 @@ def sheets_m(board: Board) -> Floats:
 
 def outlines(board: Board, planes: Floats) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the camera frame."""
-    return in_space(sheet_boxes(board), planes)
+    return np.asarray(_corners(board) @ np.swapaxes(planes, 1, 2))
 
 
 def own_sheets(board: Board) -> int:
@@ -716,9 +725,10 @@ def boxes_px(
     Of those that face the camera, if any does; NaN if a part of one is not before it.
     """
     planes = sheet_planes(board, rotation, translation, scale)
+    facing_it, around = facing(board, planes), outlines(board, planes)
     boxes = []
     for count in (own_sheets(board), len(planes)):
-        seen, corners = facing(board, planes)[:count], outlines(board, planes)[:count]
+        seen, corners = facing_it[:count], around[:count]
         corners = corners[seen if seen.any() else slice(None)]
         pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
         low, high = pixels.min(axis=0), pixels.max(axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from sweep.compilation import compiled
 from sweep.declaration import parameter
 from sweep.model import lens
-from sweep.model.polygon import Optics, pixel
+from sweep.model.polygon import Optics
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -224,11 +225,15 @@ def _project(
     """As :meth:`Cameras.project`."""
     pixels = np.empty((points.shape[0], points.shape[1], 2))
     for i in range(points.shape[0]):
-        optics = Optics(view[i], lenses[i], distorted[i])
         for j in range(points.shape[1]):
-            pixels[i, j, 0], pixels[i, j, 1] = pixel(
-                points[i, j, 0], points[i, j, 1], points[i, j, 2], optics
-            )
+            z = points[i, j, 2]
+            x, y = math.nan, math.nan
+            if z > 0:
+                x, y = points[i, j, 0] / z, points[i, j, 1] / z
+                if distorted[i]:
+                    x, y = lens.distort(x, y, lenses[i])
+            pixels[i, j, 0] = view[i, 0] * x + view[i, 2]
+            pixels[i, j, 1] = view[i, 1] * y + view[i, 3]
     return pixels
 
 

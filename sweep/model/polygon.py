@@ -113,18 +113,6 @@ def plane_point(plane: Floats, column: float, row: float) -> tuple[float, float,
 
 
 @compiled_inline
-def pixel(x: float, y: float, z: float, optics: Optics) -> tuple[float, float]:
-    """Return the pixel of a point in the camera frame; NaN if it is not before the camera."""
-    if not z > 0.0:
-        return math.nan, math.nan
-    x, y = x / z, y / z
-    if optics.distorted:
-        x, y = distort(x, y, optics.lens)
-    intrinsics = optics.intrinsics
-    return intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
-
-
-@compiled_inline
 def homogeneous_pixel(
     projection: Projection, shift_x: float, shift_y: float, column: float, row: float
 ) -> tuple[float, float, float]:
@@ -303,7 +291,14 @@ def sheet_pixel(
     if height != 0.0:
         normal = plane_normal(projection.plane)
         x, y, z = x + height * normal[0], y + height * normal[1], z + height * normal[2]
-    u, v = pixel(x, y, z, projection.optics)
+    if not z > 0.0:
+        return math.nan, math.nan
+    x, y = x / z, y / z
+    optics = projection.optics
+    if optics.distorted:
+        x, y = distort(x, y, optics.lens)
+    intrinsics = optics.intrinsics
+    u, v = intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
     waves = sheet.waves
     right = down = 0.0
     for wave in range(waves.shape[1]):

@@ -167,14 +167,14 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
         behind = image = background_image(background)[top:bottom, left:right].copy()
     else:
         image = np.full((bottom - top, right - left), quantise(np.array(background)))
+        if not active and scenes.renderer[row] == "warp":
+            if x1 > x0:
+                image[inner] = _warp_grey(scenes, row, marker_box)
+            return image
         behind = np.broadcast_to(float(background), image.shape)
     if not active:
         if x1 > x0:
-            image[inner] = (
-                _warp_grey(scenes, row, marker_box)
-                if scenes.renderer[row] == "warp" and not isinstance(background, str)
-                else quantise(_exposed(scenes, row, marker_box, behind[inner]))
-            )
+            image[inner] = quantise(_exposed(scenes, row, marker_box, behind[inner]))
         return image
     levels, overshoot, effect = behind.astype(np.float64), None, scenes.effects.of(row)
     if x1 > x0:
@@ -353,6 +353,14 @@ def _grey_bitmap(board: Board, black: float, white: float, behind: float) -> Gre
     return quantise(_bitmap(board, black, white).astype(np.float64) + (1.0 - share) * behind)
 
 
+@lru_cache(maxsize=1024)
+def _bitmap_corners(board: Board) -> NDArray[np.float32]:
+    """Return the corners (4, 2) of what is black, TL, TR, BR, BL, in pixels of a bitmap."""
+    extent = extent_of(board)
+    square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
+    return np.asarray(rectangles(square[None])[0], dtype=np.float32)
+
+
 def _warped(
     scenes: Scenes, row: int, box: Box, bitmap: NDArray[Any], border: int = 0
 ) -> NDArray[Any]:
@@ -360,12 +368,8 @@ def _warped(
 
     A bitmap's pixels have their edges at halves; beyond it is the level ``border``.
     """
-    extent = extent_of(scenes.targets[row])
-    square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
-    transform = cv2.getPerspectiveTransform(
-        rectangles(square[None])[0].astype(np.float32),
-        (scenes.corners_px[row] - box[:2]).astype(np.float32),
-    )
+    corners = (scenes.corners_px[row] - box[:2]).astype(np.float32)
+    transform = cv2.getPerspectiveTransform(_bitmap_corners(scenes.targets[row]), corners)
     return cv2.warpPerspective(
         bitmap, transform, (box[2] - box[0], box[3] - box[1]), flags=cv2.INTER_LINEAR,
         borderValue=(border,),

@@ -12,20 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.model import marker
 from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges, joined
-from sweep.model.marker import (
-    BLACK,
-    OCCLUDER,
-    OUTSIDE,
-    WHITE,
-    cell_edges,
-    edges,
-    marker_corners,
-    module_count,
-    overhang,
-    rectangle_edges,
-)
+from sweep.model.marker import BLACK, OCCLUDER, OUTSIDE, WHITE
 from sweep.model.polygon import half_plane
 from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers, Masks
@@ -174,9 +164,10 @@ def single_marker(dictionary: str, marker_id: int, margin: float) -> Board:
 
     Its edges are in modules, from the top left corner of its square.
     """
-    printed = Print(edges(dictionary, marker_id, margin), 1 / module_count(dictionary), 0.5)
+    module = 1 / marker.module_count(dictionary)
+    printed = Print(marker.edges(dictionary, marker_id, margin), module, 0.5)
     return Board(
-        dictionary, (marker_id,), marker_corners(np.ones(1)), (printed,), np.empty((0, 3)),
+        dictionary, (marker_id,), marker.marker_corners(np.ones(1)), (printed,), np.empty((0, 3)),
         margin=margin,
     )
 
@@ -206,14 +197,14 @@ def marker_print(
     ``quiet_zone_modules`` is the width of the white that surrounds it on its own sheet; None if
     it is printed on white that another print encloses.
     """
-    outline = edges(dictionary, marker_id, overhang(dictionary) + (quiet_zone_modules or 0.0))
+    around = marker.overhang(dictionary) + (quiet_zone_modules or 0.0)
+    outline = marker.edges(dictionary, marker_id, around)
     if quiet_zone_modules is None:
         sides = np.where(outline.sides == OUTSIDE, WHITE, outline.sides)
         seen = sides[:, 0] != sides[:, 1]
         outline = MarkerEdges(outline.ends[seen], sides[seen])
-    return Print(
-        outline, size_m / module_count(dictionary), size_m / 2, x_m, y_m, math.radians(roll_deg)
-    )
+    module_m = size_m / marker.module_count(dictionary)
+    return Print(outline, module_m, size_m / 2, x_m, y_m, math.radians(roll_deg))
 
 
 def solid_print(
@@ -237,7 +228,7 @@ def solid_print(
 
 def corners_of(size_m: float, x_m: float, y_m: float, roll_deg: float = 0.0) -> Floats:
     """Return the corners (4, 3) of a marker's square in the board's frame: TL, TR, BR, BL."""
-    corners = marker_corners(np.array([size_m]))[0]
+    corners = marker.marker_corners(np.array([size_m]))[0]
     cosine, sine = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
     turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(corners @ turn + [x_m, y_m, 0.0])
@@ -245,7 +236,7 @@ def corners_of(size_m: float, x_m: float, y_m: float, roll_deg: float = 0.0) -> 
 
 def cells_print(codes: Integers, side_m: float) -> Print:
     """Return square cells (h, w) of areas ``codes`` on white, their middle at the origin."""
-    cells = cell_edges(np.pad(codes, 1, constant_values=WHITE))
+    cells = marker.cell_edges(np.pad(codes, 1, constant_values=WHITE))
     height, width = codes.shape
     shifted = cells.ends - np.tile([width / 2, height / 2], 2)
     return Print(MarkerEdges(shifted, cells.sides), side_m, 0.0)
@@ -253,7 +244,7 @@ def cells_print(codes: Integers, side_m: float) -> Print:
 
 def rectangles_print(boxes_m: Floats, outside: int, inside: int) -> Print:
     """Return rectangles (n, 4) in metres, as :func:`sweep.model.marker.rectangle_edges`."""
-    return Print(rectangle_edges(boxes_m, outside, inside), 1.0, 0.0)
+    return Print(marker.rectangle_edges(boxes_m, outside, inside), 1.0, 0.0)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -337,12 +328,13 @@ class Extent(NamedTuple):
 @lru_cache(maxsize=8192)
 def extent_of(target: Board) -> Extent:
     """Return where the parts of a target end."""
-    n = float(module_count(target.dictionary))
+    n = float(marker.module_count(target.dictionary))
     if target.margin is not None:
         margin, middle = target.margin, np.array([n / 2, n / 2])
         sheet = np.array([-margin, -margin, n + margin, n + margin])
         ink = np.array([0.0, 0.0, n, n])
-        return Extent(sheet, sheet, ink, float(overhang(target.dictionary)), middle, middle, n)
+        beyond = float(marker.overhang(target.dictionary))
+        return Extent(sheet, sheet, ink, beyond, middle, middle, n)
     outline = target_edges(target)
     black = (outline.sides == BLACK).any(axis=1)
     own = _box(outline.ends)
@@ -393,14 +385,14 @@ def box_corners(boxes: Floats) -> Floats:
 def unit_m(target: Board) -> float:
     """Return the unit in metres: a module of the first marker; in sides of a marker alone."""
     side = float(np.linalg.norm(target.corners_m[0, 1] - target.corners_m[0, 0]))
-    return side / module_count(target.dictionary)
+    return side / marker.module_count(target.dictionary)
 
 
 def side_m(target: Board, size_m: float) -> float:
     """Return the side of a target's first marker in metres: ``size_m`` unless it has its own."""
     if target.is_marker:
         return size_m
-    side = unit_m(target) * module_count(target.dictionary)
+    side = unit_m(target) * marker.module_count(target.dictionary)
     return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
 
 
@@ -460,7 +452,7 @@ def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> Mar
     width = float(hideable @ np.abs(towards))
     limit = float(towards @ middle) + width * (0.5 - occlusion)
     beside = np.array([*-towards, limit])
-    sheet = rectangle_edges(extent.sheet[None], OUTSIDE, OCCLUDER)
+    sheet = marker.rectangle_edges(extent.sheet[None], OUTSIDE, OCCLUDER)
     return joined([within(edges_of(target), beside)[0], within(sheet, -beside)[0]])
 
 

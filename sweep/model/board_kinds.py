@@ -12,31 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sweep.declaration import Declared, check_tables, declared_fields, parameter
-from sweep.model.board import (
-    Board,
-    Chessboard,
-    Print,
-    cells_print,
-    corners_of,
-    first_overlap,
-    marker_print,
-    own_sheets,
-    rectangles_print,
-    sheets_m,
-    solid_print,
-)
+from sweep.model import board, marker
+from sweep.model.board import Board, Chessboard, Print
 from sweep.model.coverage import joined
-from sweep.model.marker import (
-    BLACK,
-    OUTSIDE,
-    WHITE,
-    Marker,
-    marker_count,
-    missing_package,
-    module_count,
-    overhang,
-    square_edges,
-)
+from sweep.model.marker import BLACK, OUTSIDE, WHITE
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -45,7 +24,7 @@ from sweep.typing import Floats, Integers
 MAX_MARKERS = 4000
 """The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
 
-_DICTIONARY = declared_fields(Marker)["dictionary"].declaration
+_DICTIONARY = declared_fields(marker.Marker)["dictionary"].declaration
 
 
 class Fault(NamedTuple):
@@ -104,7 +83,7 @@ def table_reader(
 
 def id_faults(key: str, ids: list[int], dictionary: str, written: Any = None) -> list[Fault]:
     """Return the faults of markers' IDs; ``written`` is what the key has if not these."""
-    missing = missing_package(dictionary)
+    missing = marker.missing_package(dictionary)
     if missing is not None:
         return [Fault("dictionary", dictionary, f"one whose package is installed: {missing}")]
     written = ids if written is None else written
@@ -114,7 +93,7 @@ def id_faults(key: str, ids: list[int], dictionary: str, written: Any = None) ->
     twice = [marker_id for marker_id, count in Counter(ids).items() if count > 1]
     if twice:
         faults.append(Fault(key, written, f"each ID once; {twice[0]} is listed more than once"))
-    count = marker_count(dictionary)
+    count = marker.marker_count(dictionary)
     if min(ids) < 0 or max(ids) >= count:
         faults.append(Fault(
             key, written,
@@ -158,10 +137,10 @@ class BoardMarker:
         ``solid``: on a plane of its own. ``quiet_modules`` is as of :func:`marker_print`.
         """
         where = self.x_m, self.y_m, self.roll_deg
-        printed = marker_print(dictionary, self.marker_id, self.size_m, quiet_modules, *where)
+        printed = board.marker_print(dictionary, self.marker_id, self.size_m, quiet_modules, *where)
         if solid:
-            return solid_print(printed, self.z_m, self.tilt_deg, self.azimuth_deg)
-        return printed, corners_of(self.size_m, *where)
+            return board.solid_print(printed, self.z_m, self.tilt_deg, self.azimuth_deg)
+        return printed, board.corners_of(self.size_m, *where)
 
 
 _TABLES = "tables [[markers]]"
@@ -214,7 +193,7 @@ class Markers:
                 "margin_m", self.margin_m, "no one sheet for markers in several planes; delete it"
             ))
         if not faults:
-            pair = first_overlap(self._printed(self._placed()[1]))
+            pair = board.first_overlap(self._printed(self._placed()[1]))
             if pair is not None:
                 quiet = "" if self.margin_m is not None else " with their quiet zones"
                 faults.append(Fault(
@@ -237,10 +216,10 @@ class Markers:
 
         ``corners`` (n, 4, 3) are those of its square.
         """
-        around = overhang(self.dictionary) + (self._quiet or 0.0)
+        around = marker.overhang(self.dictionary) + (self._quiet or 0.0)
         middle = corners.mean(axis=1, keepdims=True)
         return np.asarray(
-            middle + (corners - middle) * (1 + 2 * around / module_count(self.dictionary))
+            middle + (corners - middle) * (1 + 2 * around / marker.module_count(self.dictionary))
         )
 
     @property
@@ -255,7 +234,7 @@ class Markers:
         if self.margin_m is not None:
             printed = self._printed(corners)[..., :2].reshape(-1, 2) * [1.0, -1.0]
             box = [*(printed.min(axis=0) - self.margin_m), *(printed.max(axis=0) + self.margin_m)]
-            prints.append(rectangles_print(np.array([box]), OUTSIDE, WHITE))
+            prints.append(board.rectangles_print(np.array([box]), OUTSIDE, WHITE))
         return Board(
             self.dictionary, tuple(each.marker_id for each in self.markers), corners,
             tuple(prints), np.empty((0, 3)),
@@ -281,7 +260,7 @@ _BESIDE = _LISTED | {
 
 
 def with_distractors(
-    board: Board, listed: Sequence[Sequence[Any]] | None, size_m: float, quiet_modules: float
+    target: Board, listed: Sequence[Sequence[Any]] | None, size_m: float, quiet_modules: float
 ) -> Board:
     """Return a board with what is ``listed`` beside it, rows of the values of a table's keys.
 
@@ -290,19 +269,19 @@ def with_distractors(
     """
     prints = []
     for marker_id, x_m, y_m, own_size_m, *pose, own in listed or ():
-        dictionary = own or board.dictionary
+        dictionary = own or target.dictionary
         size = size_m if own_size_m is None else own_size_m
         each = BoardMarker(marker_id or 0, x_m, y_m, size, *pose)
         printed, _ = each.placed(dictionary, quiet_modules, not each.is_flat)
         if marker_id is None:
             # A black square as large as a marker's, on its white sheet.
-            modules = module_count(dictionary)
+            modules = marker.module_count(dictionary)
             printed = printed._replace(edges=joined([
-                square_edges(-quiet_modules, modules + quiet_modules, OUTSIDE, WHITE),
-                square_edges(0, modules, WHITE, BLACK),
+                marker.square_edges(-quiet_modules, modules + quiet_modules, OUTSIDE, WHITE),
+                marker.square_edges(0, modules, WHITE, BLACK),
             ]))
         prints.append(printed)
-    return dataclasses.replace(board, distractors=tuple(prints)) if prints else board
+    return dataclasses.replace(target, distractors=tuple(prints)) if prints else target
 
 
 def listing_faults(listed: Sequence[Sequence[Any]] | None, dictionary: str) -> list[Fault]:
@@ -310,23 +289,23 @@ def listing_faults(listed: Sequence[Sequence[Any]] | None, dictionary: str) -> l
     if listed and len(listed) > MAX_MARKERS:
         return [Fault("distractors", len(listed), f"at most {MAX_MARKERS} of them")]
     for number, (marker_id, *_, own) in enumerate(listed or ()):
-        missing = missing_package(own or dictionary)
+        missing = marker.missing_package(own or dictionary)
         if missing is not None:
             expected = f"one whose package is installed: {missing}"
             return [Fault(f"distractors[{number}].dictionary", own or dictionary, expected)]
-        count = marker_count(own or dictionary)
+        count = marker.marker_count(own or dictionary)
         if marker_id is not None and marker_id >= count:
             expected = f"an ID from 0 to {count - 1}, which is what {own or dictionary} has"
             return [Fault(f"distractors[{number}].marker_id", marker_id, expected)]
     return []
 
 
-def overlap_faults(board: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]:
+def overlap_faults(target: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]:
     """Return the first overlap of a distractor with its board, or with another distractor."""
-    pair = first_overlap(sheets_m(board))
+    pair = board.first_overlap(board.sheets_m(target))
     if pair is None:
         return []
-    other, number = (sheet - own_sheets(board) for sheet in pair)
+    other, number = (sheet - board.own_sheets(target) for sheet in pair)
     name = f"distractors[{other}]" if other >= 0 else "the board"
     return [Fault(
         f"distractors[{number}].x_m", listed[number][1],
@@ -407,14 +386,14 @@ class _OnSheet:
 
         The sheet extends ``half_m`` (2,) and the margin from the origin.
         """
-        module_m = marker_m / module_count(self.dictionary)
+        module_m = marker_m / marker.module_count(self.dictionary)
         beyond = half_m + (module_m if self.margin_m is None else self.margin_m)
         prints, corners = zip(
             *(BoardMarker(marker_id, x, y, marker_m, roll_deg).placed(self.dictionary, None, False)
               for marker_id, (x, y) in zip(self._ids, centres_m.tolist(), strict=True)),
             strict=True,
         )
-        sheet = rectangles_print(np.array([[*-beyond, *beyond]]), OUTSIDE, WHITE)
+        sheet = board.rectangles_print(np.array([[*-beyond, *beyond]]), OUTSIDE, WHITE)
         return Board(
             self.dictionary, self._ids, np.array(corners), (*prints, *others, sheet),
             np.empty((0, 3)),
@@ -437,7 +416,7 @@ class _OnSheet:
         if squares:
             row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
             low = np.stack([column, row], axis=1) * step - gap_m - middle
-            others = [rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
+            others = [board.rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
             half = middle + gap_m
         if kalibr:
             return self._on_sheet(centres, marker_m, others, half, 180.0)
@@ -484,11 +463,11 @@ class Charuco(_OnSheet):
         centres = (np.stack([columns, rows], axis=1) + 0.5) * self.square_m - middle
         inner = np.indices((self.squares_y - 1, self.squares_x - 1)).reshape(2, -1)[::-1].T + 1
         chessboard = (inner * self.square_m - middle) * [1.0, -1.0]
-        board = self._on_sheet(
-            centres * [1.0, -1.0], self.marker_m, [cells_print(codes, self.square_m)], middle
+        plain = self._on_sheet(
+            centres * [1.0, -1.0], self.marker_m, [board.cells_print(codes, self.square_m)], middle
         )
         return dataclasses.replace(
-            board, chessboard_m=np.column_stack([chessboard, np.zeros(len(chessboard))]),
+            plain, chessboard_m=np.column_stack([chessboard, np.zeros(len(chessboard))]),
             chessboard=Chessboard(
                 self.squares_x, self.squares_y, self.square_m, self.marker_m, self.legacy_pattern
             ),
@@ -560,7 +539,7 @@ class AprilGrid(_OnSheet):
 
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
-        if overhang(self.dictionary):
+        if marker.overhang(self.dictionary):
             return [Fault(
                 "dictionary", self.dictionary,
                 "another one: its markers have modules where an AprilGrid has squares",
@@ -575,9 +554,9 @@ class AprilGrid(_OnSheet):
 
 def _printed_side(dictionary: str, marker_m: float) -> tuple[float, str]:
     """Return the side of all modules of a marker, and a note if some are beyond its square."""
-    whole = marker_m * (1 + 2 * overhang(dictionary) / module_count(dictionary))
+    whole = marker_m * (1 + 2 * marker.overhang(dictionary) / marker.module_count(dictionary))
     note = f": markers of {dictionary} have modules beyond their square, {whole:g} m in all"
-    return whole, note if overhang(dictionary) else ""
+    return whole, note if marker.overhang(dictionary) else ""
 
 
 Kind = Charuco | Grid | AprilGrid | Markers
@@ -687,7 +666,8 @@ def arranged(values: Sequence[Any]) -> Kind:
         value = given[PIPELINE_NAMES.get(name, name)]
         # Along an axis, numbers are floating-point.
         made[name] = int(value) if int in declared.types and value is not None else value
-    made["margin_m"] = given["quiet_zone_modules"] * size_m / module_count(given["dictionary"])
+    modules = marker.module_count(given["dictionary"])
+    made["margin_m"] = given["quiet_zone_modules"] * size_m / modules
     if ids is not None:
         made["first_id"] = None
     return KINDS[kind](**made)

@@ -10,24 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled, compiled_inline
+from sweep.model import polygon
 from sweep.model.lens import distort, jacobian
-from sweep.model.polygon import (
-    ModuleEdge,
-    Optics,
-    Projection,
-    Sheet,
-    chord_count,
-    chords_within_tolerance,
-    clip,
-    distance_from_chord,
-    distorted_point,
-    flat_sheet,
-    homogeneous_pixel,
-    is_curved,
-    piece_count,
-    plane_point,
-    sheet_pixel,
-)
+from sweep.model.polygon import ModuleEdge, Optics, Projection, Sheet, clip
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -338,24 +323,26 @@ def accumulate_curved(
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
         columns, rows = edge.to_column - edge.column, edge.to_row - edge.row
-        pieces = piece_count(edge, projection, sheet)
-        x, y = sheet_pixel(edge.column, edge.row, projection, sheet)
+        pieces = polygon.piece_count(edge, projection, sheet)
+        x, y = polygon.sheet_pixel(edge.column, edge.row, projection, sheet)
         for piece in range(pieces):
             distance = 0.0
             t = (piece + 1.0) / pieces
-            u1, v1 = sheet_pixel(edge.column + t * columns, edge.row + t * rows, projection, sheet)
+            u1, v1 = polygon.sheet_pixel(
+                edge.column + t * columns, edge.row + t * rows, projection, sheet
+            )
             for quarter in range(1, 4):
                 t = (piece + 0.25 * quarter) / pieces
-                u, v = sheet_pixel(
+                u, v = polygon.sheet_pixel(
                     edge.column + t * columns, edge.row + t * rows, projection, sheet
                 )
-                distance = max(distance, distance_from_chord(u, v, x, y, u1, v1))
-            chords = chords_within_tolerance(distance)
+                distance = max(distance, polygon.distance_from_chord(u, v, x, y, u1, v1))
+            chords = polygon.chords_within_tolerance(distance)
             for chord in range(1, chords + 1):
                 u, v = u1, v1
                 if chord < chords:
                     t = (piece + chord / chords) / pieces
-                    u, v = sheet_pixel(
+                    u, v = polygon.sheet_pixel(
                         edge.column + t * columns, edge.row + t * rows, projection, sheet
                     )
                 segment = Segment(
@@ -389,7 +376,7 @@ def accumulate(
         Standard deviation in pixels of a Gaussian point spread; 0 for none.
     """
     if projection.optics.distorted:
-        accumulate_curved(cover, edges, levels, projection, left, top, sigma, flat_sheet())
+        accumulate_curved(cover, edges, levels, projection, left, top, sigma, polygon.flat_sheet())
         return
     intrinsics = projection.optics.intrinsics
     shift_x, shift_y = intrinsics[2] + (0.5 - left), intrinsics[3] + (0.5 - top)
@@ -398,8 +385,8 @@ def accumulate(
         jump = levels[sides[e, 1]] - levels[sides[e, 0]]
         if jump == 0.0:
             continue
-        x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, ends[e, 0], ends[e, 1])
-        x1, y1, z1 = homogeneous_pixel(projection, shift_x, shift_y, ends[e, 2], ends[e, 3])
+        x0, y0, z0 = polygon.homogeneous_pixel(projection, shift_x, shift_y, ends[e, 0], ends[e, 1])
+        x1, y1, z1 = polygon.homogeneous_pixel(projection, shift_x, shift_y, ends[e, 2], ends[e, 3])
         segment = Segment(x0, y0, z0, x1, y1, z1)
         if sigma > 0.0:
             _add_blurred(cover, jump, sigma, segment)
@@ -413,7 +400,7 @@ def accumulate_sheet(
     sigma: float, sheet: Sheet,
 ) -> None:
     """As :func:`accumulate`, of a sheet that may be bent or shifted."""
-    if is_curved(sheet):
+    if polygon.is_curved(sheet):
         accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
     else:
         accumulate(cover, edges, levels, projection, left, top, sigma)
@@ -667,20 +654,20 @@ def differentiate(
             continue
         a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
         edge = ModuleEdge(a, b, c, d)
-        chords = chord_count(projection, edge) if optics.distorted else 1
+        chords = polygon.chord_count(projection, edge) if optics.distorted else 1
         for chord in range(chords):
             t0, t1 = chord / chords, (chord + 1.0) / chords
             if not optics.distorted:
                 # Clip to the box and its margin before division, as the image is.
-                x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, a, b)
-                x1, y1, z1 = homogeneous_pixel(projection, shift_x, shift_y, c, d)
+                x0, y0, z0 = polygon.homogeneous_pixel(projection, shift_x, shift_y, a, b)
+                x1, y1, z1 = polygon.homogeneous_pixel(projection, shift_x, shift_y, c, d)
                 t0, t1 = clip(x0, x1, t0, t1)
                 t0, t1 = clip(y0, y1, t0, t1)
                 t0, t1 = clip(far_x * z0 - x0, far_x * z1 - x1, t0, t1)
                 t0, t1 = clip(far_y * z0 - y0, far_y * z1 - y1, t0, t1)
             else:
-                u0, v0 = distorted_point(t0, projection, edge)
-                u1, v1 = distorted_point(t1, projection, edge)
+                u0, v0 = polygon.distorted_point(t0, projection, edge)
+                u1, v1 = polygon.distorted_point(t1, projection, edge)
                 if (
                     max(u0, u1) + 0.5 < -margin or min(u0, u1) + 0.5 > width + margin
                     or max(v0, v1) + 0.5 < -margin or min(v0, v1) + 0.5 > height + margin
@@ -689,9 +676,9 @@ def differentiate(
             if not t0 < t1:
                 continue
             ca, cb, da, db = a + t0 * (c - a), a + t1 * (c - a), b + t0 * (d - b), b + t1 * (d - b)
-            x, y, z = plane_point(plane, ca, da)
+            x, y, z = polygon.plane_point(plane, ca, da)
             xa, ya = velocity(x, y, z, translation, optics, rates[:2])
-            x, y, z = plane_point(plane, cb, db)
+            x, y, z = polygon.plane_point(plane, cb, db)
             xb, yb = velocity(x, y, z, translation, optics, rates[2:])
             for k in range(POSE):
                 at_a[k] = rates[0, k] * (yb - ya) - rates[1, k] * (xb - xa)

@@ -14,18 +14,7 @@ from numpy.typing import NDArray
 
 from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
-from sweep.model.sensor import (
-    BLOCK_PX,
-    GREY_NOISE_DRAW,
-    METHODS,
-    PATTERNS,
-    REACH_PX,
-    apply_tone,
-    demosaiced,
-    expose,
-    normal_field,
-    standard_normals,
-)
+from sweep.model import sensor
 from sweep.plugins.loading import call, real_numbers
 from sweep.typing import Floats
 
@@ -64,7 +53,7 @@ class Patch:
         a pixel of the frame has the same number.
         """
         normals = np.empty(shape)
-        standard_normals(self.stream_key(stream), 0, self.left, self.top, normals)
+        sensor.standard_normals(self.stream_key(stream), 0, self.left, self.top, normals)
         return normals
 
     def stream_key(self, stream: str) -> np.uint64:
@@ -229,7 +218,7 @@ def _lit(levels: Floats, patch: Patch) -> Floats:
 def _exposed(levels: Floats, patch: Patch) -> Floats:
     """Return levels of electrons, with shot noise and read noise."""
     electrons = levels.copy()
-    expose(
+    sensor.expose(
         electrons, patch.left, patch.top, patch.noise_key, patch.values["full_well_e"],
         patch.values["read_noise_e"],
     )
@@ -238,8 +227,8 @@ def _exposed(levels: Floats, patch: Patch) -> Floats:
 
 def _noisy(levels: Floats, patch: Patch) -> Floats:
     """Return levels with plain grey noise, which may be correlated."""
-    field = normal_field(
-        patch.noise_key, GREY_NOISE_DRAW, patch.left, patch.top, levels.shape,
+    field = sensor.normal_field(
+        patch.noise_key, sensor.GREY_NOISE_DRAW, patch.left, patch.top, levels.shape,
         patch.values["noise_correlation"],
     )
     return np.asarray(levels + patch.values["noise_grey"] * field)
@@ -248,20 +237,20 @@ def _noisy(levels: Floats, patch: Patch) -> Floats:
 def _demosaiced(levels: Floats, patch: Patch) -> Floats:
     """Return levels seen through colour filters."""
     names = "bayer", "demosaic", "bayer_red", "bayer_blue"
-    return demosaiced(levels, *(patch.values[name] for name in names))
+    return sensor.demosaiced(levels, *(patch.values[name] for name in names))
 
 
 def _toned(levels: Floats, patch: Patch) -> Floats:
     """Return the camera's response: toe, knee, then gamma."""
     toned = levels.copy()
-    apply_tone(toned, *(patch.values[f"tone_{name}"] for name in ("gamma", "toe", "knee")))
+    sensor.apply_tone(toned, *(patch.values[f"tone_{name}"] for name in ("gamma", "toe", "knee")))
     return toned
 
 
 def _noisy_by_level(levels: Floats, patch: Patch) -> Floats:
     """Return levels with noise whose standard deviation is interpolated over the level."""
     table = patch.values["noise_table"]
-    field = normal_field(
+    field = sensor.normal_field(
         patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
         patch.values["noise_correlation"],
     )
@@ -429,17 +418,17 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("demosaicing", "colour", {
         "bayer": parameter(
             "none", "colour filters of the frame's first two by two pixels; none: a grey "
-            "camera", choices=("none", *PATTERNS),
+            "camera", choices=("none", *sensor.PATTERNS),
         ),
         "demosaic": parameter(
             "bilinear", "how colours are interpolated (OpenCV), before they are turned to grey",
-            choices=tuple(METHODS),
+            choices=tuple(sensor.METHODS),
         ),
         "bayer_red": drawn(1.0, "gain of the red pixels relative to the green ones", 0, 100),
         "bayer_blue": drawn(1.0, "gain of the blue pixels relative to the green ones", 0, 100),
     },
         needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
-        reach_px=REACH_PX, apply=_demosaiced,
+        reach_px=sensor.REACH_PX, apply=_demosaiced,
     ),
     Effect("gamma", "response", {
         "tone_gamma": drawn(
@@ -478,7 +467,7 @@ EFFECTS: tuple[Effect, ...] = (
             0, "quality of JPEG compression (OpenCV's encoder), 1 to 100; 0: not compressed", 0,
             100,
         ),
-    }, worsens=("noise", "uneven light"), block_px=BLOCK_PX),
+    }, worsens=("noise", "uneven light"), block_px=sensor.BLOCK_PX),
 )
 """Every effect, in physical order."""
 

@@ -12,43 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model import coverage
-from sweep.model.board import (
-    along_sides,
-    beside_edges,
-    edges_of,
-    extent_of,
-    facing,
-    in_space,
-    occluded_edges,
-    own_sheets,
-    rectangles,
-    sheet_boxes,
-    sheet_planes,
-    sheets_m,
-    sheets_of,
-    unit_m,
-    unseen_markers,
-    visible_prints,
-)
+from sweep.model import board, coverage, polygon
+from sweep.model.board import along_sides, extent_of, rectangles
 from sweep.model.coverage import NODES, REACH, WEIGHTS, MarkerEdges
 from sweep.model.lens import distort, folds, jacobian
-from sweep.model.polygon import (
-    PIECE_LENGTHS,
-    Optics,
-    Projection,
-    Sheet,
-    bent_point,
-    flat_sheet,
-    fold_cells,
-    folds_over,
-    half_plane,
-    is_curved,
-    plane_normal,
-    plane_point,
-    sheet_pixels,
-    signed_areas,
-)
+from sweep.model.polygon import Optics, Projection, Sheet, bent_point, plane_normal
 from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Motion, Scenes
 from sweep.model.sensor import standard_normals
@@ -106,7 +74,7 @@ def outline_extent(projection: Projection, outline: Floats, extent: Floats) -> t
     normal = plane_normal(plane)
     for j in range(len(outline)):
         height = outline[j, 2]
-        x, y, z = plane_point(plane, outline[j, 0], outline[j, 1])
+        x, y, z = polygon.plane_point(plane, outline[j, 0], outline[j, 1])
         z += height * normal[2]
         if not z > 0.0:
             behind += 1
@@ -176,7 +144,7 @@ _STREAMS = {
 
 
 def shift_waves(std_px: float, length_px: float, key: np.uint64, field: str = "geometry") -> Floats:
-    """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.polygon.Sheet`).
+    """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.Sheet`).
 
     Parameters
     ----------
@@ -212,12 +180,12 @@ class SeenSheet(NamedTuple):
     @property
     def corners(self) -> Floats:
         """Its corners (4, 3) in the camera frame, in metres."""
-        return np.asarray(in_space(self.box[None], self.plane[None])[0])
+        return np.asarray(board.in_space(self.box[None], self.plane[None])[0])
 
 
 def solid_planes(scenes: Scenes, row: int) -> Floats:
     """Return the planes (P, 3, 3) of the sheets of one scene's board."""
-    return sheet_planes(
+    return board.sheet_planes(
         scenes.targets[row], scenes.rotation[row], scenes.translation[row],
         float(scenes.effects["marker_scale"][row]),
     )
@@ -228,15 +196,14 @@ def seen_sheets(scenes: Scenes, row: int) -> list[SeenSheet]:
     target = scenes.targets[row]
     if target.is_flat:
         return [SeenSheet(0, extent_of(target).sheet, scenes.plane[row])]
-    planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
-    return [
-        SeenSheet(k, boxes[k], planes[k]) for k in np.flatnonzero(facing(target, planes)).tolist()
-    ]
+    planes, boxes = solid_planes(scenes, row), board.sheet_boxes(target)
+    numbers = np.flatnonzero(board.facing(target, planes)).tolist()
+    return [SeenSheet(k, boxes[k], planes[k]) for k in numbers]
 
 
 def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     """Return how the sheets of one scene are bent, in modules, and how their image is shifted."""
-    effect, flat = scenes.effects.of(row), flat_sheet()
+    effect, flat = scenes.effects.of(row), polygon.flat_sheet()
     waves, length_px = flat.waves, math.inf
     for field in FIELDS:
         if effect[f"{field}_px"] != 0:
@@ -251,7 +218,7 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
         math.cos(direction), -math.sin(direction),
         effect["bend"] == "saddle", waves,
         float(np.hypot(waves[:, :, 2], waves[:, :, 3]).sum(axis=1).max(initial=0.0)),
-        PIECE_LENGTHS * length_px,
+        polygon.PIECE_LENGTHS * length_px,
     )
 
 
@@ -259,7 +226,7 @@ def sheet_outline_px(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 2) along the images of the sheets; NaN if not before the camera."""
     optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
     return np.concatenate([np.empty((0, 2)), *(
-        sheet_pixels(rectangles(each.box[None], CHORDS_PER_SIDE)[0],
+        polygon.sheet_pixels(rectangles(each.box[None], CHORDS_PER_SIDE)[0],
                      Projection(each.plane, optics), bend)
         for each in seen_sheets(scenes, row)
     )])
@@ -274,8 +241,8 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
     extent = float(np.ptp(scenes.outline_px[row], axis=0).max()) if len(bend.waves[0]) else 0.0
     for each in seen_sheets(scenes, row):
         low, high = each.box[:2], each.box[2:]
-        cells = fold_cells(bend, float((high - low).max()), extent)
-        if folds_over(low, high, cells, Projection(each.plane, optics), bend):
+        cells = polygon.fold_cells(bend, float((high - low).max()), extent)
+        if polygon.folds_over(low, high, cells, Projection(each.plane, optics), bend):
             return True
     return False
 
@@ -286,11 +253,11 @@ def target_outline(scenes: Scenes, row: int) -> Floats:
     In modules: its sheets' corners, or more points under a lens or on a bent sheet.
     """
     target, bend = scenes.targets[row], scene_sheet(scenes, row)
-    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or is_curved(bend) else 1
+    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or polygon.is_curved(bend) else 1
     if target.is_flat:
         (points,) = rectangles(extent_of(target).sheet[None], per_side)
         return np.array([bent_point(column, line, bend) for column, line in points.tolist()])
-    corners = sheets_m(target) / unit_m(target) * [1.0, -1.0, 1.0]
+    corners = board.sheets_m(target) / board.unit_m(target) * [1.0, -1.0, 1.0]
     return along_sides(corners, per_side).reshape(-1, 3)
 
 
@@ -351,8 +318,8 @@ WARP_PX_PER_MODULE = 10
 
 def _outlines(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 3) along all that is printed, in the camera frame."""
-    boxes = scenes.targets.each(lambda board: extent_of(board).sheet)[rows]
-    return in_space(boxes, scenes.plane[rows], per_side)
+    boxes = scenes.targets.each(lambda target: extent_of(target).sheet)[rows]
+    return board.in_space(boxes, scenes.plane[rows], per_side)
 
 
 def _squares_px(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats:
@@ -360,11 +327,11 @@ def _squares_px(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats
 
     It is as large as ``size_m`` says, not as it is printed.
     """
-    ink = scenes.targets.each(lambda board: extent_of(board).ink)[rows]
-    origin = scenes.targets.each(lambda board: extent_of(board).origin)[rows]
+    ink = scenes.targets.each(lambda target: extent_of(target).ink)[rows]
+    origin = scenes.targets.each(lambda target: extent_of(target).origin)[rows]
     larger = 1 / scenes.effects["marker_scale"][rows] - 1
     boxes = ink + (ink - np.tile(origin, 2)) * larger[:, None]
-    return scenes.cameras.take(rows).project(in_space(boxes, scenes.plane[rows], per_side))
+    return scenes.cameras.take(rows).project(board.in_space(boxes, scenes.plane[rows], per_side))
 
 
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
@@ -410,7 +377,7 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
     """Return the extent, from ``low`` to ``high`` (2,), of the sheets that the frame can see."""
     target = scenes.targets[row]
     if (
-        len(sheets_of(target)) == 1 or scenes.renderer[row] == "warp"
+        len(board.sheets_of(target)) == 1 or scenes.renderer[row] == "warp"
         or any(each.outline != "kept" for each in scenes.effects.active_in(row))
     ):
         return low, high
@@ -420,7 +387,7 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
             each.reach_px for each in scenes.effects.plugins.all_effects
         )
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
-    sides = along_sides(sheets_m(target) * scenes.effects["marker_scale"][row], per_side)
+    sides = along_sides(board.sheets_m(target) * scenes.effects["marker_scale"][row], per_side)
     points = scenes.cameras.take(np.array([row])).project(
         sides.reshape(1, -1, 3) @ scenes.rotation[row].T + scenes.translation[row]
     ).reshape(len(sides), -1, 2)
@@ -447,7 +414,8 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         square = rectangles(extent.ink[None])[0].astype(np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
         half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
-        (points,) = in_space(extent.sheet[None] + half_px, np.array([transform], dtype=np.float64))
+        plane = np.array([transform], dtype=np.float64)
+        (points,) = board.in_space(extent.sheet[None] + half_px, plane)
         if (points[:, 2] > 0).all():
             flat = points[:, :2] / points[:, 2:]
             low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
@@ -474,7 +442,7 @@ def _exposed_extent(scenes: Scenes, row: int, low: Floats, high: Floats) -> tupl
     reach = reach + 1 if reach > 0 else 0.0
     if not motion.moves:
         return low - reach, high + reach
-    if is_curved(sheet):
+    if polygon.is_curved(sheet):
         reach += sheet.largest_px + 2
     row_time_s = motion.row_time_s
     begin, end = motion.exposed(0, int(scenes.frame[row, 1]))
@@ -521,10 +489,10 @@ def _exposed_extent(scenes: Scenes, row: int, low: Floats, high: Floats) -> tupl
 def areas_px(scenes: Scenes) -> Floats:
     """Return the projected black square's area (N,) in px², along its curved edges."""
     points = scenes.corners_px
-    area = signed_areas(points)
+    area = polygon.signed_areas(points)
     curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
     if len(curved):
-        area[curved] = signed_areas(_squares_px(scenes, curved, 256))
+        area[curved] = polygon.signed_areas(_squares_px(scenes, curved, 256))
     return np.abs(area)
 
 
@@ -539,10 +507,10 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
     """
     towards = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1)
     # A tilt of 90° is not quite one in double precision.
-    facing = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
+    shown = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
     for row in np.flatnonzero(scenes.solid).tolist():
-        facing[row] = any(
-            each.number < own_sheets(scenes.targets[row]) for each in seen_sheets(scenes, row)
+        shown[row] = any(
+            each.number < board.own_sheets(scenes.targets[row]) for each in seen_sheets(scenes, row)
         )
     behind: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
     for row in np.flatnonzero(behind).tolist():
@@ -550,9 +518,9 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
         if target.distractors and scenes.solid[row]:
             behind[row] = not np.isfinite(scenes.corners_px[row]).all()
         elif target.distractors:
-            own = in_space(extent_of(target).target[None], scenes.plane[[row]])
+            own = board.in_space(extent_of(target).target[None], scenes.plane[[row]])
             behind[row] = (own[..., 2] <= 0).any()
-    return np.asarray(~facing | behind)
+    return np.asarray(~shown | behind)
 
 
 def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -583,7 +551,7 @@ def unseen_squares(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floa
     if scenes.solid[row]:
         printed = corners_m.reshape(1, -1, 3) * scenes.effects["marker_scale"][row]
         corners = in_camera(printed).reshape(count, 4, 3)
-        unseen |= unseen_markers(scenes.targets[row], solid_planes(scenes, row), corners)
+        unseen |= board.unseen_markers(scenes.targets[row], solid_planes(scenes, row), corners)
     return unseen
 
 
@@ -604,14 +572,14 @@ def _outside(
     return outside
 
 
-def _meets_frame(polygon: Floats, limit: Floats) -> bool:
+def _meets_frame(outline: Floats, limit: Floats) -> bool:
     """Return whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
     for axis in (0, 1):
         for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
-            polygon = half_plane(polygon, sign * polygon[:, axis] - bound)
-            if len(polygon) < 3:
+            outline = polygon.half_plane(outline, sign * outline[:, axis] - bound)
+            if len(outline) < 3:
                 return False
-    return bool(np.abs(signed_areas(polygon[None])[0]) > 0)
+    return bool(np.abs(polygon.signed_areas(outline[None])[0]) > 0)
 
 
 def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
@@ -696,12 +664,12 @@ def _layers(scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool) ->
     if target.is_flat:
         (sheet,) = seen_sheets(scenes, row)
         edges = (
-            beside_edges(target) if beside
-            else occluded_edges(target, effect["occlusion"], effect["occlusion_deg"])
-            if effect["occlusion"] > 0 else edges_of(target)
+            board.beside_edges(target) if beside
+            else board.occluded_edges(target, effect["occlusion"], effect["occlusion_deg"])
+            if effect["occlusion"] > 0 else board.edges_of(target)
         )
         return [Layer(sheet, edges, target_outline(scenes, row), -math.inf, math.inf)]
-    planes, boxes = solid_planes(scenes, row), sheet_boxes(target)
+    planes, boxes = solid_planes(scenes, row), board.sheet_boxes(target)
     begin_s, end_s = motion.exposed(box[1], box[3])
     path = _path_px(scenes, row, motion, begin_s, end_s) if motion.moves else 0.0
     count = min(max(math.ceil(path / OCCLUSION_PX), 1), MAX_SHADOWS)
@@ -714,7 +682,7 @@ def _layers(scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool) ->
         moved = planes
         if motion.moves:
             moved = np.array([moved_plane(each, motion, middle) for each in planes])
-        for seen in visible_prints(target, moved, own_sheets(target) if beside else 0):
+        for seen in board.visible_prints(target, moved, board.own_sheets(target) if beside else 0):
             sheet = SeenSheet(seen.number, boxes[seen.number], planes[seen.number])
             (points,) = rectangles(sheet.box[None], per_side)
             around = np.column_stack([points, np.zeros(len(points))])

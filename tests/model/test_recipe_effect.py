@@ -70,9 +70,7 @@ pipeline = Pipeline.from_text(TEXT.format(scene="column_period_px = 3"))
 indices = [index.ravel() for index in np.indices((2, 2, 2))]
 batch = scenes_at(pipeline.experiment, indices)
 scenes, boxes, settings = batch.scenes, batch.boxes, pipeline.experiment.detectors
-(result,), _ = detections_of(
-    pipeline.experiment, batch, np.ones((8, 1), dtype=bool), [], keep=True
-)
+(result,), _ = detections_of(batch, np.ones((8, 1), dtype=bool), [], keep=True)
 box = tuple(boxes[0].tolist())
 mean, share = marker_levels(scenes, 0, box)
 cells = run_cells(pipeline.experiment, indices)

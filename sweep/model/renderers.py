@@ -12,16 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model import coverage, lens
-from sweep.model.board import (
-    Board,
-    edge_table,
-    edges_of,
-    edges_on_sheet,
-    extent_of,
-    rectangles,
-    unit_m,
-)
+from sweep.model import board, coverage, lens
+from sweep.model.board import Board, extent_of
 from sweep.model.effects import MarkerView, after_step
 from sweep.model.exposure import WARP_PX_PER_MODULE, marker_exposure
 from sweep.model.image_file import decode_grey, photograph_image
@@ -214,7 +206,7 @@ def _draw(
     images = np.empty(stops[-1], dtype=np.uint8)
     box = boxes[:, 2:] - boxes[:, :2]
     scratch = np.zeros(int(((box[:, 0] + 2) * box[:, 1]).max()))
-    table, spans = edge_table(scenes.targets.boards)
+    table, spans = board.edge_table(scenes.targets.boards)
     cameras = scenes.cameras
     coverage.draw_greys(
         coverage.Canvas(images, starts, windows, boxes, scratch),
@@ -283,12 +275,12 @@ def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
 
 
 @lru_cache(maxsize=16)
-def _board_table(board: Board) -> tuple[Floats, Floats]:
+def _board_table(target: Board) -> tuple[Floats, Floats]:
     """Return the edges (E, 6) and the prints (P, 6) of a board, as `SampledMarker` has them."""
     tables, prints, first = [], [], 0
-    for each in (*board.prints, *board.distractors):
-        outline = edges_on_sheet([each])
-        ends = outline.ends / unit_m(board)
+    for each in (*target.prints, *target.distractors):
+        outline = board.edges_on_sheet([each])
+        ends = outline.ends / board.unit_m(target)
         points = ends.reshape(-1, 2)
         tables.append(np.hstack([ends, outline.sides]))
         prints.append([first, first + len(ends), *points.min(axis=0), *points.max(axis=0)])
@@ -318,28 +310,28 @@ MAX_BITMAP_SIDE = 32_766
 """The longest side of what ``cv2.warpPerspective`` takes, whose coordinates are 16-bit integers."""
 
 
-def bitmap_shape(board: Board) -> tuple[int, int]:
+def bitmap_shape(target: Board) -> tuple[int, int]:
     """Return height and width of the bitmap that ``renderer = "warp"`` draws of a board."""
-    left, top, right, bottom = extent_of(board).sheet.tolist()
+    left, top, right, bottom = extent_of(target).sheet.tolist()
     height, width = (WARP_PX_PER_MODULE * each for each in (bottom - top, right - left))
     return math.ceil(height), math.ceil(width)
 
 
 @lru_cache(maxsize=1024)
-def _bitmap(board: Board, black: float, white: float) -> NDArray[np.float32]:
+def _bitmap(target: Board, black: float, white: float) -> NDArray[np.float32]:
     """Return a print's bitmap (height, width) at 10 px a module.
 
     Pixels on edges have the mean of their area, beside the print 0.
     """
     scale = float(WARP_PX_PER_MODULE)
-    left, top, _, _ = extent_of(board).sheet.tolist()
+    left, top, _, _ = extent_of(target).sheet.tolist()
     plane = np.array([
         [scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]
     ])
-    height, width = bitmap_shape(board)
+    height, width = bitmap_shape(target)
     cover, bitmap = np.zeros((height, width + 2)), np.empty((height, width))
     coverage.accumulate(
-        cover, edges_of(board), np.array([0.0, black, white]),
+        cover, board.edges_of(target), np.array([0.0, black, white]),
         Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
     )
     coverage.sum_levels(cover, 0.0, bitmap)
@@ -347,18 +339,18 @@ def _bitmap(board: Board, black: float, white: float) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=1024)
-def _grey_bitmap(board: Board, black: float, white: float, behind: float) -> Grey:
+def _grey_bitmap(target: Board, black: float, white: float, behind: float) -> Grey:
     """As :func:`_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
-    share = _bitmap(board, 1.0, 1.0)
-    return quantise(_bitmap(board, black, white).astype(np.float64) + (1.0 - share) * behind)
+    share = _bitmap(target, 1.0, 1.0)
+    return quantise(_bitmap(target, black, white).astype(np.float64) + (1.0 - share) * behind)
 
 
 @lru_cache(maxsize=1024)
-def _bitmap_corners(board: Board) -> NDArray[np.float32]:
+def _bitmap_corners(target: Board) -> NDArray[np.float32]:
     """Return the corners (4, 2) of what is black, TL, TR, BR, BL, in pixels of a bitmap."""
-    extent = extent_of(board)
+    extent = extent_of(target)
     square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
-    return np.asarray(rectangles(square[None])[0], dtype=np.float32)
+    return np.asarray(board.rectangles(square[None])[0], dtype=np.float32)
 
 
 def _warped(

@@ -12,27 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import drawn, parameter
+from sweep.model import board, effects
 from sweep.model import lens as lens_model
-from sweep.model.board import (
-    Board,
-    box_corners,
-    boxes_px,
-    extent_of,
-    side_m,
-    sides_m,
-    single_marker,
-)
+from sweep.model.board import Board, extent_of
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
-from sweep.model.effects import (
-    CODED,
-    NEUTRAL,
-    NO_PLUGINS,
-    PLAIN,
-    VELOCITIES,
-    Effect,
-    Patch,
-    ScenePlugins,
-)
+from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, Effect, Patch, ScenePlugins
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
@@ -130,7 +114,7 @@ class Targets:
 
     def each(self, read: Callable[[Board], Any]) -> NDArray[Any]:
         """Return (N, ...) a property of each scene's target."""
-        return np.array([read(board) for board in self.boards])[self.number]
+        return np.array([read(target) for target in self.boards])[self.number]
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,17 +274,17 @@ class Scenes:
     @property
     def dictionary(self) -> list[str]:
         """The dictionary of each scene's markers."""
-        return [board.dictionary for board in self.targets]
+        return [target.dictionary for target in self.targets]
 
     @property
     def marker_id(self) -> NDArray[np.int64]:
         """The ID of each scene's first marker, (N,)."""
-        return self.targets.each(lambda board: board.marker_ids[0])
+        return self.targets.each(lambda target: target.marker_ids[0])
 
     @property
     def solid(self) -> NDArray[np.bool_]:
         """Whether markers, or what is beside them, are in several planes, (N,)."""
-        return ~self.targets.each(lambda board: board.is_flat)
+        return ~self.targets.each(lambda target: target.is_flat)
 
     @property
     def plain(self) -> NDArray[np.bool_]:
@@ -317,16 +301,16 @@ class Scenes:
 
     def patch(self, row: int, left: int, top: int) -> Patch:
         """Return what effects on levels know of one scene; (left, top) is their first pixel."""
-        effects, (width, height) = self.effects, self.frame[row].tolist()
+        own, (width, height) = self.effects, self.frame[row].tolist()
         return Patch(
-            effects.of(row), left, top, (width, height), self.cameras.view[row],
-            effects.noise_key[row],
+            own.of(row), left, top, (width, height), self.cameras.view[row],
+            own.noise_key[row],
         )
 
     def motion(self, row: int) -> Motion:
         """Return how the target of one scene moves while its image is taken."""
         effect = self.effects.of(row)
-        velocity = np.array([effect[name] for name in VELOCITIES])
+        velocity = np.array([effect[name] for name in effects.VELOCITIES])
         velocity[3:] = np.radians(velocity[3:])
         exposure_s, row_time_s = effect["exposure_s"], effect["row_time_s"]
         if not velocity.any() or exposure_s == row_time_s == 0.0:
@@ -334,6 +318,24 @@ class Scenes:
         return Motion(
             self.translation[row], velocity, exposure_s, row_time_s, (self.frame[row, 1] - 1) / 2
         )
+
+
+def _target(
+    shown: Board | None, dictionary: str, marker_id: int, size_m: float, width: float,
+    white: float, background: float | str, occlusion: float,
+) -> Board:
+    """Return what a scene shows: a board, or a marker alone with a quiet zone of a width.
+
+    A quiet zone on a background of its own level is invisible, unless a sheet hides a part of it:
+    it is not modelled.
+    """
+    if shown is not None:
+        marker_id = shown.marker_ids[0]
+        single = shown.is_single and not shown.is_marker
+        if not single or board.side_m(shown, size_m) != size_m:
+            return shown
+    quiet = 0.0 if background == white and occlusion == 0 else float(width)
+    return board.single_marker(dictionary, int(marker_id), overhang(dictionary) + quiet)
 
 
 _DEFAULTS = NEUTRAL | {field.name: field.default for field in dataclasses.fields(Camera)}
@@ -392,29 +394,16 @@ def build_scenes(
 
     # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
     size = numbers("size_m")
-    # A quiet zone on a background of its own level is invisible, unless a sheet hides a part of
-    # it: it is not modelled.
-    keys: list[Board] = mapped(
-        lambda board, dictionary, marker_id, size_m, width, white, background, occlusion: (
-            single_marker(
-                dictionary, int(marker_id) if board is None else board.marker_ids[0],
-                overhang(dictionary)
-                + (0.0 if background == white and occlusion == 0 else float(width)),
-            )
-            if board is None
-            or (not board.is_marker and board.is_single and side_m(board, size_m) == size_m)
-            else board
-        ),
-        "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
-        "occlusion",
-    )
-    targets = Targets.of(keys)
-    modules = targets.each(lambda board: extent_of(board).modules)
-    sheet = targets.each(lambda board: extent_of(board).sheet)
-    side = sides_m(targets.boards, targets.number, size)
+    targets = Targets.of(mapped(
+        _target, "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white",
+        "background", "occlusion",
+    ))
+    modules = targets.each(lambda target: extent_of(target).modules)
+    sheet = targets.each(lambda target: extent_of(target).sheet)
+    side = board.sides_m(targets.boards, targets.number, size)
     printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
-    on_board = targets.each(lambda board: not board.is_marker)
+    on_board = targets.each(lambda target: not target.is_marker)
     half[on_board] = 0.0
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
@@ -424,17 +413,17 @@ def build_scenes(
     )
     square_m = marker_corners(size)
     around_m = marker_corners(printed * (1 + 2 * -sheet[:, 0] / modules))
-    ink = targets.each(lambda board: extent_of(board).ink)[on_board]
-    square_m[on_board] = box_corners(ink) * (side / modules)[on_board, None, None]
-    around_m[on_board] = box_corners(sheet[on_board]) * module[on_board, None, None]
+    ink = targets.each(lambda target: extent_of(target).ink)[on_board]
+    square_m[on_board] = board.box_corners(ink) * (side / modules)[on_board, None, None]
+    around_m[on_board] = board.box_corners(sheet[on_board]) * module[on_board, None, None]
     corners_px, outline_px = (
         cameras.project(transform_points(points, rotation, translation))
         for points in (square_m, around_m)
     )
-    solid = ~targets.each(lambda board: board.is_flat)
+    solid = ~targets.each(lambda target: target.is_flat)
     for row in np.flatnonzero(solid).tolist():
         camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
-        corners_px[row], outline_px[row] = boxes_px(
+        corners_px[row], outline_px[row] = board.boxes_px(
             targets[row], camera, rotation[row], translation[row], scale
         )
 
@@ -447,15 +436,15 @@ def build_scenes(
         axis=1,
     )
     own = [name for each in plugins.effects for name in each.parameters]
-    effects = {name: numbers(name) for name in (*PLAIN, *own)}
+    strengths = {name: numbers(name) for name in (*PLAIN, *own)}
     coded: dict[str, Sequence[Any]] = {}
     for name in CODED:
         coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
-        effects[name] = number[1:].astype(np.float64)
+        strengths[name] = number[1:].astype(np.float64)
     present = [each for each in plugins.all_effects if column(each.switch).differs_from(each.off)]
     active = np.zeros(count, dtype=bool)
     for each in present:
-        active |= each.is_active(effects[each.switch])
+        active |= each.is_active(strengths[each.switch])
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
@@ -470,7 +459,7 @@ def build_scenes(
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),
         effects=SceneEffects(
-            effects, coded, present, active, column("noise_key").broadcast(count, np.uint64),
+            strengths, coded, present, active, column("noise_key").broadcast(count, np.uint64),
             plugins, {name: numbers(name) for name in plugins.settings},
         ),
     )

@@ -122,10 +122,8 @@ class Experiment:
     def target_axes(self) -> tuple[Axis, ...]:
         """The axes along which targets differ by more than a number: compared, never averaged."""
         return tuple(
-            axis for axis in self.scene_axes
-            if len(axis) > 1 and axis.name != TRIAL and not axis.is_numeric and any(
-                PARAMETERS[name].section in TARGET_SECTIONS for name in axis.columns
-                if name in PARAMETERS))
+            axis for axis in self.scene_axes if len(axis) > 1 and not axis.is_numeric
+            and any(each.section in TARGET_SECTIONS for each in axis.parameters))
 
     @cached_property
     def detectors(self) -> list[AnyDetectorSetting]:

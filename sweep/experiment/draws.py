@@ -304,10 +304,7 @@ def _shifts(
     values: Mapping[str, Column], count: int, names: tuple[str, str] = SHIFTS
 ) -> Floats:
     """Return what the jitter's pixels are at the centre's depth, along x and y, (count, 2) m."""
-    focal = intrinsics(
-        *(None if values[name].missing else values[name].broadcast(count)
-          for name in VIEW_PARAMETERS)
-    )[:2]
+    focal = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))[:2]
     depth, pixels = values["distance_m"].broadcast(count), _numbers(values, names, count)
     return np.stack(
         [depth * (pixel / length) for pixel, length in zip(pixels, focal, strict=True)], axis=1

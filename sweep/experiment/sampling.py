@@ -16,7 +16,7 @@ from sweep.experiment.axes import TRIAL, Axis, parse_trial
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.parameters import Stage
-from sweep.messages import nearest, plain, shown
+from sweep.messages import nearest, shown
 
 # --------------------------------------------------------------------------------------------------
 # Numbers of trials at which waves end: after each, it is decided what else is needed.
@@ -256,22 +256,22 @@ def _true(value: Any) -> bool:
     return value
 
 
+def _half_width(written: Any) -> float:
+    percent = _PERCENT.fullmatch(written) if isinstance(written, str) else None
+    number = float(percent[1]) / 100 if percent else written
+    if isinstance(number, (int, float)) and number is not True and 0 < number < 1:
+        return float(number)
+    raise ValueError('the half-width of an interval, such as 0.02 or "5 %", above 0 and below 1')
+
+
 def _precision(value: Any) -> tuple[tuple[str, float], ...]:
     """Return the half-widths of quantities: numbers, or per cent as texts."""
     if not isinstance(value, dict) or not value:
         raise ValueError("how well quantities are to be known, such as { detection_rate = 0.02 }")
-    widths, lines = [], []
-    for name, written in sorted(value.items()):
-        percent = _PERCENT.fullmatch(written) if isinstance(written, str) else None
-        number = float(percent[1]) / 100 if percent else written
-        if isinstance(number, (int, float)) and number is not True and 0 < number < 1:
-            widths.append((name, float(number)))
-        else:
-            lines.append(f".{plain(name)} = {shown(written)}: expected the half-width of an "
-                         'interval, such as 0.02 or "5 %", above 0 and below 1')
+    widths, lines = check_table(_keys(**dict.fromkeys(value, _half_width)), value, "")
     if lines:
-        raise TablesError("half-widths", lines)
-    return tuple(widths)
+        raise TablesError("half-widths", [f".{line}" for line in lines])
+    return tuple(sorted(widths.items()))
 
 
 def _keys(**readers: Callable[[Any], Any]) -> dict[str, Declared]:

@@ -12,7 +12,6 @@ from sweep.experiment.sampling import wave_ends
 
 ALPHA = 0.05 * TAIL_SHARE
 RATES = (0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 1.0)
-HALF_WIDTHS = np.geomspace(0.005, 0.25, 24)
 
 
 def clopper_pearson(k, n):
@@ -68,56 +67,57 @@ def test_an_interval_without_smaller_tails_would_cover_less():
     assert min(plain.at(rate).coverage for rate in rates) < 0.95
 
 
-def least_coverage(rule, rng, most=120):
-    """Return the least coverage beside ends of intervals, of which ``most`` are drawn."""
-    ends = rule.critical_rates()
-    ends = ends[ends <= 0.5]  # it is symmetric
-    if len(ends) > most:
-        ends = rng.choice(ends, most, replace=False)
-    beside = np.concatenate([ends * (1 - 1e-9), ends * (1 + 1e-9)])
-    return min(rule.at(rate).coverage for rate in beside)
+def enough(half_width):
+    """Return trials that are enough for an interval of any rate."""
+    return int(1.7 / half_width**2) + 200
+
+
+def rules_of_width(half_width, rng):
+    """Yield rules of waves of any first length (those of flips are shorter) and most trials."""
+    for unit in (5, 18, 50, 64, 99):
+        for most in (enough(half_width), int(enough(half_width) * rng.uniform(0.05, 0.5)) + unit):
+            yield StoppedRate(half_width, wave_ends(most, unit))
+
+
+def rules_of_level(level, _rng):
+    """Yield rules whose intervals have another level, as requirements of many conditions need.
+
+    Trials stop by intervals of 95 %.
+    """
+    for half_width in (0.01, 0.02, 0.05):
+        yield StoppedRate(half_width, wave_ends(enough(half_width), 50), level)
+
+
+def rules_of_solved(share, rng):
+    """Yield rules of a flip rate: of the solved poses alone, whose waves have random lengths."""
+    for _ in range(10):
+        n = np.cumsum(rng.binomial(np.diff((0, *wave_ends(4500, 50))), share))
+        yield StoppedRate(0.02, tuple(np.unique(n[n > 0]).tolist()))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("half_width", HALF_WIDTHS)
-def test_the_least_coverage_of_any_rate_is_above_95_percent(half_width):
-    """Over waves of any first length (those of flips are shorter) and any largest number."""
+@pytest.mark.parametrize(("rules", "value", "most", "error"), [
+    *((rules_of_width, half_width, 120, 0.05) for half_width in np.geomspace(0.005, 0.25, 24)),
+    # At 0.9999 the error is up to 1.11 times that promised.
+    *((rules_of_level, level, 60, times * (1 - level))
+      for level, times in ((0.9, 1.0), (0.99, 1.0), (0.999, 1.0), (0.9999, 1.15))),
+    *((rules_of_solved, share, 60, 0.05) for share in (0.03, 0.3, 0.8)),
+])
+def test_the_least_coverage_of_any_rate_is_as_promised(rules, value, most, error):
+    """It lies beside an end of an interval, of which ``most`` are drawn."""
     rng = np.random.default_rng(20)
-    enough = int(1.7 / half_width**2) + 200
-    for unit in (5, 18, 50, 64, 99):
-        for most in (enough, int(enough * rng.uniform(0.05, 0.5)) + unit):
-            rule = StoppedRate(half_width, wave_ends(most, unit))
-            assert least_coverage(rule, rng) >= 0.95
+    for rule in rules(value, rng):
+        ends = rule.critical_rates()
+        ends = ends[ends <= 0.5]  # it is symmetric
+        if len(ends) > most:
+            ends = rng.choice(ends, most, replace=False)
+        beside = np.concatenate([ends * (1 - 1e-9), ends * (1 + 1e-9)])
+        assert min(rule.at(rate).coverage for rate in beside) >= 1.0 - error
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("half_width", [0.01, 0.02, 0.05, 0.1])
 def test_the_bias_of_a_rate_is_below_a_fifth_of_the_half_width(half_width):
-    rule = StoppedRate(half_width, wave_ends(int(1.7 / half_width**2) + 200, 50))
+    rule = StoppedRate(half_width, wave_ends(enough(half_width), 50))
     biases = [abs(rule.at(rate).bias) for rate in np.linspace(0.002, 0.5, 250)]
     assert max(biases) < 0.2 * half_width
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("level", "times"), [(0.9, 1.0), (0.99, 1.0), (0.999, 1.0), (0.9999, 1.15)])
-def test_intervals_of_other_levels_are_kept_too(level, times):
-    """Requirements of many conditions are decided by them, after stopping by those of 95 %.
-
-    At 0.9999 the error is up to 1.11 times that promised.
-    """
-    rng = np.random.default_rng(21)
-    for half_width in (0.01, 0.02, 0.05):
-        rule = StoppedRate(half_width, wave_ends(int(1.7 / half_width**2) + 200, 50), level)
-        assert 1.0 - least_coverage(rule, rng, 60) <= times * (1.0 - level)
-
-
-@pytest.mark.long
-def test_random_numbers_of_draws_keep_the_coverage():
-    """A flip rate is of the solved poses alone: its waves have random lengths."""
-    rng = np.random.default_rng(22)
-    for solved in (0.03, 0.3, 0.8):
-        for _ in range(10):
-            n = np.cumsum(rng.binomial(np.diff((0, *wave_ends(4500, 50))), solved))
-            rule = StoppedRate(0.02, tuple(np.unique(n[n > 0]).tolist()))
-            assert least_coverage(rule, rng, 60) >= 0.95

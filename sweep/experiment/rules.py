@@ -144,6 +144,11 @@ def _whole_frame(name: str, is_whole: Callable[[Any], bool]) -> Rule:
         f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels")
 
 
+def _without(*names: str) -> Callable[[Reading], bool]:
+    """Return what says whether none of some parameters is given."""
+    return lambda reading: reading.given.isdisjoint(names)
+
+
 def _is_calibrated(reading: Reading) -> bool:
     """Return whether an estimator believes a calibration."""
     return "calibration" in reading.values_of("believed")
@@ -159,7 +164,13 @@ SEVERAL_PLANES = "for prints with z_m or tilt_deg"
 OTHER_WAYS = (*IN_MM, *FIELDS_OF_VIEW)
 """The ways to give a camera beside focal lengths in pixels, and beside a file."""
 
+PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
+"""Parameter -> those of which one must be given beside it, or one of a rival way."""
+
 RECORDS: tuple[Rule | Exclusion, ...] = (
+    *(Exclusion((name,), _without(*others, *RIVALS.get(name, ())),
+                f"{' or '.join(others)} beside it", active=True)
+      for name, others in PARTNERS.items()),
     Rule(("marker_id", "dictionary"),
          lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
          lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
@@ -201,8 +212,8 @@ RECORDS: tuple[Rule | Exclusion, ...] = (
          "believed_focal_scale", "believed_distortion"), _is_calibrated,
         "no other belief about the camera beside believed = calibration; delete one of them"),
     # Photographs, which have their own poses and light.
-    Exclusion((SIMULATED,), lambda reading: PHOTOGRAPHS not in reading.given,
-              f"{PHOTOGRAPHS} beside it, whose poses are taken", active=True),
+    Exclusion((SIMULATED,), _without(PHOTOGRAPHS),
+              "photographs beside it, whose poses are taken", active=True),
     Exclusion(("kind",), lambda reading: PHOTOGRAPHS in reading.given and reading.shows_boards,
               "no board beside photographs, whose board `sweep photos` knows; delete it"),
     Rule(("believed", PHOTOGRAPHS), lambda believed, file: file and believed == "calibration",
@@ -545,17 +556,6 @@ def each_in_one_way(reading: Reading) -> None:
         reading.note("pose", "expected distance_m or side_px, fixed or under [axes]")
 
 
-PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
-"""Parameter -> those of which one must be given beside it."""
-
-
-def partners_are_given(reading: Reading) -> None:
-    """Demand the parameters without which another has no meaning; not those of a rival way."""
-    for name, others in PARTNERS.items():
-        if reading.is_active(name) and reading.given.isdisjoint((*others, *RIVALS.get(name, ()))):
-            reading.refuse(name, f"{' or '.join(others)} beside it")
-
-
 def what_is_installed(reading: Reading) -> None:
     """Demand detector fields, and dictionaries that are installed and that each detector has.
 
@@ -636,13 +636,13 @@ MAX_CONFIGURATIONS = 10_000
 
 def size_of_the_grid(reading: Reading) -> None:
     """Limit the number of poses and of configurations."""
-    for count, most, what in (
-        (reading.size(*Stage), MAX_POSES, f"poses: expected at most {MAX_POSES:.0e}"),
-        (reading.size(Stage.detection, Stage.estimation), MAX_CONFIGURATIONS,
-         f"detector settings times estimators: expected at most {MAX_CONFIGURATIONS:,}"),
-    ):
-        if count > most:
-            reading.note("axes", f"{min(count, 10**300):.3g} {what}")
+    poses, settings = reading.size(*Stage), reading.size(Stage.detection, Stage.estimation)
+    if poses > MAX_POSES:
+        reading.note(
+            "axes", f"{min(poses, 10**300):.3g} poses: expected at most {MAX_POSES:.0e}")
+    if settings > MAX_CONFIGURATIONS:
+        reading.note("axes", f"{min(settings, 10**300):.3g} detector settings times estimators: "
+                     f"expected at most {MAX_CONFIGURATIONS:,}")
 
 
 RULES: tuple[Callable[[Reading], None], ...] = (
@@ -653,7 +653,6 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     what_is_installed,
     boards_can_be_printed,
     targets_are_solved,
-    partners_are_given,
     check_backgrounds,
     something_random_to_repeat,
     names_are_free,

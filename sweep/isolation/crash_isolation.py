@@ -28,6 +28,7 @@ from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plugins.declared import PluginSetting
 from sweep.store.outcome import selected
+from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # Scenes that crash their process or never return, isolated in child processes.
@@ -70,8 +71,10 @@ def _hold(pipeline: Pipeline) -> None:
     _held[:] = [pipeline]
 
 
-def _run_held(*arguments: Any) -> CellsResult:
-    return run_cells(_held[0].experiment, *arguments)
+def _run_held(
+    indices: Sequence[NDArray[np.intp]], need: Masks, search_too: Masks | None = None
+) -> CellsResult:
+    return run_cells(_held[0].experiment, indices, need, search_too)
 
 
 class _IsolatedCells:

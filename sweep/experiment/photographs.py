@@ -145,11 +145,6 @@ class PhotographRecord:
         """Which marker is in which photograph, (P, M)."""
         return np.asarray(np.isfinite(self.translation).all(axis=2))
 
-    def index_of(self, marker_id: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Return the index of each of some markers; -1 for those that the record lacks."""
-        at = np.minimum(np.searchsorted(self.marker_id, marker_id), len(self.marker_id) - 1)
-        return np.where(self.marker_id[at] == marker_id, at, -1)
-
     def on_board(self, marker_id: NDArray[np.int64]) -> list[BoardMarker | None]:
         """Return the marker of the board that each of some markers is; None without a board."""
         if not self.board:
@@ -239,38 +234,39 @@ def recorded_poses(
     """
     count = len(trials)
     names = values[PHOTOGRAPHS].listed(count)
-    marker_id = values["marker_id"].broadcast(count, np.int64)
-    images: list[str] = [""] * count
-    rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
-    std, source = np.full((count, POSE), np.nan), np.zeros(count, dtype=np.uint8)
-    on_board: list[BoardMarker | None] = [None] * count
-    for name in dict.fromkeys(names):
-        rows = np.flatnonzero([each == name for each in names])
-        home = Path(folder) / name
-        record, _ = PHOTOGRAPH_RECORDS.read(home)
-        known = record.index_of(marker_id[rows])
-        numbers = trials[rows] % len(record.paths) if simulated else trials[rows]
-        if (known < 0).any() or (numbers >= len(record.paths)).any():
+    records = {
+        name: PHOTOGRAPH_RECORDS.read(Path(folder) / name)[0] for name in dict.fromkeys(names)}
+    ids = {name: record.marker_id.tolist() for name, record in records.items()}
+    boards = {name: record.on_board(record.marker_id) for name, record in records.items()}
+    places: list[tuple[str, int, int]] = []
+    wanted = values["marker_id"].broadcast(count, np.int64).tolist()
+    for name, trial, marker_id in zip(names, trials.tolist(), wanted, strict=True):
+        length = len(records[name].paths)
+        number = trial % length if simulated else trial
+        if number >= length or marker_id not in ids[name]:
             raise PluginError(f"{plain(name)}: it lacks photographs or markers of the pipeline")
-        references = [
-            reference(home.parent / path, digest, record.part)
-            for path, digest in zip(record.paths, record.digests, strict=True)
-        ]
-        printed = record.on_board(marker_id[rows])
-        for row, number, each in zip(rows.tolist(), numbers.tolist(), printed, strict=True):
-            images[row], on_board[row] = references[number], each
-        at = numbers, known
-        rotation[rows], translation[rows] = record.rotation[at], record.translation[at]
-        std[rows], source[rows] = record.std[at], record.source[at]
+        places.append((name, number, ids[name].index(marker_id)))
+
+    def recorded(field: str) -> NDArray[Any]:
+        return np.array([getattr(records[name], field)[number, marker]
+                         for name, number, marker in places])
+
+    rotation, translation = recorded("rotation"), recorded("translation")
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
-    columns: dict[str, Any] = (
-        {"neighbourhood": [_around(each) for each in on_board]} if simulated
-        else {"renderer": PHOTOGRAPH, "background": images}
-    ) | {
+    on_board = [boards[name][marker] for name, _, marker in places]
+    columns: dict[str, Any] = {"neighbourhood": [_around(each) for each in on_board]}
+    if not simulated:
+        images = {
+            (name, number): reference((Path(folder) / name).parent / records[name].paths[number],
+                                      records[name].digests[number], records[name].part)
+            for name, number in {place[:2] for place in places}
+        }
+        columns = {"renderer": PHOTOGRAPH, "background": [images[place[:2]] for place in places]}
+    columns |= {
         "on_board": on_board,
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
-        "truth": source, "truth_std": std,
+        "truth": recorded("source"), "truth_std": recorded("std"),
     }
     return {name: Column.of(column) for name, column in columns.items()}

@@ -57,7 +57,7 @@ def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
     assert Path(folder) == tmp_path / "__pycache__"
 
 
-@pytest.mark.evidence
+@pytest.mark.system
 def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package, tmp_path):
     cached = str(tmp_path / "cached")
     first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)

@@ -97,13 +97,6 @@ def holds(table, name, truth):
     return int(((table[f"{name}_low"] <= truth) & (truth <= table[f"{name}_high"])).sum())
 
 
-def assert_coverage(words, count, n, least=0.93, most=0.97):
-    """Fail a coverage within the limits with a probability below 1e-6."""
-    print(f"{words}: {count / n:.4f} of {n}")
-    assert stats.binom.cdf(count, n, least) > 5e-7, words
-    assert stats.binom.sf(count - 1, n, most) > 5e-7, words
-
-
 def simulated(rng, sizes, vectors):
     """Return a dataset of regimes; rotation in 0.01 rad, z in percent of 1 m, x and y in cm."""
     results = perfect(rng, sizes, rotation=0.01 * vectors, position=0.01 * vectors)
@@ -122,7 +115,7 @@ SCALES = {"rotation": ("deg", math.degrees(0.01)), "range": ("percent", 1.0),
 @lengths(300, 10_000)
 @pytest.mark.parametrize(("cells", "trials"), [(1, 50), (5, 10), (25, 2)])
 @pytest.mark.parametrize("tails", TAILS)
-def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count):
+def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count, covered):
     # Chance of a false alarm: below 1e-6 for each, for coverages within 0.93 ... 0.97, and of the
     # length of a mean vector within 0.95 ... 0.995, which is wide by design (`mean_length`).
     rng = np.random.default_rng([21, cells])
@@ -150,14 +143,14 @@ def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count):
             elif (statistic, name) == ("rmse", "rotation"):  # which counts flips that are not there
                 limits = (0.95, 1.0)
             label = f"{name}_{statistic}_{unit}"
-            assert_coverage(f"{tails} {cells} x {trials} {label}",
-                            holds(answer, label, scale * value), count, *limits)
+            covered(f"{tails} {cells} x {trials} {label}",
+                    holds(answer, label, scale * value), count, *limits)
 
 
 @lengths(1000, 10_000)
 @pytest.mark.parametrize("trials", first_of([50, 200], 1))
 @pytest.mark.parametrize("share", [0.01, 0.02, 0.05])
-def test_rmse_of_rare_flips_is_covered(share, trials, count):
+def test_rmse_of_rare_flips_is_covered(share, trials, count, covered):
     # Flips of 60 degrees about any axis among errors of half a degree. Chance of a false alarm
     # below 1e-6, for coverages above 0.93; 50 of 2 % are covered with 0.64 if what is not in the
     # sample does not count.
@@ -174,14 +167,14 @@ def test_rmse_of_rare_flips_is_covered(share, trials, count):
     answer = error_statistics(results, ["regime"]).compute()
     truth = math.sqrt((1 - share) * 0.25 + share * 3600)
     words = f"{share:.0%} flips, n = {trials}"
-    assert_coverage(f"{words}: RMSE", holds(answer, "rotation_rmse_deg", truth), count, 0.93, 1.0)
+    covered(f"{words}: RMSE", holds(answer, "rotation_rmse_deg", truth), count, 0.93, 1.0)
     # What flips do not touch.
     for name, value in (("rotation_rmse_unflipped_deg", 0.5), ("rotation_sd_deg", 0.5)):
-        assert_coverage(f"{words}: {name}", holds(answer, name, value), count)
+        covered(f"{words}: {name}", holds(answer, name, value), count)
     squares = stats.chi2(3)
     median = math.sqrt(squares.ppf(0.5 / (1 - share)) / 12)
-    assert_coverage(f"{words}: median", holds(answer, "rotation_median_deg", median), count,
-                    0.93, 0.99)
+    covered(f"{words}: median", holds(answer, "rotation_median_deg", median), count,
+            0.93, 0.99)
 
 
 @pytest.mark.parametrize("n", [1, 5, 20, 50, 1000])
@@ -196,7 +189,7 @@ def test_clopper_and_pearsons_interval_covers_every_rate(n):
 
 @lengths(300, 10_000)
 @pytest.mark.parametrize("lost", [0.0, 0.03])
-def test_quantiles_are_covered_at_least_as_often_as_they_say(lost, count):
+def test_quantiles_are_covered_at_least_as_often_as_they_say(lost, count, covered):
     # Chance of a false alarm below 1e-6, for coverages within 0.95 ... 1.
     rng = np.random.default_rng(22)
     trials = 200
@@ -218,13 +211,13 @@ def test_quantiles_are_covered_at_least_as_often_as_they_say(lost, count):
         for quantity, unit in (("range", "percent"), ("position", "m")):
             label = f"{quantity}_{name}_{unit}"
             scaled = truth * SCALES[quantity][1]
-            assert_coverage(f"lost {lost} {label}", holds(answer, label, scaled), count, 0.95, 1.0)
+            covered(f"lost {lost} {label}", holds(answer, label, scaled), count, 0.95, 1.0)
 
 
 @lengths(300, 10_000)
 @pytest.mark.parametrize(("first", "second"), [(0.5, 0.5), (0.8, 0.9), (0.9, 0.6), (0.97, 0.9)])
 @pytest.mark.parametrize(("cells", "trials"), [(1, 50), (5, 20)])
-def test_differences_of_paired_rates_are_covered(cells, trials, first, second, count):
+def test_differences_of_paired_rates_are_covered(cells, trials, first, second, count, covered):
     # Chance of a false alarm below 1e-6, for coverages within 0.93 ... 0.975; method 10 covers more
     # where 50 draws have rates near 1: exactly (by the reference, over all tables) 0.983.
     rng = np.random.default_rng([23, cells, int(100 * first)])
@@ -235,9 +228,9 @@ def test_differences_of_paired_rates_are_covered(cells, trials, first, second, c
     results = perfect(rng, sizes)
     answer = compare(with_detected(results, common < first), with_detected(results, own < second),
                    ["regime"]).compute()
-    assert_coverage(f"{first} and {second}, {cells} x {trials}",
-                    holds(answer, "detection_difference", second - first), count, 0.93,
-                    0.99 if (cells, first) == (1, 0.97) else 0.975)
+    covered(f"{first} and {second}, {cells} x {trials}",
+            holds(answer, "detection_difference", second - first), count, 0.93,
+            0.99 if (cells, first) == (1, 0.97) else 0.975)
     if first == second:
         false_alarms = int((answer["detection_p_value"] < 0.05).sum())
         print(f"McNemar: {false_alarms / count:.4f} below 0.05")
@@ -246,7 +239,7 @@ def test_differences_of_paired_rates_are_covered(cells, trials, first, second, c
 
 @lengths(300, 10_000)
 @pytest.mark.parametrize(("cells", "trials"), [(1, 50), (5, 10), (25, 2)])
-def test_differences_and_ratios_of_paired_errors_are_covered(cells, trials, count):
+def test_differences_and_ratios_of_paired_errors_are_covered(cells, trials, count, covered):
     # Chance of a false alarm below 1e-6, for coverages within 0.93 ... 0.97.
     rng = np.random.default_rng([24, cells])
     sizes = {"regime": count, "marker_id": cells, "trial": trials}
@@ -263,9 +256,9 @@ def test_differences_and_ratios_of_paired_errors_are_covered(cells, trials, coun
     for name, (unit, scale) in SCALES.items():
         words = f"{cells} x {trials} {name}"
         label = f"{name}_difference_{unit}"
-        assert_coverage(f"{words} difference",
-                        holds(answer, label, scale * (0.7 - 1.0) * mean_size), count)
-        assert_coverage(f"{words} ratio", holds(answer, f"{name}_rmse_ratio", 0.7), count)
+        covered(f"{words} difference",
+                holds(answer, label, scale * (0.7 - 1.0) * mean_size), count)
+        covered(f"{words} ratio", holds(answer, f"{name}_rmse_ratio", 0.7), count)
 
 
 LADDERS = {
@@ -279,7 +272,7 @@ LADDERS = {
 @pytest.mark.parametrize(("cells", "trials"), [(1, 50), (4, 25)])
 @pytest.mark.parametrize("ladder", LADDERS)
 def test_limits_of_detection_are_covered_at_least_as_often_as_they_say(
-    ladder, cells, trials, count
+    ladder, cells, trials, count, covered
 ):
     # Chance of a false alarm below 1e-6, for coverages within 0.95 ... 1.
     rng = np.random.default_rng([25, cells])
@@ -294,7 +287,7 @@ def test_limits_of_detection_are_covered_at_least_as_often_as_they_say(
     hits = holds(answer, "side_px", truth)
     found = {int(flag): int((answer["limit"] == flag).sum()) for flag in (1, 2, 3)}
     print(f"{ladder}: found {found[1]}, never {found[2]}, always {found[3]}")
-    assert_coverage(f"{ladder}, {cells} x {trials}", hits, count, 0.95, 1.0)
+    covered(f"{ladder}, {cells} x {trials}", hits, count, 0.95, 1.0)
 
 
 # Rankings.

@@ -27,15 +27,12 @@ QUICK = {
     "analysis": (["1e4", "60"], ["CALLS = dict(list(CALLS.items())[:2])"]),
     "detectors": (["--scenes", "8", "--noise", "0", "--only", "none"], []),
     "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS = 1, 3, 3.0, 1"]),
-    "fit": (["1", "3"], []),
     "kernel": ([], ["SIZES = BOARD_SIZES = SIZES[:1]", "POSES = {640: 20}", "REPEATS = 1",
                     "BOARD_POSES = {640: 2}", "DISTANCES = DISTANCES[:1]",
                     "BOARDS = dict(list(BOARDS.items())[:1])"]),
     "limit": (["20", "1", "40"], [
         "EXPERIMENT['axes'] = {'dictionary': ['DICT_4X4_50'], 'tilt_deg': [0]}",
         "EXPERIMENT['axes'] |= {'noise_grey': [2], 'side_px': [12, 30]}", "RATES = (0.9,)"]),
-    "photometric": ([], ["SCENES, SIDES, TILTS = 3, (20,), (0,)",
-                         "PHOTOGRAPHS, REAL_SIDES = 1, (20,)"]),
     "renderers": ([], ["SIDES, LENSES, SCENES = (8,), ((),), 2"]),
     "scale": (["--workers", "2", "--waves", "2", "--block-s", "0.1"], []),
     "size": (["{folder}", "smallest_marker"], [
@@ -49,8 +46,14 @@ QUICK = {
         "CASES['paper_fig4'][0].append('search.precision={ detection_rate = 0.2 }')",
         "CASES['paper_fig4'][0].append('search.max_trials=40')"]),
     "extremes": ([str(TOP / "pipelines" / "extremes" / "tilt_zero.toml")], []),
+    "photometric": ([], ["SCENES, SIDES, TILTS = 3, (20,), (0,)",
+                         "PHOTOGRAPHS, REAL_SIDES = 1, (20,)"]),
+    "fit": (["1", "3"], []),
 }
-"""Arguments of the smallest size of each, and statements that make its constants small."""
+"""Arguments of the smallest size of each, and statements that make its constants small.
+
+The last two compile most; in CI, tests beside them have done so by then.
+"""
 
 
 def file_of(name: str) -> Path:

@@ -105,7 +105,7 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
     assert named in found[check]
 
 
-@pytest.mark.evidence
+@pytest.mark.system
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
     (DETECTOR, "os.abort()", "returns markers", "SIGABRT"),
     (DETECTOR, "image.shape[0] > 8 or os._exit(3)", "has no memory", "exit status 3"),

@@ -156,7 +156,6 @@ def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
     assert any("pass --pixel-center 0.5" in line for line in wrong)
 
 
-@pytest.mark.evidence
 @pytest.mark.parametrize("form", ["rvec", "quaternion"])
 def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
     generator = np.random.default_rng(3)

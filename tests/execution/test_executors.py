@@ -92,7 +92,7 @@ def compute_in(store, child):
         compute(store, waiting, Tally(store, waiting), executor, (), 60, interrupts)
 
 
-@pytest.mark.evidence
+@pytest.mark.system
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
     monkeypatch.setattr(executors, "compute_blocks", suicide)

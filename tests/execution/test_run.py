@@ -1,6 +1,5 @@
 """A run: the same numbers however it is run, nothing computed twice, nothing mixed."""
 
-import contextlib
 import json
 import os
 import signal
@@ -59,21 +58,16 @@ def undisturbed(pipeline, tmp_path_factory):
     return url
 
 
-@pytest.mark.parametrize("extents", [
-    (1, 4, 2, 3), *(pytest.param(each, marks=pytest.mark.evidence)
-                    for each in ((1, 1, 1, 1), (2, 3, 1, 2))),
-])
-def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
+def test_block_size_changes_no_bit(pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "cut.zarr")
-    by_hand(url, pipeline, extents)
+    by_hand(url, pipeline, (1, 3, 2, 2))
     assert same(url, undisturbed)
 
 
-@pytest.mark.evidence
-@pytest.mark.parametrize("workers", [1, 2])
-def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_path):
+@pytest.mark.system
+def test_number_of_workers_changes_no_bit(pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "run.zarr")
-    summary = execute(pipeline, url, workers=workers, block_s=0.02)
+    summary = execute(pipeline, url, workers=2, block_s=0.02)
     assert same(url, undisturbed)
     assert summary.poses == summary.computed_scenes == 48
     assert summary.results == summary.computed_estimates == 192
@@ -144,27 +138,17 @@ def test_store_of_other_library_versions_is_not_continued(pipeline, tmp_path):
 
 GROWN = {
     "front": ["distance_m={values = [0.1, 0.2, 1.5]}"],
-    "middle": ["tilt_deg=[0, 20, 50]"],
-    "end": ["tilt_deg=[0, 50, 60, 70]"],
     "trial": ["trial=5"],
-    "dictionary": ['dictionary=["DICT_6X6_50", "DICT_5X5_50", "DICT_4X4_50"]'],
     "solver": ['solver=["p3p", "iterative", "ippe_square"]'],
-    "refinement": ['cornerRefinementMethod=["contour", "subpix"]'],
     "fixed": ["solver=iterative", "dictionary=DICT_5X5_50"],
     "new axis": ["background=[128, 60]"],
 }
-
-GROWN_SHORT = ("new axis",)
-"""Draws, and another axis."""
 
 GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}
 """Extents of blocks that cut each axis that grows."""
 
 
-@pytest.mark.parametrize("settings", [
-    pytest.param(settings, id=name, marks=() if name in GROWN_SHORT else pytest.mark.evidence)
-    for name, settings in GROWN.items()
-])
+@pytest.mark.parametrize("settings", GROWN.values(), ids=GROWN)
 def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
     grown = Pipeline.from_text(TEXT, settings, name="grown")
     fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
@@ -224,37 +208,14 @@ def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
     assert "x" in zarr.open_group(str(foreign), mode="r")
 
 
-@pytest.mark.evidence
-def test_two_clients_at_once_on_one_store_make_the_same_bits(pipeline, undisturbed, tmp_path):
-    path, url = tmp_path / "twice.toml", tmp_path / "twice.zarr"
-    path.write_text(TEXT)
-    create_store(str(url), pipeline, (1, 2, 1, 1))
-    with contextlib.ExitStack() as stack:
-        clients = [
-            stack.enter_context(subprocess.Popen(
-                [sys.executable, "-m", "sweep", "run", path, "--store", url, "--workers", "1"],
-                cwd=tmp_path, stderr=subprocess.PIPE, text=True))
-            for _ in range(2)
-        ]
-        for client in clients:
-            assert client.communicate()[1].count("Error") == 0
-            assert client.returncode == 0
-    assert same(str(url), undisturbed)
-
-
-LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
+LONG = "[axes]\ntrial = 1500\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("workers", [
-    [], pytest.param(["--workers", "2"], marks=pytest.mark.evidence)], ids=["small", "cluster"])
-def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys):
+def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path, capsys):
     path = tmp_path / "long.toml"
-    path.write_text(LONG if workers else LONG.replace("40000", "1500"))
-    (tmp_path / "runs").mkdir()
-    if workers:
-        create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(path), (500, 1))
-    run = [sys.executable, "-m", "sweep", "run", str(path), *workers]
+    path.write_text(LONG)
+    run = [sys.executable, "-m", "sweep", "run", str(path)]
     with subprocess.Popen(
         run, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,

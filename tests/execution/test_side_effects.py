@@ -78,7 +78,7 @@ if __name__ == "__main__":
     logging.getLogger("distributed").addHandler(Kept(level=7))
     signal.signal(signal.SIGINT, handler)
     signal.signal(signal.SIGTERM, handler)
-    how, folder = sys.argv[1:]
+    (folder,) = sys.argv[1:]
     import sweep
 
     def run(name, **options):
@@ -91,40 +91,30 @@ if __name__ == "__main__":
         changed.extend(f"{name}: {line}" for line in changes(before, settings()))
 
     changed = []
-    if how == "embedded":
-        run("embedded", workers=1)
-    else:
-        with LocalCluster(
-            n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
-        ) as cluster, Client(cluster) as client:
-            run("client", client=client)
-            try:
-                run("client", client=client, workers=0)
-            except sweep.ArgumentError:
-                pass
-            while client.futures:  # released futures go in the client's own time
-                time.sleep(0.05)
-            if how == "all of the caller's":
-                run("cluster", client=cluster)
-                run("scheduler", scheduler=cluster.scheduler_address)
-            assert client.status == "running"
-            assert client.submit(sum, [1, 2, 3]).result(timeout=30) == 6
-            assert distributed.default_client() is client
-            assert cluster.status.name == "running"
-            assert len(cluster.workers) == 1
+    run("embedded", workers=1)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+    ) as cluster, Client(cluster) as client:
+        run("client", client=client)
+        while client.futures:  # released futures go in the client's own time
+            time.sleep(0.05)
+        run("cluster", client=cluster)
+        run("scheduler", scheduler=cluster.scheduler_address)
+        assert client.status == "running"
+        assert client.submit(sum, [1, 2, 3]).result(timeout=30) == 6
+        assert distributed.default_client() is client
+        assert cluster.status.name == "running"
+        assert len(cluster.workers) == 1
     print(json.dumps(changed))
 """
 
 
-@pytest.mark.evidence
-@pytest.mark.parametrize("how", [
-    "client of the caller", pytest.param("all of the caller's", marks=pytest.mark.evidence),
-    pytest.param("embedded", marks=pytest.mark.evidence)])
-def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(how, tmp_path):
+@pytest.mark.system
+def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     ran = subprocess.run(
-        [sys.executable, script, how, tmp_path], capture_output=True, text=True, check=False,
+        [sys.executable, script, tmp_path], capture_output=True, text=True, check=False,
         timeout=300,
     )
     assert ran.returncode == 0, ran.stderr

@@ -73,7 +73,6 @@ def test_each_member_is_a_coordinate_over_the_dimension(zipped):
     assert zipped["fx_px"].attrs["units"] == "px"
 
 
-@pytest.mark.evidence
 def test_cells_are_reused_between_both_declarations(folder, zipped, apart):
     grown = {**ZIPPED, "lens": {"zip": {"fx_px": [800, 700, 600], "fy_px": [805, 700, 600]}}}
     ours, count = computed(folder / "a.zarr", grown, (2, 3), (str(folder / "zipped.zarr"),))

@@ -47,7 +47,6 @@ def shifted(shift):
 right = shifted(lambda count: 0)
 random = shifted(lambda count: 1e-5 * GENERATOR.random())
 counting = shifted(lambda count: 1e-6 * next(COUNT))
-batched = shifted(lambda count: 1e-6 * count)
 
 
 def search(settings, family):
@@ -89,12 +88,8 @@ def made(tmp_path):
 
 
 @pytest.mark.parametrize(("detector", "solvers", "named"), [
-    ("opencv", ["ippe_square", "mine:random"], "mine:random"),
     ("opencv", ["mine:counting", "mine:right"], "mine:counting"),
-    pytest.param("opencv", ["mine:batched"], "mine:batched", marks=pytest.mark.evidence),
-    pytest.param("opencv", ["mine:random", "mine:counting"], "mine:random, mine:counting",
-                 marks=pytest.mark.evidence),
-    pytest.param("mine:search", ["mine:right"], "mine:search", marks=pytest.mark.evidence),
+    ("mine:search", ["mine:right"], "mine:search"),
 ])
 def test_what_changes_from_call_to_call_is_named_and_no_block_is_damaged(
     detector, solvers, named, made, capsys

@@ -12,13 +12,9 @@ from sweep.measure.flags import DetectionStatus
 
 @pytest.mark.parametrize(
     ("pose", "axes"),
-    [pytest.param({}, {"distance_m": [0.01, 0.3], "tilt_deg": [0, 80, 180]},
-                  marks=pytest.mark.evidence),
-     ({"camera_yaw_deg": 180}, {"marker_x_m": [-0.3, 0, 0.3]}),
-     pytest.param({"marker_yaw_deg": 180, "jitter_px": 1},
-                  {"camera_x_m": [0, 0.3, 0.6], "marker_x_m": [0.3], "trial": 2},
-                  marks=pytest.mark.evidence)],
-    ids=["a corner behind", "the marker behind", "at the camera's centre"],
+    [({}, {"distance_m": [0.01, 0.3], "tilt_deg": [0, 80, 180]}),
+     ({"camera_yaw_deg": 180}, {"marker_x_m": [-0.3, 0, 0.3]})],
+    ids=["a corner behind", "the marker behind"],
 )
 def test_a_store_with_markers_behind_the_camera_is_sound(pose, axes, tmp_path):
     url = str(tmp_path / "behind.zarr")

@@ -35,7 +35,6 @@ def true_corners(number):
     return points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
 
 
-@pytest.mark.evidence
 def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
     _, results = made
     errors = []
@@ -102,7 +101,6 @@ def test_corners_and_poses_are_those_of_a_plain_loop_over_the_files(made):
     assert compared == shown - 2  # the covered marker
 
 
-@pytest.mark.evidence
 def test_a_photograph_is_the_draw_of_every_interval(made):
     _, results = made
     table = error_statistics(results, per="cornerRefinementMethod")

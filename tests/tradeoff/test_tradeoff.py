@@ -1,12 +1,10 @@
 """What accuracy costs, from a store to the tables: `sweep tradeoff`, and how costs are measured."""
 
-import _thread
 import contextlib
 import io
 import itertools
 import json
 import math
-import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +20,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.messages import to_json
 from sweep.store.lifecycle import create_store
-from sweep.tradeoff import costs as configuration_costs
 from sweep.tradeoff import costs as paired_timing
 from sweep.tradeoff import costs as scene_sample
 from sweep.tradeoff import measurement as tradeoff
@@ -220,7 +217,6 @@ def test_costs_are_in_order(trade):
     assert values(trade, "cost_ms") == pytest.approx(total, rel=0.2)
 
 
-@pytest.mark.evidence
 def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trade):
     with xr.open_zarr(store) as before, xr.open_zarr(store, group="cost") as cost:
         results, spent = before.load(), cost.load()
@@ -250,7 +246,6 @@ def renderers(renderer_store):
     return json.loads(told(renderer_store, "--seconds", "0.4", "--json"))
 
 
-@pytest.mark.evidence
 def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(renderers, renderer_store):
     content = renderers["renderers"]
     order = content["coords"]["renderer"]["data"]
@@ -311,28 +306,6 @@ def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(
 
 
 # Ctrl-C.
-
-@pytest.mark.evidence
-def test_ctrl_c_while_costs_are_measured_leaves_the_store_as_it_was(
-    store, trade, monkeypatch
-):
-    assert trade
-    with xr.open_zarr(store, group="cost/tradeoff") as written:
-        before = written.load()
-    monkeypatch.setattr(paired_timing, "NARROW", 0.0)
-
-    def interrupted(*arguments):
-        threading.Timer(0.3, _thread.interrupt_main).start()
-        return time_in_turns(*arguments)
-
-    monkeypatch.setattr(configuration_costs, "time_in_turns", interrupted)
-    code, out, err = command(store, "--seconds", "20")
-    assert (code, out) == (130, "")
-    assert err.splitlines()[-1].startswith("stopped")
-    assert err.count("\n") == 3
-    assert status(store).finished
-    with xr.open_zarr(store, group="cost/tradeoff") as written:
-        assert written.load().identical(before)
 
 
 # How costs are measured, on a clock of our own.

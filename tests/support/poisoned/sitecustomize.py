@@ -22,7 +22,6 @@ import ctypes
 import dataclasses
 import importlib.abc
 import importlib.machinery
-import itertools
 import json
 import os
 import signal
@@ -32,18 +31,8 @@ import time
 from pathlib import Path
 
 
-def _sleep():
-    while True:
-        time.sleep(1.0)
-
-
-def _spin():
-    """Never return, in C, without ever giving up the interpreter's lock."""
-    collections.deque(itertools.repeat(None), maxlen=0)
-
-
 def _hold():
-    """As ``_spin``, without using the processor."""
+    """Never return, in C, without ever giving up the interpreter's lock."""
     ctypes.PyDLL(None).sleep(1_000_000)
 
 
@@ -55,10 +44,7 @@ WAYS = {
     "segv": lambda: ctypes.string_at(0),
     "abort": os.abort,
     "ill": lambda: os.kill(os.getpid(), signal.SIGILL),
-    "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "exit": lambda: os._exit(3),
-    "sleep": _sleep,
-    "spin": _spin,
     "hold": _hold,
     "raise": _raise,
 }
@@ -231,8 +217,7 @@ class _Finder(importlib.abc.MetaPathFinder):
 
         def load_and_wrap(module):
             load(module)
-            poison = _Poison(module, sys.modules["sweep.evaluation.search"], *self._given)
-            poison.note("start")
+            _Poison(module, sys.modules["sweep.evaluation.search"], *self._given)
 
         spec.loader.exec_module = load_and_wrap
         return spec

@@ -471,8 +471,18 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
 
 
 def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
-    """Write a dataset to a group of a finished store, and consolidate the metadata again."""
-    _write_groups(store, {name: content}, store.run_metadata)
+    """Write a dataset to a group of a finished store, and consolidate the metadata again.
+
+    Files of an earlier dataset go first: with other dimensions, one's folder is the other's file.
+    """
+    files = store.run_metadata["files"]
+    others = {key: each for key, each in files.items() if not key.startswith(f"{name}/")}
+    metadata = {**store.run_metadata, "files": others}
+    if len(others) < len(files):
+        with translate_errors(store.url, "written"):
+            write_root(store, metadata)
+            sync(store.storage.delete_dir(name))
+    _write_groups(store, {name: content}, metadata)
 
 
 def _write_groups(

@@ -253,7 +253,7 @@ def detections_of(
     ]
     imaged = wanted & np.array([keep or source.needs_images for source in sources])
     row_s = np.zeros(len(batch.scenes))
-    for rows in _groups(np.flatnonzero(imaged.any(axis=1)), rendered, batch.scenes.plain):
+    for rows in _groups(np.flatnonzero(imaged.any(axis=1)), rendered, batch.scenes):
         begun = time.perf_counter()
         images = images_of(render_all, batch, rows, rendered, failures)
         row_s[rows] = (time.perf_counter() - begun) / len(rows)
@@ -330,16 +330,16 @@ GROUP_PX = 1 << 24
 
 
 def _groups(
-    rows: NDArray[np.intp], windows: Integers, plain: Masks
+    rows: NDArray[np.intp], windows: Integers, scenes: Scenes
 ) -> Iterator[NDArray[np.intp]]:
     """Cut rows into runs whose windows have about ``GROUP_PX`` pixels, at least one each.
 
-    A scene that is not ``plain`` (N,) is rendered alone, so that its time is its own.
+    A scene that is not plain is rendered alone, so that its time is its own.
     """
     if not len(rows):
         return
     size = windows[rows, 2:] - windows[rows, :2]
     number = np.cumsum(size[:, 0] * size[:, 1]) // GROUP_PX
-    alone = ~plain[rows]
+    alone = ~scenes.plain(rows)
     cuts = (np.diff(number) != 0) | alone[1:] | alone[:-1]
     yield from np.split(rows, np.flatnonzero(cuts) + 1)

@@ -16,7 +16,7 @@ from sweep.model import marker
 from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges, joined
 from sweep.model.marker import BLACK, OCCLUDER, OUTSIDE, WHITE
-from sweep.model.polygon import half_plane
+from sweep.model.polygon import following, half_plane
 from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers, Masks
 
@@ -352,18 +352,17 @@ def _box(ends: Floats) -> Floats:
 
 def along_sides(corners: Floats, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, D) along the sides of quadrilaterals (n, 4, D)."""
+    if per_side == 1:
+        return corners
     t = np.arange(per_side)[:, None] / per_side
-    sides = (np.roll(corners, -1, axis=1) - corners)[:, :, None]
+    sides = (following(corners) - corners)[:, :, None]
     return (corners[:, :, None] + t * sides).reshape(len(corners), 4 * per_side, corners.shape[2])
 
 
 def rectangles(boxes: Floats, per_side: int = 1) -> Floats:
     """Return points (n, 4 · per_side, 2) along boxes (n, 4), from the top left: right and down."""
-    left, top, right, bottom = boxes.T
-    across = np.stack([left, right, right, left], axis=1)
-    return along_sides(
-        np.stack([across, np.stack([top, top, bottom, bottom], axis=1)], axis=2), per_side
-    )
+    corners = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(len(boxes), 4, 2)
+    return along_sides(corners, per_side)
 
 
 def in_space(boxes: Floats, planes: Floats, per_side: int = 1) -> Floats:

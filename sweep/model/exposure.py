@@ -18,7 +18,7 @@ from sweep.model.coverage import NODES, REACH, WEIGHTS, MarkerEdges
 from sweep.model.lens import distort, folds, jacobian
 from sweep.model.polygon import Optics, Projection, Sheet, bent_point, plane_normal
 from sweep.model.pose import transform_points
-from sweep.model.scene import Box, Motion, Scenes
+from sweep.model.scene import Box, Motion, Scenes, kept_for_row
 from sweep.model.sensor import standard_normals
 from sweep.typing import Floats, Masks
 
@@ -201,6 +201,7 @@ def seen_sheets(scenes: Scenes, row: int) -> list[SeenSheet]:
     return [SeenSheet(k, boxes[k], planes[k]) for k in numbers]
 
 
+@kept_for_row
 def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     """Return how the sheets of one scene are bent, in modules, and how their image is shifted."""
     effect, flat = scenes.effects.of(row), polygon.flat_sheet()
@@ -247,6 +248,7 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
     return False
 
 
+@kept_for_row
 def target_outline(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 3) around the target of one scene: column, row, height over its plane.
 

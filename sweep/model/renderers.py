@@ -133,7 +133,7 @@ def render_all(
     if lost.any():
         window, box = windows[lost][0].tolist(), boxes[lost][0].tolist()
         raise ValueError(f"window {window} does not hold the marker's box {box}")
-    plain = scenes.plain[rows]
+    plain = scenes.plain(rows)
     if plain.all():
         return _draw(scenes, rows, boxes, windows)
     return [

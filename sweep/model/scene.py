@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +118,23 @@ class Targets:
         return np.array([read(target) for target in self.boards])[self.number]
 
 
+Returned = TypeVar("Returned")
+
+
+def kept_for_row(function: Callable[[Any, int], Returned]) -> Callable[[Any, int], Returned]:
+    """Make a function of scenes and a row keep what it returned for the row that was asked last."""
+
+    @functools.wraps(function)
+    def kept(scenes: Any, row: int) -> Returned:
+        last, returned = scenes.memo.get(function, (-1, None))
+        if last != row:
+            returned = function(scenes, row)
+            scenes.memo[function] = row, returned
+        return cast("Returned", returned)
+
+    return kept
+
+
 @dataclass(frozen=True, slots=True)
 class SceneEffects:
     """The effects of N scenes: exposure, sensor and light.
@@ -134,6 +152,8 @@ class SceneEffects:
         (N,) keys of the noise.
     plugins, settings
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
+    memo
+        What :func:`kept_for_row` keeps.
     """
 
     values: Mapping[str, Floats]
@@ -143,6 +163,7 @@ class SceneEffects:
     noise_key: NDArray[np.uint64]
     plugins: ScenePlugins
     settings: Mapping[str, Floats]
+    memo: dict[Any, tuple[int, Any]] = field(default_factory=dict, init=False)
 
     def __getitem__(self, name: str) -> Floats:
         return self.values[name]
@@ -151,6 +172,7 @@ class SceneEffects:
         """Return whether an effect is active whose record has ``outline = change``, (N,)."""
         return self._any_active(lambda effect: effect.outline == change)
 
+    @kept_for_row
     def of(self, row: int) -> dict[str, Any]:
         """Return the parameters of one scene: numbers, NaN if not given, texts and lists."""
         numbers = {name: float(column[row]) for name, column in self.values.items()}
@@ -252,6 +274,8 @@ class Scenes:
         One value for each scene.
     effects
         Motion, optics, light, sensor and processing.
+    memo
+        What :func:`kept_for_row` keeps.
     """
 
     cameras: Cameras
@@ -267,6 +291,7 @@ class Scenes:
     renderer: Sequence[str]
     background: Sequence[float | str]
     effects: SceneEffects
+    memo: dict[Any, tuple[int, Any]] = field(default_factory=dict, init=False)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -286,14 +311,17 @@ class Scenes:
         """Whether markers, or what is beside them, are in several planes, (N,)."""
         return ~self.targets.each(lambda target: target.is_flat)
 
-    @property
-    def plain(self) -> NDArray[np.bool_]:
-        """Whether images are exact, of one plane on one level, without effects, (N,)."""
+    def plain(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return whether images of scenes ``rows`` (n,) are exact, without effects, on one level.
+
+        And of one plane.
+        """
         exact = [
-            name == "exact" and not isinstance(behind, str)
-            for name, behind in zip(self.renderer, self.background, strict=True)
+            self.renderer[row] == "exact" and not isinstance(self.background[row], str)
+            for row in rows.tolist()
         ]
-        return np.array(exact, dtype=bool) & ~self.solid & ~self.effects.active
+        flat = self.targets.take(rows).each(lambda board: board.is_flat)
+        return np.asarray(np.array(exact, dtype=bool) & flat & ~self.effects.active[rows])
 
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
@@ -307,6 +335,7 @@ class Scenes:
             own.noise_key[row],
         )
 
+    @kept_for_row
     def motion(self, row: int) -> Motion:
         """Return how the target of one scene moves while its image is taken."""
         effect = self.effects.of(row)

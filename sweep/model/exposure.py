@@ -359,7 +359,9 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         low[warp_rows], high[warp_rows] = _warp_extent(scenes, warp_rows)
     for row in np.flatnonzero(((low < 0) | (high > limit - 1)).any(axis=1)).tolist():
         low[row], high[row] = _in_frame(scenes, row, low[row], high[row])
-    for row in np.flatnonzero(scenes.effects.active & np.isfinite(low).all(axis=1)).tolist():
+    widened = scenes.effects.any_active(
+        lambda effect: effect.spread_px is not None or effect.outline == "moving")
+    for row in np.flatnonzero(widened & np.isfinite(low).all(axis=1)).tolist():
         low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
     block = np.ones((len(scenes), 1))
     for effect in scenes.effects.present:

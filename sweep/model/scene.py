@@ -170,7 +170,7 @@ class SceneEffects:
 
     def outlines(self, change: str) -> NDArray[np.bool_]:
         """Return whether an effect is active whose record has ``outline = change``, (N,)."""
-        return self._any_active(lambda effect: effect.outline == change)
+        return self.any_active(lambda effect: effect.outline == change)
 
     @kept_for_row
     def of(self, row: int) -> dict[str, Any]:
@@ -189,8 +189,8 @@ class SceneEffects:
     @property
     def noise_coarseness(self) -> NDArray[np.int64]:
         """0 for scenes without noise of pixels, 1 with it, 2 with coarse noise, (N,)."""
-        noisy = self._any_active(lambda effect: effect.widens == "noise")
-        coarse = self._any_active(lambda effect: "noise" in effect.worsens)
+        noisy = self.any_active(lambda effect: effect.widens == "noise")
+        coarse = self.any_active(lambda effect: "noise" in effect.worsens)
         return noisy * (1 + coarse.astype(np.int64))
 
     @property
@@ -199,11 +199,11 @@ class SceneEffects:
 
         Infinite beside an effect that makes it steeper.
         """
-        uneven = self._any_active(lambda effect: effect.widens == "uneven light")
-        steep = self._any_active(lambda effect: "uneven light" in effect.worsens)
+        uneven = self.any_active(lambda effect: effect.widens == "uneven light")
+        steep = self.any_active(lambda effect: "uneven light" in effect.worsens)
         return np.where(uneven, np.where(steep, np.inf, np.maximum(self.values["gain"], 1.0)), 0.0)
 
-    def _any_active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
+    def any_active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
         """Return whether one of the effects that are concerned is active, (N,)."""
         active = np.zeros(len(self.active), dtype=bool)
         for effect in filter(concerned, self.present):

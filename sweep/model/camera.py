@@ -101,19 +101,9 @@ SQUARE_RTOL = 1e-12
 
 
 def intrinsics(
-    width_px: Any,
-    height_px: Any,
-    sensor_width_mm: Any,
-    sensor_height_mm: Any,
-    focal_length_mm: Any,
-    fx_px: Any,
-    fy_px: Any,
-    cx_px: Any,
-    cy_px: Any,
-    hfov_deg: Any = None,
-    vfov_deg: Any = None,
-    pixel_size_um: Any = None,
-    dfov_deg: Any = None,
+    width_px: Any, height_px: Any, sensor_width_mm: Any, sensor_height_mm: Any,
+    focal_length_mm: Any, fx_px: Any, fy_px: Any, cx_px: Any, cy_px: Any, hfov_deg: Any = None,
+    vfov_deg: Any = None, pixel_size_um: Any = None, dfov_deg: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Return fx, fy, cx, cy in pixels (numbers or arrays, as the arguments of :class:`Camera`)."""
     if fx_px is not None:

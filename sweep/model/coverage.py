@@ -400,7 +400,7 @@ def accumulate_sheet(
     sigma: float, sheet: Sheet,
 ) -> None:
     """As :func:`accumulate`, of a sheet that may be bent or shifted."""
-    if polygon.is_curved(sheet):
+    if sheet.curvature != 0.0 or sheet.waves.shape[1] > 0:
         accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
     else:
         accumulate(cover, edges, levels, projection, left, top, sigma)

@@ -255,9 +255,11 @@ def target_outline(scenes: Scenes, row: int) -> Floats:
     In modules: its sheets' corners, or more points under a lens or on a bent sheet.
     """
     target, bend = scenes.targets[row], scene_sheet(scenes, row)
-    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or polygon.is_curved(bend) else 1
+    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] or bend.is_curved else 1
     if target.is_flat:
         (points,) = rectangles(extent_of(target).sheet[None], per_side)
+        if not bend.is_curved:
+            return np.column_stack([points, np.zeros(len(points))])
         return np.array([bent_point(column, line, bend) for column, line in points.tolist()])
     corners = board.sheets_m(target) / board.unit_m(target) * [1.0, -1.0, 1.0]
     return along_sides(corners, per_side).reshape(-1, 3)
@@ -281,6 +283,8 @@ def spread_px(scenes: Scenes, row: int, inverse_depth: Floats, blurred: bool = F
 
 def largest_spread_px(scenes: Scenes, row: int) -> float:
     """Return the largest point spread on the target, at a corner of a sheet, with sharpening's."""
+    if all(each.spread_px is None for each in scenes.effects.active_in(row)):
+        return 0.0
     depths = np.concatenate([[], *(each.corners[:, 2] for each in seen_sheets(scenes, row))])
     return float(spread_px(scenes, row, 1 / depths, blurred=True).max(initial=0.0))
 
@@ -441,12 +445,13 @@ def _exposed_extent(scenes: Scenes, row: int, low: Floats, high: Floats) -> tupl
     NaN if the image has no meaning while rows that see the marker are exposed. At an instant a
     marker is seen by those rows that it covers and that are exposed then.
     """
-    motion, sheet = scenes.motion(row), scene_sheet(scenes, row)
+    motion = scenes.motion(row)
     reach = largest_spread_px(scenes, row) * REACH
     reach = reach + 1 if reach > 0 else 0.0
     if not motion.moves:
         return low - reach, high + reach
-    if polygon.is_curved(sheet):
+    sheet = scene_sheet(scenes, row)
+    if sheet.is_curved:
         reach += sheet.largest_px + 2
     row_time_s = motion.row_time_s
     begin, end = motion.exposed(0, int(scenes.frame[row, 1]))

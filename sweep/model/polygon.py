@@ -234,17 +234,16 @@ class Sheet(NamedTuple):
     largest_px: float
     piece_px: float
 
+    @property
+    def is_curved(self) -> bool:
+        """Whether it is bent, or its image shifted."""
+        return self.curvature != 0 or self.waves.shape[1] > 0
+
 
 @compiled_inline
 def flat_sheet() -> Sheet:
     """Return a sheet without bend and shift."""
     return Sheet(0.0, 0.0, 0.0, 1.0, 0.0, False, np.zeros((2, 0, 4)), 0.0, math.inf)
-
-
-@compiled_inline
-def is_curved(sheet: Sheet) -> bool:
-    """Return whether a sheet is bent or its image shifted."""
-    return sheet.curvature != 0.0 or sheet.waves.shape[1] > 0
 
 
 @compiled_inline

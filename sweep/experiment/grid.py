@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cached_property
@@ -129,16 +129,11 @@ class Grid:
                for name in ("size_m", "blur_px", "noise_grey")},
         }
 
-    def arrangements(self, names: Collection[str] = ARRANGING) -> Iterator[tuple[Any, ...]]:
-        """Yield the values of `ARRANGING` of each combination of the axes of some parameters.
-
-        Those along other axes have their first value.
-        """
-        first = {name: self.values_of(name)[0] for name in ARRANGING}
-        axes = [axis for axis in self.axes if not set(axis.columns).isdisjoint(names)]
+    def arrangements(self) -> Iterator[tuple[Any, ...]]:
+        """Yield the values of `ARRANGING` of each combination of their axes."""
+        axes = [axis for axis in self.axes if not axis.columns.keys().isdisjoint(ARRANGING)]
         for chosen in combinations(axes):
-            board = first | chosen
-            yield tuple(board[name] for name in ARRANGING)
+            yield tuple({**self.fixed, **chosen}[name] for name in ARRANGING)
 
     @property
     def shows_boards(self) -> bool:
@@ -159,7 +154,7 @@ class Grid:
         if not self.shows_boards:
             return 1, 0
         markers, corners = zip(
-            *(arranged(values).counts for values in self.arrangements(_SIZED_BY)), strict=True)
+            *(arranged(values).counts for values in self.arrangements()), strict=True)
         return max(markers), max(corners)
 
     @property
@@ -167,7 +162,7 @@ class Grid:
         """The least and the largest side of a marker over ``size_m``: listed ones have own."""
         listed = [
             each.size_m / values[ARRANGING.index("size_m")]
-            for values in self.arrangements(("kind", "size_m", "markers"))
+            for values in self.arrangements()
             if isinstance(board := arranged(values), Markers) for each in board.markers
         ] if self.any_value("markers", bool) else []
         return min(listed, default=1.0), max(listed, default=1.0)
@@ -181,11 +176,6 @@ class Grid:
     def shows_photographs(self) -> bool:
         """Whether the images are photographs, not simulated at their poses."""
         return PHOTOGRAPHS in self.given and not self.is_simulated
-
-
-_SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_pattern", "tagCols",
-             "tagRows", "markers")
-"""The parameters that a board's numbers of markers and corners depend on."""
 
 
 # --------------------------------------------------------------------------------------------------

@@ -99,6 +99,8 @@ class Effect:
         Standard deviation of the point spread that it adds, in px, by its parameters, the focal
         length in px and inverse depths (...) in 1/m; those of several add in quadrature. Printed
         edges reach so far beyond their place that their windows are widened by it.
+    by_depth
+        Whether that depends on depth: then each sheet and pixel has a point spread of its own.
     reach_px, block_px
         How far around a pixel it mixes pixels, and the side of the blocks, counted from the frame's
         corner, of which it changes all pixels: windows are widened by them.
@@ -119,6 +121,7 @@ class Effect:
     worsens: tuple[Literal["noise", "uneven light"], ...] = ()
     outline: Literal["kept", "curved", "moving", "covered"] = "kept"
     spread_px: Callable[[Mapping[str, float], float, Floats], Floats] | None = None
+    by_depth: bool = False
     reach_px: int = 0
     block_px: int = 1
     apply: Callable[[Floats, Patch], Floats] | None = None
@@ -339,7 +342,7 @@ EFFECTS: tuple[Effect, ...] = (
         needs={
             "aperture_mm": ("focus_distance_m",), "focus_distance_m": ("aperture_mm",),
         },
-        spread_px=_defocus_px,
+        spread_px=_defocus_px, by_depth=True,
     ),
     Effect("image shift", "edges", {
         "geometry_px": drawn(

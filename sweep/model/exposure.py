@@ -291,7 +291,7 @@ def largest_spread_px(scenes: Scenes, row: int) -> float:
 
 def is_defocused(scenes: Scenes, row: int) -> bool:
     """Return whether the point spread of one scene depends on depth."""
-    return not math.isnan(scenes.effects["aperture_mm"][row])
+    return any(each.by_depth for each in scenes.effects.active_in(row))
 
 
 def defocus_px(

@@ -172,9 +172,6 @@ def test_window_has_the_pixels_of_the_whole_frame(count, name):
             np.testing.assert_array_equal(image, frame[top:bottom, left:right])
 
 
-# Extremes.
-
-
 # What follows from the declarations.
 
 def test_effects_are_axes_and_distributions_and_the_bound_says_that_it_lacks_them():

@@ -29,7 +29,7 @@ from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
-from sweep.model.effects import Effects
+from sweep.model.effects import NEUTRAL, VELOCITIES
 from sweep.model.exposure import (
     defocus_px,
     marker_boxes,
@@ -40,7 +40,6 @@ from sweep.model.exposure import (
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
 
-NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0
 
 
@@ -295,12 +294,6 @@ def test_defocus_is_each_pixels_own_gaussian(count):
 
 
 # Motion: the mean of exact frames of a marker that is moved here.
-
-VELOCITIES = (
-    "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
-    "rotation_x_deg_s", "rotation_y_deg_s", "rotation_z_deg_s",
-)
-
 
 def moved(value, instant):
     """The plane (3, 3) of a marker ``instant`` seconds after the truth."""

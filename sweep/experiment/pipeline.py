@@ -263,16 +263,6 @@ class Pipeline(Grid):
         """The title, or without one the name, as it can be printed."""
         return self.title.strip() or plain(self.name)
 
-    def cell_at(self, index: Mapping[str, int]) -> dict[str, Any]:
-        """Return the value of each parameter that varies, and ``trial``, at indices along axes.
-
-        Axes that ``index`` does not name are left out.
-        """
-        return {
-            name: value for axis in self.axes if axis.name in index
-            for name, value in axis.at(index[axis.name]).items()
-        }
-
     @staticmethod
     def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
         """Read a pipeline file.
@@ -574,13 +564,18 @@ def _row(axis: Axis, value: Any) -> int:
     raise ValueError(f'a number from 0 to {len(axis) - 1}, or a label such as "{axis.values[0]}"')
 
 
-def selection_text(coordinates: Mapping[str, Any]) -> str:
-    """Return a cell's coordinates as ``--at`` takes them.
+def selection_text(pipeline: Pipeline, index: Mapping[str, int]) -> str:
+    """Return the cell at indices along axes as ``--at`` takes it; other axes are left out.
 
-    >>> selection_text({"distance_m": 0.3, "guarded": True, "distortion": (0.1, 0.0)})
-    'distance_m=0.3,guarded=true,distortion=[0.1,0.0]'
+    >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1}, "axes": {
+    ...     "guarded": [True, False], "distortion": [[], [0.1, 0, 0, 0]], "tilt_deg": [0, 30]}})
+    >>> selection_text(pipeline, {"guarded": 0, "distortion": 1})
+    'guarded=true,distortion=[0.1,0.0,0.0,0.0]'
     """
-    return ",".join(f"{name}={_written(value)}" for name, value in coordinates.items())
+    return ",".join(
+        f"{name}={_written(value)}" for axis in pipeline.axes if axis.name in index
+        for name, value in axis.at(index[axis.name]).items()
+    )
 
 
 def _written(value: Any) -> str:

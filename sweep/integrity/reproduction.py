@@ -125,7 +125,7 @@ def reproduce(
     difference = "" if stored is None else compare(
         recomputed, stored, store.variables, same_processor=exact
     )
-    full_at = selection_text(pipeline.cell_at(index))
+    full_at = selection_text(pipeline, index)
     cell_pipeline = cell(pipeline, full_at)
     inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
     return Reproduction(

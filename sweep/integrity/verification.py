@@ -333,10 +333,9 @@ def _part(pipeline: Pipeline, stage: Stage, configuration: int) -> str:
 def _at(store: RunStore, scene: Scene) -> str:
     """Return a scene as ``sweep repro`` takes it."""
     block, number = scene
-    return "--at " + selection_text({
-        axis.name: axis.values[index] for axis, index in zip(
-            store.pipeline.experiment.scene_axes, store.blocks[block].cell(number), strict=True)
-    })
+    names = (axis.name for axis in store.pipeline.experiment.scene_axes)
+    index = dict(zip(names, store.blocks[block].cell(number), strict=True))
+    return "--at " + selection_text(store.pipeline, index)
 
 
 # --------------------------------------------------------------------------------------------------

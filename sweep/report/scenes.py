@@ -427,7 +427,7 @@ def scenes_of(data: ReportData) -> Iterator[Scene]:
 
 def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
     stored = stored_cell(data, index)
-    at = selection_text(data.pipeline.cell_at(index))
+    at = selection_text(data.pipeline, index)
     command = f"sweep show {pipeline_file(data.pipeline)}"
     command += f" --at {shlex.quote(at)}" if at else ""
     detection = DetectionStatus(int(stored["detection"]))

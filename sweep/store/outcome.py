@@ -68,7 +68,7 @@ def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
         if number is not None and axes:
             index = np.unravel_index(number, [len(axis) for axis in axes])
             indices |= {axis.name: int(k) for axis, k in zip(axes, index, strict=True)}
-    return selection_text(pipeline.cell_at(indices))
+    return selection_text(pipeline, indices)
 
 
 def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.Dataset:
@@ -238,7 +238,7 @@ def outcome_of_finished(store: RunStore) -> Outcome:
 
 def first_cell(store: RunStore) -> str:
     """Return the first cell of a store's grid, as ``sweep repro --at`` takes it."""
-    return selection_text({axis.name: axis.values[0] for axis in store.pipeline.axes})
+    return selection_text(store.pipeline, {axis.name: 0 for axis in store.pipeline.axes})
 
 
 def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:

@@ -112,8 +112,9 @@ def test_a_cell_is_named_by_values_a_label_or_a_number():
         assert (fixed["fx_px"], fixed["fy_px"]) == (fx, fy), at
         assert [axis.name for axis in cell(grid, at).axes] == ["trial"]
     index = {"lens": 1, "tilt_deg": 0, "trial": 0}
-    text = selection_text(grid.cell_at(index))
+    text = selection_text(grid, index)
     assert text == "fx_px=800.0,fy_px=805.0,tilt_deg=0.0,trial=0"
+    assert cell(grid, text).fixed["fy_px"] == 805
     for at, line in (
         ("lens=3", 'expected a number from 0 to 2, or a label such as "600, 600"'),
         ("lens=600", "expected a number from 0 to 2"),

@@ -91,10 +91,11 @@ def covered(results, name, value):
     # ... and in 12,000 with one of 1e-9.
     pytest.param(12_000, 0.93, marks=pytest.mark.evidence),
 ])
-def test_intervals_cover(sims, least):
+def test_intervals_cover(sims, least, claim):
     even = dataset(sims)
     shares = {name: covered(even, name, value)[0] for name, value in true_values().items()}
-    print(shares)
+    claim("95 % intervals of Sobol' draws", "quadrature; 12,000 simulations",
+          max(0.0, 95 - 100 * min(shares.values())), "% below 95 %")
     assert min(shares.values()) >= least
 
 

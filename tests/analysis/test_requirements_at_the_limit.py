@@ -31,11 +31,20 @@ def simulated(draws, conditions=1, simulations=SIMULATIONS, **errors):
     return perfect(np.random.default_rng(draws), sizes, **errors)
 
 
-def count_of(decision, results, text, name):
-    table = check_requirements(results, [text], per=["side_px"])
-    found = (table["decision"] == decision).any("side_px")
-    print(f"{name}: {decision.name} in {int(found.sum())} of {found.size}")
-    return int(found.sum())
+@pytest.fixture
+def count_of(claim):
+    """Count the simulations of a decision at some condition; record the share of false ones."""
+    def counted(decision, results, text, name):
+        table = check_requirements(results, [text], per=["side_px"])
+        found = (table["decision"] == decision).any("side_px")
+        print(f"{name}: {decision.name} in {int(found.sum())} of {found.size}")
+        if "far" not in name:
+            claim("requirements whose limit is the true value, falsely decided",
+                  "1,000 or 2,000 simulated stores; 5 % are allowed",
+                  100 * int(found.sum()) / found.size, "%")
+        return int(found.sum())
+
+    return counted
 
 
 def lose(results, missed):
@@ -50,7 +59,7 @@ def lose(results, missed):
 
 @pytest.mark.parametrize("rate", [0.9, 0.95, 0.99, 0.995])
 @pytest.mark.parametrize("draws", [20, 50, 100, 400, 1000])
-def test_a_rate_at_the_limit_is_rarely_met(rate, draws):
+def test_a_rate_at_the_limit_is_rarely_met(rate, draws, count_of):
     results = simulated(draws)
     rng = np.random.default_rng(7)
     results = lose(results, rng.random(results["estimate"].shape) >= rate)
@@ -62,7 +71,7 @@ def test_a_rate_at_the_limit_is_rarely_met(rate, draws):
 
 
 @pytest.mark.parametrize("draws", [50, 80, 100, 200, 1000])
-def test_a_quantile_at_the_limit_is_rarely_met(draws):
+def test_a_quantile_at_the_limit_is_rarely_met(draws, count_of):
     rng = np.random.default_rng(8)
     errors = np.zeros((1, draws, SIMULATIONS, 3))
     errors[..., 0] = rng.exponential(size=errors.shape[:-1])
@@ -80,7 +89,7 @@ ERRORS = {"normal": (stats.norm(), (50, 100, 400)), "Laplace": (stats.laplace(),
 
 @pytest.mark.parametrize(("name", "draws"), [
     (name, draws) for name, (_, counts) in ERRORS.items() for draws in counts])
-def test_a_root_mean_square_at_the_limit_is_rarely_met(name, draws):
+def test_a_root_mean_square_at_the_limit_is_rarely_met(name, draws, count_of):
     distribution = ERRORS[name][0]
     position = np.zeros((1, draws, SIMULATIONS, 3))
     position[..., 0] = distribution.rvs(size=position.shape[:-1], random_state=9)
@@ -107,7 +116,7 @@ TAILS = {
 }
 
 
-def of_rmse(draw, limit, draws, name):
+def of_rmse(draw, limit, draws, name, count_of):
     """Check that a root mean square at its limit is rarely met, on either side of it."""
     rng = np.random.default_rng(12)
     position = np.zeros((1, draws, SIMULATIONS, 3))
@@ -120,11 +129,11 @@ def of_rmse(draw, limit, draws, name):
 
 @pytest.mark.parametrize("draws", [50, 100, 400])
 @pytest.mark.parametrize("name", [*TAILS])
-def test_a_root_mean_square_of_heavy_tails_is_rarely_met_at_its_limit(name, draws):
-    of_rmse(*TAILS[name], draws, name)
+def test_a_root_mean_square_of_heavy_tails_is_rarely_met_at_its_limit(name, draws, count_of):
+    of_rmse(*TAILS[name], draws, name, count_of)
 
 
-def test_normal_errors_far_from_the_limit_are_decided_with_100_draws():
+def test_normal_errors_far_from_the_limit_are_decided_with_100_draws(count_of):
     position = np.random.default_rng(13).normal(size=(1, 100, SIMULATIONS, 3))
     position[..., 1:] = 0.0
     results = simulated(100, position=position)
@@ -132,12 +141,12 @@ def test_normal_errors_far_from_the_limit_are_decided_with_100_draws():
                            ("position_rmse_m >= 0.75", Decision.met),
                            ("position_rmse_m <= 0.75", Decision.not_met),
                            ("position_rmse_m >= 2", Decision.not_met)):
-        assert count_of(decision, results, text, text) > 0.9 * SIMULATIONS
+        assert count_of(decision, results, text, f"far {text}") > 0.9 * SIMULATIONS
 
 
 @pytest.mark.parametrize(("name", "draws"), [
     (name, draws) for name, (_, counts) in ERRORS.items() for draws in counts])
-def test_a_bias_at_the_limit_is_rarely_met(name, draws):
+def test_a_bias_at_the_limit_is_rarely_met(name, draws, count_of):
     distribution = ERRORS[name][0]
     position = np.zeros((1, draws, SIMULATIONS, 3))
     position[..., 0] = 0.5 + distribution.rvs(size=position.shape[:-1], random_state=10)
@@ -149,7 +158,7 @@ def test_a_bias_at_the_limit_is_rarely_met(name, draws):
 
 
 @pytest.mark.parametrize(("text", "rate"), [("solved >= 0.9", 0.9), ("solved >= 0.99", 0.99)])
-def test_not_met_at_any_of_many_conditions_is_rarely_false(text, rate):
+def test_not_met_at_any_of_many_conditions_is_rarely_false(text, rate, count_of):
     results = simulated(100, conditions=6, simulations=1000)
     rng = np.random.default_rng(11)
     results = lose(results, rng.random(results["estimate"].shape) >= rate)

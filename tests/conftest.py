@@ -116,11 +116,6 @@ def claim(record_property):
     return recorded
 
 
-@pytest.fixture
-def no_child():
-    """Nothing: unit tests start no child process anyway."""
-
-
 @pytest.fixture(scope="session")
 def cluster():
     """A cluster of two worker processes, for tests to which it does not matter whose it is."""

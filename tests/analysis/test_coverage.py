@@ -69,21 +69,6 @@ def test_rates_are_covered_as_the_literature_says(interval, n):
     assert expected[1] <= inside < expected[1] + 0.002
 
 
-def test_near_no_success_the_coverage_falls_to_poissons_limits():
-    # BCD section 3.1.1: Wilson's falls to 0.838 at p = 0.1765 / n, where only 0 of n holds p.
-    # Jeffreys' lower end at 1 of n is the quantile of a gamma distribution over n.
-    z = stats.norm.ppf(0.975)
-    rates = {wilson: 1 + z**2 / 2 - z * math.sqrt(1 + z**2 / 4), jeffreys: stats.gamma.ppf(
-        0.025, 1.5)}
-    assert rates[wilson] == pytest.approx(0.1765, abs=5e-5)
-    assert math.exp(-rates[wilson]) == pytest.approx(0.838, abs=5e-4)
-    for interval, rate in rates.items():
-        for n in (10**4, 10**5):
-            low, high = interval(np.arange(n + 1), n)
-            found = exact_coverage(low, high, np.array([rate * (1 - 1e-3) / n]), n)[0]
-            assert found == pytest.approx(math.exp(-rate), abs=5e-4)
-
-
 def of_scipy(successes, n, method):
     """Return SciPy's intervals, low and high, of some numbers of n."""
     return np.transpose([

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import cv2
 import pytest
 
-import sweep
 from sweep import cli, installation
 from sweep.cli.command import SESSION, findings, print_error
 from sweep.cli.command import answer as printed
@@ -70,10 +69,6 @@ def test_stopped_command_that_does_not_continue_does_not_say_so(monkeypatch, cap
 
 
 # Help and version.
-
-
-def test_version_is_that_of_the_package(capsys):
-    assert told(capsys, "--version") == (0, f"sweep {sweep.__version__}\n", "")
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)

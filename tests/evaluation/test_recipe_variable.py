@@ -93,7 +93,6 @@ with calls_here():
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("no_child")
 def test_a_record_and_a_function_make_a_variable(tmp_path):
     overlay = tmp_path / "overlay"
     overlay.mkdir()

@@ -114,14 +114,13 @@ def outcome(client, url):
 
 
 @pytest.mark.evidence
-@pytest.mark.parametrize("runs", [10, 200])
-def test_random_faults_of_one_of_two_machines_change_no_bit(runs, tmp_path, undisturbed):
+def test_random_faults_of_one_of_two_machines_change_no_bit(tmp_path, undisturbed, claim):
     generator = random.Random(SEED)
     print(f"seed {SEED}")
     ended = {"equal": 0, "a line": 0}
     with contextlib.ExitStack() as stack:
         client = stack.enter_context(workers())
-        for number in range(runs):
+        for number in range(60):
             if len(client.nthreads()) < 2:  # one was retired
                 stack.close()
                 client = stack.enter_context(workers())
@@ -140,3 +139,5 @@ def test_random_faults_of_one_of_two_machines_change_no_bit(runs, tmp_path, undi
             if faulty in client.nthreads():
                 client.run(machine_faults.clear, workers=[faulty])
     print(ended)
+    claim("runs with a random fault of one of two machines that end", "an undisturbed run; 60 runs",
+          0.0, "bits differ")

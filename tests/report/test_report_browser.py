@@ -84,7 +84,6 @@ def test_the_report_is_right_wide_and_narrow_light_and_dark(scheme, tmp_path):
 
 
 KINDS = {
-    "one pose": "[pose]\nside_px = 40\n",
     "sobol": """seed = 1
 sampling = "sobol"
 [pose]
@@ -94,13 +93,6 @@ noise_grey = 2
 [axes]
 side_px = [20, 40]
 trial = 32
-""",
-    "together": """seed = 1
-[pose]
-jitter_px = 0.5
-[axes]
-view = { zip = { tilt_deg = [0, 30, 60], side_px = [40, 30, 20] } }
-trial = 10
 """,
     "angles": """seed = 1
 [pose]

@@ -242,25 +242,28 @@ def check_table(
     return values, lines
 
 
-def check_tables(
-    declared: Mapping[str, Declared], value: Any, owner: str, expected: str
-) -> list[dict[str, Any]]:
-    """Return the values of each of a list of tables, as :func:`check_table`.
+def table_reader(
+    declared: Mapping[str, Declared], owner: str, expected: str = ""
+) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
+    """Return what reads tables as tuples of the values of ``declared``, in its order.
 
-    Raises
-    ------
-    ValueError
-        ``expected``, if it is no list of tables; :class:`TablesError` for the faults in them.
+    It raises ValueError if they are no tables, in words that are ``expected``, and
+    :class:`TablesError` for the faults in them, as :func:`check_table` tells them.
     """
-    if not isinstance(value, (list, tuple)) or not all(isinstance(each, Mapping) for each in value):
-        raise ValueError(expected)
-    checked = [check_table(declared, table, owner) for table in value]
-    lines = [
-        f"[{number}].{line}" for number, (_, faults) in enumerate(checked) for line in faults
-    ]
-    if lines:
-        raise TablesError(expected, lines)
-    return [values for values, _ in checked]
+    expected = expected or f"tables with {', '.join(declared)}"
+
+    def read(value: Any) -> tuple[tuple[Any, ...], ...]:
+        if not isinstance(value, (list, tuple)) or not all(
+                isinstance(table, Mapping) for table in value):
+            raise ValueError(expected)
+        checked = [check_table(declared, table, owner) for table in value]
+        lines = [f"[{number}].{line}" for number, (_, faults) in enumerate(checked)
+                 for line in faults]
+        if lines:
+            raise TablesError(expected, lines)
+        return tuple(tuple(row.values()) for row, _ in checked)
+
+    return read
 
 
 def plain_types(hint: Any) -> tuple[type, ...]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.declaration import Declared, check_tables, declared_fields, parameter
+from sweep.declaration import Declared, declared_fields, parameter, table_reader
 from sweep.model import board, marker
 from sweep.model.board import Board, Chessboard, Print
 from sweep.model.coverage import joined
@@ -66,19 +66,6 @@ def place(meaning: str, default: Any = dataclasses.MISSING) -> Any:
 def turn(meaning: str, most: float = 360) -> Any:
     """Return the declared field of an angle, 0 by default."""
     return parameter(0.0, meaning, unit="degree", low=-most, high=most)
-
-
-def table_reader(
-    declared: Mapping[str, Declared], owner: str, expected: str = ""
-) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
-    """Return what reads tables as tuples of the values of ``declared``, in its order.
-
-    It raises ValueError or TablesError if they are not such tables.
-    """
-    expected = expected or f"tables with {', '.join(declared)}"
-    return lambda value: tuple(
-        tuple(row.values()) for row in check_tables(declared, value, owner, expected)
-    )
 
 
 def id_faults(key: str, ids: list[int], dictionary: str, written: Any = None) -> list[Fault]:

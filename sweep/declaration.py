@@ -13,15 +13,20 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from sweep.messages import nearest, plain, shown, similar_names
 
 
-@dataclass(frozen=True, slots=True)
-class Declaration:
-    """The declaration of a parameter: meaning, unit, allowed values.
+def _letters_and_digits(word: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", word.casefold())
 
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """The declaration of a value: name, types, default, meaning, unit, allowed values.
+
+    ``types`` are those of the value without None; ``default`` is MISSING if it must be given.
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
@@ -31,6 +36,9 @@ class Declaration:
     the checks by type.
     """
 
+    name: str
+    types: tuple[type, ...]
+    default: Any
     meaning: str
     unit: str = ""
     low: float = -math.inf
@@ -66,7 +74,8 @@ class Declaration:
 
         Examples
         --------
-        >>> solver = Declaration("", choices=("ippe", "ippe_square"), prefix="SOLVEPNP_")
+        >>> solver = Declared("solver", (str,), "ippe", "", choices=("ippe", "ippe_square"),
+        ...                   prefix="SOLVEPNP_")
         >>> solver.choice("cv2.SOLVEPNP_IPPE_SQUARE"), solver.choice("Ippe"), solver.choice("p3p")
         ('ippe_square', 'ippe', None)
         """
@@ -98,58 +107,39 @@ class Declaration:
         above = number > self.low if self.open_low else number >= self.low
         return above and number <= self.high and abs(number) < 1e300
 
-
-def _letters_and_digits(word: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", word.casefold())
-
-
-@dataclass(frozen=True, slots=True)
-class Declared:
-    """A declared field: its name, types without None, default (MISSING if it must be given)."""
-
-    name: str
-    types: tuple[type, ...]
-    default: Any
-    declaration: Declaration
-
-    @property
-    def unit(self) -> str:
-        """The unit; empty if it has none."""
-        return self.declaration.unit
-
     def expected(self) -> str:
         """Return the allowed values in words."""
         if tuple in self.types:
-            if self.declaration.list_text:
-                return self.declaration.list_text
-            *counts, last = self.declaration.lengths
+            if self.list_text:
+                return self.list_text
+            *counts, last = self.lengths
             return f"a list of {', '.join(map(str, counts))} or {last} finite numbers"
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
         kind = " or ".join(words[kind] for kind in self.types)
-        extent = self.declaration.range_text()
-        if self.declaration.choices:
+        extent = self.range_text()
+        if self.choices:
             return extent
         return f"{kind} {extent}".strip()
 
     def check(self, value: Any) -> Any:
         """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
-        if self.declaration.reads is not None and value not in self.declaration.choices:
-            return self.declaration.reads(value)
+        if self.reads is not None and value not in self.choices:
+            return self.reads(value)
         if tuple in self.types and isinstance(value, (list, tuple)):
             numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
-            if numbers and len(value) in self.declaration.lengths:
+            if numbers and len(value) in self.lengths:
                 return tuple(float(item) for item in value)
         elif bool in self.types and isinstance(value, bool):
             return value
         elif int in self.types and isinstance(value, int) and not isinstance(value, bool):
-            if self.declaration.admits(value):
+            if self.admits(value):
                 return value
         elif float in self.types and _is_number(value):
-            if abs(value) < 1e300 and self.declaration.admits(float(value)):
+            if abs(value) < 1e300 and self.admits(float(value)):
                 return float(value)
         elif str in self.types and isinstance(value, str):
-            if self.declaration.choices:
-                choice = self.declaration.choice(value)
+            if self.choices:
+                choice = self.choice(value)
                 if choice is not None:
                     return choice
             elif value:
@@ -158,11 +148,11 @@ class Declared:
 
     def _hint(self, value: Any) -> str:
         """Return the choice that a wrong value may stand for."""
-        choices = self.declaration.choices
+        choices = self.choices
         if isinstance(value, str) and choices:
-            bare = value.removeprefix(self.declaration.prefix)
+            bare = value.removeprefix(self.prefix)
             return similar_names(bare, choices) or nearest(bare, choices)
-        if isinstance(value, int) and (name := self.declaration.of_number(value)):
+        if isinstance(value, int) and (name := self.of_number(value)):
             return f"; OpenCV's constant {value} is {name}"
         return ""
 
@@ -181,8 +171,8 @@ UNITS = {
 def parameter(
     default: Any, meaning: str, low: float = -math.inf, high: float = math.inf, **declared: Any
 ) -> Any:
-    """Return a dataclass field that carries its :class:`Declaration` (keywords as its fields)."""
-    declaration = Declaration(meaning, low=low, high=high, **declared)
+    """Return a dataclass field that carries its :class:`Declared` (keywords as its fields)."""
+    declaration = Declared("", (), default, meaning, low=low, high=high, **declared)
     return dataclasses.field(default=default, metadata={"declaration": declaration})
 
 
@@ -196,12 +186,21 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
     hints, declared = typing.get_type_hints(declaring), {}
     for field in dataclasses.fields(declaring):
         declaration = field.metadata["declaration"]
-        if not declaration.unit:
-            unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
-            declaration = dataclasses.replace(declaration, unit=unit)
-        types = plain_types(hints[field.name])
-        declared[field.name] = Declared(field.name, types, field.default, declaration)
+        unit = declaration.unit or next(
+            (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
+        declared[field.name] = dataclasses.replace(
+            declaration, name=field.name, types=plain_types(hints[field.name]),
+            default=field.default, unit=unit)
     return declared
+
+
+Kind = TypeVar("Kind", bound=Declared)
+
+
+def converted(declared: Declared, kind: type[Kind], **more: Any) -> Kind:
+    """Return a declaration as one of another kind, which has ``more`` fields."""
+    fields = {field.name: getattr(declared, field.name) for field in dataclasses.fields(Declared)}
+    return kind(**fields | more)
 
 
 class TablesError(ValueError):
@@ -235,7 +234,7 @@ def check_table(
         except ValueError as error:
             lines.append(f"{plain(key)} = {shown(value)}: expected {error}")
     lines += [
-        f"{name}: missing; expected {each.expected()}: {each.declaration.meaning}"
+        f"{name}: missing; expected {each.expected()}: {each.meaning}"
         for name, each in declared.items()
         if each.default is dataclasses.MISSING and name not in table
     ]

@@ -89,7 +89,7 @@ class Axis:
         """Meaning of the values, in words."""
         if self.zipped:
             return f"{', '.join(self.columns)}, which go together"
-        return self.parameters[0].declaration.meaning if self.parameters else "number of the draw"
+        return self.parameters[0].meaning if self.parameters else "number of the draw"
 
     @property
     def kind(self) -> type:
@@ -210,8 +210,8 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
             raise ValueError("one value here; more than one goes under [axes]")
         forms = " or ".join(f"{{ {each} = {form} }}" for each, form in DISTRIBUTION_FORMS.items())
         raise ValueError(f"{parameter.expected()}, or {forms}")
-    if not parameter.declaration.drawable:
-        drawable = ", ".join(p.name for p in PARAMETERS.values() if p.declaration.drawable)
+    if not parameter.drawable:
+        drawable = ", ".join(p.name for p in PARAMETERS.values() if p.drawable)
         raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
     sound = isinstance(ends, list) and len(ends) == 2 and _are_numbers(ends)
     if not sound or not ends[1] > (ends[0] if kind == "uniform" else 0):
@@ -220,8 +220,8 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if kind == "uniform":
         parameter.check(a)
         parameter.check(b)
-    elif not all(parameter.declaration.admits(a + side * MAX_DEVIATIONS * b) for side in (-1, 1)):
-        extent = parameter.declaration.range_text()
+    elif not all(parameter.admits(a + side * MAX_DEVIATIONS * b) for side in (-1, 1)):
+        extent = parameter.range_text()
         raise ValueError(f"mean - {MAX_DEVIATIONS} sd and mean + {MAX_DEVIATIONS} sd {extent}")
     return Distribution(kind, a, b)
 

@@ -16,7 +16,7 @@ import numpy as np
 import tomlkit
 import tomlkit.items
 
-from sweep.declaration import Declaration, Declared, TablesError, check_table
+from sweep.declaration import Declared, TablesError, check_table
 from sweep.experiment.axes import (
     MAX_LISTED,
     TRIAL,
@@ -215,10 +215,10 @@ def _effects(value: Any) -> list[str]:
 
 HEADER = {
     declared.name: declared for declared in (
-        Declared("title", (str,), "", Declaration("title", reads=_title)),
-        Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
-        Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
-        Declared(EFFECTS_KEY, (list,), (), Declaration("plug-ins", reads=_effects)),
+        Declared("title", (str,), "", "title", reads=_title),
+        Declared("seed", (int,), 0, "seed of all draws", low=0, high=2**63 - 1),
+        Declared("sampling", (str,), SAMPLINGS[0], "sampling", choices=SAMPLINGS),
+        Declared(EFFECTS_KEY, (list,), (), "plug-ins", reads=_effects),
     )
 }
 """Keys that stand above the sections."""

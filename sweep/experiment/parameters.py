@@ -10,7 +10,7 @@ from enum import IntEnum
 from functools import cache, lru_cache
 from typing import Any
 
-from sweep.declaration import Declared, declared_fields
+from sweep.declaration import Declared, converted, declared_fields
 from sweep.errors import PluginError
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import BoardDetectorSetting, DetectorChoice, DetectorSetting
@@ -55,8 +55,8 @@ GEOMETRY_SECTIONS = ("camera", "marker", "pose")
 class Parameter(Declared):
     """A parameter of pipelines: a declared field with its section and stage."""
 
-    section: str
-    stage: Stage
+    section: str = ""
+    stage: Stage = Stage.scene
 
 
 def _gather() -> dict[str, Parameter]:
@@ -65,9 +65,7 @@ def _gather() -> dict[str, Parameter]:
         for each in itertools.chain(*(declared_fields(group).values() for group in declaring)):
             if each.name in gathered:
                 raise TypeError(f"parameter {each.name} is declared twice")
-            gathered[each.name] = Parameter(
-                each.name, each.types, each.default, each.declaration, section, stage
-            )
+            gathered[each.name] = converted(each, Parameter, section=section, stage=stage)
     return gathered
 
 
@@ -153,7 +151,7 @@ def is_zip(value: Any) -> bool:
 # The plug-ins that a document names, and their settings as parameters beside our own.
 
 NAMED_BY: dict[str, Parameter] = {
-    each.declaration.plugin: each for each in PARAMETERS.values() if each.declaration.plugin
+    each.plugin: each for each in PARAMETERS.values() if each.plugin
 }
 """Kind of plug-in -> the parameter whose values name it."""
 
@@ -174,7 +172,7 @@ def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
             } if isinstance(axes, dict) else {}
     for kind, parameter in NAMED_BY.items():
         # Where there are several choices, another word is more likely one of them, misspelt.
-        few = len(parameter.declaration.choices) == 1
+        few = len(parameter.choices) == 1
         tables = {parameter.section: document.get(parameter.section), "axes": axes, **zips}
         for path, table in tables.items():
             value = table.get(parameter.name) if isinstance(table, dict) else None
@@ -247,15 +245,12 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
         section = section_of_settings(plugin.kind)
         if plugin.kind in NAMED_BY:
             by = gathered[NAMED_BY[plugin.kind].name]
-            gathered[by.name] = dataclasses.replace(by, declaration=dataclasses.replace(
-                by.declaration, choices=(*by.declaration.choices, plugin.name)
-            ))
+            gathered[by.name] = dataclasses.replace(
+                by, choices=(*by.choices, plugin.name))
         for setting in plugin.settings:
             name = setting.name
-            parameter = Parameter(
-                name, setting.types, setting.default, setting.declaration, section,
-                SECTIONS[section][1],
-            )
+            parameter = converted(
+                setting, Parameter, section=section, stage=SECTIONS[section][1])
             if name in PARAMETERS:
                 raise PluginError(f"another name for its setting {name}: the pipeline has this one")
             if gathered.setdefault(name, parameter) != parameter:

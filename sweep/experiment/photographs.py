@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.declaration import Declaration, Declared, check_table, declared_fields
+from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
 from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.document import file_text, read_document
@@ -68,8 +68,8 @@ def board_document(path: str | Path) -> dict[str, Any]:
         raise refusal([f"{plain(path)}: {error}"]) from None
 
 
-_KIND = {"kind": Declared("kind", (str,), MISSING, Declaration(
-    "how its markers are arranged", choices=tuple(KINDS)))}
+_KIND = {"kind": Declared(
+    "kind", (str,), MISSING, "how its markers are arranged", choices=tuple(KINDS))}
 
 
 def board_of(document: Mapping[str, Any], source: str) -> Board:

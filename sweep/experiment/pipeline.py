@@ -12,7 +12,7 @@ from typing import Any
 
 import tomlkit
 
-from sweep.declaration import Declaration, Declared
+from sweep.declaration import Declared
 from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL, Axis
 from sweep.experiment.document import (
     HEADER,
@@ -459,7 +459,7 @@ def _checked(
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
 """A part between commas; commas within a list or within quotes do not separate."""
 
-_TRIAL = Declared(TRIAL, (int,), 0, Declaration("number of the draw", low=0, high=1e18))
+_TRIAL = Declared(TRIAL, (int,), 0, "number of the draw", low=0, high=1e18)
 
 
 def cell(pipeline: Pipeline, at: str) -> Pipeline:

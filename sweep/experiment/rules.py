@@ -471,7 +471,7 @@ def boards_can_be_printed(reading: Reading) -> None:
     kinds = dict.fromkeys(reading.values_of("kind"))
     needed = {name: kind for kind in kinds for name in NEEDED[kind] if name not in reading.given}
     for name, kind in needed.items():
-        meaning = reading.parameters[name].declaration.meaning
+        meaning = reading.parameters[name].meaning
         reading.note(f"board.{name}", f"missing; kind = {shown(kind)} needs it: {meaning}")
     used = {"kind", *(name for kind in kinds for name in used_by(kind))}
     for name in reading.given - used if kinds else ():

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
-from sweep.declaration import Declaration, Declared, TablesError, check_table
+from sweep.declaration import Declared, TablesError, check_table
 from sweep.experiment.axes import TRIAL, Axis, parse_trial
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
@@ -276,7 +276,7 @@ def _precision(value: Any) -> tuple[tuple[str, float], ...]:
 
 def _keys(**readers: Callable[[Any], Any]) -> dict[str, Declared]:
     """Return keys by their names, each with what reads its value."""
-    return {name: Declared(name, (), None, Declaration(name, reads=reads))
+    return {name: Declared(name, (), None, name, reads=reads)
             for name, reads in readers.items()}
 
 

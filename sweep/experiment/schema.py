@@ -120,7 +120,7 @@ def fixed_values(pipeline: Grid) -> dict[str, tuple[float | bool | str, dict[str
     without = superseded(pipeline.given)
     return {
         each.name: (label(value) if isinstance(value, tuple) else value, {
-            "long_name": each.declaration.meaning, FIXED: "on the whole grid",
+            "long_name": each.meaning, FIXED: "on the whole grid",
             **({"units": each.unit} if each.unit else {})})
         for each in pipeline.parameters.values()
         if each.section in ALWAYS_GIVEN or each.name in pipeline.given
@@ -490,7 +490,7 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
         scales["distance_m"] = 0.0
     parameters = {name: pipeline.parameters[name] for name in scales}
     variables = [
-        _drawn(name, parameter.declaration.meaning, parameter.unit, scales[name])
+        _drawn(name, parameter.meaning, parameter.unit, scales[name])
         for name, parameter in parameters.items()
     ]
     if jitter := max(map(float, pipeline.values_of("jitter_px")), default=0.0):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.declaration import Declared, declared_fields, parameter, table_reader
+from sweep.declaration import declared_fields, parameter, table_reader
 from sweep.model import board, marker
 from sweep.model.board import Board, Chessboard, Print
 from sweep.model.coverage import joined
@@ -24,7 +24,7 @@ from sweep.typing import Floats, Integers
 MAX_MARKERS = 4000
 """The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
 
-_DICTIONARY = declared_fields(marker.Marker)["dictionary"].declaration
+_DICTIONARY = declared_fields(marker.Marker)["dictionary"]
 
 
 class Fault(NamedTuple):
@@ -241,7 +241,7 @@ _LISTED = _MARKER | {"size_m": dataclasses.replace(_MARKER["size_m"], default=No
 
 _BESIDE = _LISTED | {
     "marker_id": dataclasses.replace(_MARKER["marker_id"], default=None),
-    "dictionary": Declared("dictionary", (str,), None, _DICTIONARY),
+    "dictionary": dataclasses.replace(_DICTIONARY, default=None),
 }
 """Keys of a table [[board.distractors]]: none of their IDs and sizes is needed."""
 
@@ -619,7 +619,7 @@ BoardValues: type = dataclasses.make_dataclass(
     [
         (each.name, each.types[0], dataclasses.field(
             default=None if each.default is dataclasses.MISSING else each.default,
-            metadata={"declaration": each.declaration},
+            metadata={"declaration": each},
         ))
         for each in {name: each for keys in _OWN.values() for name, each in keys.items()}.values()
         if each.name != "markers"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sweep.declaration import Declaration, Declared, plain_types
+from sweep.declaration import Declared, converted, plain_types
 from sweep.errors import ArgumentError, PluginError
 from sweep.messages import nearest
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
@@ -33,8 +33,8 @@ class Setting(Declared):
     def to_json(self) -> dict[str, Any]:
         """Return it as a store records it."""
         declared = {
-            field.name: value for field in dataclasses.fields(Declaration)
-            if (value := getattr(self.declaration, field.name)) != field.default
+            field.name: value for field in dataclasses.fields(Declared)[3:]
+            if (value := getattr(self, field.name)) != field.default
             and not (isinstance(value, float) and math.isinf(value))
         }
         return {"name": self.name, "types": [kind.__name__ for kind in self.types],
@@ -50,7 +50,7 @@ class Setting(Declared):
         name, kinds = record["name"], tuple(TYPES[kind] for kind in record["types"])
         if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(name)
-        return Setting(name, kinds, record["default"], Declaration(**declared))
+        return Setting(name, kinds, record["default"], **declared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +239,7 @@ def _settings(record: Plugin) -> Iterator[Setting]:
         declaration = field.metadata.get("declaration")
         kinds = plain_types(hints[field.name])
         if (
-            not isinstance(declaration, Declaration) or declaration.reads is not None
+            not isinstance(declaration, Declared) or declaration.reads is not None
             or not set(kinds) <= set(TYPES.values())
         ):
             raise PluginError(
@@ -253,7 +253,8 @@ def _settings(record: Plugin) -> Iterator[Setting]:
             raise PluginError(f"a default of the setting {field.name}")
         if default is not None and type(default) is int and kinds == (float,):
             default = float(default)
-        yield Setting(field.name, kinds, default, declaration)
+        yield converted(dataclasses.replace(
+            declaration, name=field.name, types=kinds, default=default), Setting)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -541,7 +541,7 @@ def figures_of(data: ReportData) -> list[Figure]:
 def _effect(data: ReportData, name: str) -> Figure:
     """Return the figure of rates and errors along an axis or a drawn parameter."""
     axis = data.pipeline.axis(name)
-    meaning = data.pipeline.parameters[name].declaration.meaning if axis is None else axis.meaning
+    meaning = data.pipeline.parameters[name].meaning if axis is None else axis.meaning
     return along_axis(data, error_statistics, name, angles=False).figure(
         f"effect-{name}", f"The effect of {name}",
         "Detection rate, median and 95 % quantile (p95) of rotation and range error, and signed "

@@ -83,9 +83,9 @@ def _parameter_row(parameter: Parameter) -> list[str]:
     values = parameter.expected()
     if parameter.name == "dictionary":
         values = "a predefined dictionary of the installed OpenCV"
-    drawable = "; can be drawn" if parameter.declaration.drawable else ""
+    drawable = "; can be drawn" if parameter.drawable else ""
     return [parameter.name, shown, parameter.unit, f"{values}{drawable}",
-            parameter.declaration.meaning]
+            parameter.meaning]
 
 
 def _variable_table() -> Table:
@@ -138,7 +138,7 @@ def _effect_table() -> Table:
         ["effect", "switched on by", "absent at", "acts on", "random", "in the bound", "meaning"],
         [[effect.label, effect.switch, effect.off_text, effect.step,
           "yes" if effect.random else "no", "yes" if effect.in_bound else "no",
-          PARAMETERS[effect.switch].declaration.meaning]
+          PARAMETERS[effect.switch].meaning]
          for effect in EFFECTS])
 
 

@@ -25,8 +25,8 @@ OPENCV = {
 @pytest.mark.parametrize("name", OPENCV)
 def test_every_name_of_opencv_is_understood_in_any_case_and_with_its_module(name):
     parameter = PARAMETERS[name]
-    twins = {choice.casefold(): set() for choice in parameter.declaration.choices}
-    for choice in parameter.declaration.choices:  # OpenCV has DICT_APRILTAG_16h5 and ..._16H5
+    twins = {choice.casefold(): set() for choice in parameter.choices}
+    for choice in parameter.choices:  # OpenCV has DICT_APRILTAG_16h5 and ..._16H5
         twins[choice.casefold()].add(choice)
     for spelled, choice in OPENCV[name].items():
         module = "cv2." if name == "solver" else "cv2.aruco."

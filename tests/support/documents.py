@@ -10,7 +10,7 @@ LENSES = [[], LENS, [0.3, 0.2, 0, 0], [-1.2, 0.3, 0, 0], [5, 0, 0, 0],
 
 
 def any_value(rng, name):
-    declared = PARAMETERS[name].declaration
+    declared = PARAMETERS[name]
     low, high = max(declared.low, -1e12), min(declared.high, 1e12)
     ends = [1e-9 if declared.open_low else low, high, max(low, 1e-3)]
     usual = [1e-9, 0.001, 1, 89.9999999, 90, 180]

@@ -39,7 +39,7 @@ RECORD = """
 FUNCTION = """
     "range_error": lambda results: (
         np.linalg.norm(results.estimates.translation, axis=1)
-        / np.linalg.norm(results.true_translation, axis=1) - 1
+        / np.linalg.norm(results.estimates.translation - results.error.translation_m, axis=1) - 1
     ),
 """
 

@@ -125,6 +125,7 @@ def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
 
 
 def test_a_frame_size_on_an_axis_keeps_pixels_square():
+    assert pipeline({"fx_px": 500}, ["hfov_deg=[40, 50]"]).axis("hfov_deg").values == (40.0, 50.0)
     grid = Pipeline.from_dict({
         "pose": {"distance_m": 1}, "axes": {"width_px": [640, 1280], "height_px": [480, 720]},
     })
@@ -160,11 +161,6 @@ def test_choosing_one_way_to_give_a_camera_drops_the_others(camera, setting, lef
     selected = cell(on_axis, f"{setting},distance_m=2")
     assert selected.fixed[name] == left[name]
     assert selected.fixed["fx_px"] == left.get("fx_px")
-
-
-def test_an_axis_of_fields_of_view_is_set_on_the_command_line():
-    chosen = pipeline({"fx_px": 500}, ["hfov_deg=[40, 50]"])
-    assert chosen.axis("hfov_deg").values == (40.0, 50.0)
 
 
 # 3. What is told.

@@ -297,7 +297,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
         assert not bucket.told_in(content.decode("latin-1")), key
 
 
-@pytest.mark.system
+@pytest.mark.evidence
 def test_remote_store_is_left_alone_and_reused(bucket, small, capsys):
     url, grown = "s3://bucket/plain.zarr", "s3://bucket/grown.zarr"
     outcomes = []

@@ -109,7 +109,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.system
+@pytest.mark.evidence
 def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

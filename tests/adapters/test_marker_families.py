@@ -96,6 +96,7 @@ for family in tag_families.TAG_FAMILIES:
 """
 
 
+@pytest.mark.system
 def test_both_packages_have_the_same_codes():
     # Each in a process of its own: both packages wrap versions of one library.
     for package in tag_families.PACKAGES:

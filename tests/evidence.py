@@ -5,9 +5,10 @@
 
 ``run`` runs the long tests of one shard (files in turn: the first of N is 1/N), and writes outcome
 and duration of every test function, what tests claim by the fixture ``claim``, and on what they
-ran: version and commit of the project, versions of libraries, processor, date. ``table`` joins the
-files of one commit and writes the table of claims into tests/README.md; it exits with 1 where a
-test failed or a shard is missing.
+ran: version and commit of the project, versions of libraries, processor, date. It writes after each
+test, so that a run that is stopped keeps what it found. ``table`` joins the files of one commit and
+writes the table of claims into tests/README.md; it exits with 1 where a test failed, or a shard is
+missing or did not end.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ LIBRARIES = ("opencv-contrib-python-headless", "numpy", "numba", "scipy", "xarra
 
 
 class Recorder:
-    """Selects a shard of the long tests; keeps their outcomes, durations and claims."""
+    """Selects a shard of the long tests; writes their outcomes, durations and claims to a file."""
 
-    def __init__(self, shard: int, shards: int) -> None:
+    def __init__(self, file: Path, shard: int, shards: int) -> None:
+        self.file, self.circumstances = file, circumstances()
         self.shard, self.shards = shard, shards
         self.outcomes: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -60,6 +62,15 @@ class Recorder:
         if report.when == "teardown":
             self.claims += [{**value, "test": name} for key, value in report.user_properties
                             if key == "claim"]
+            self.write(None)
+
+    def write(self, status: int | None) -> None:
+        """Write the file; ``status`` is pytest's exit status, None before the end."""
+        self.file.write_text(json.dumps({
+            **self.circumstances, "shard": self.shard, "shards": self.shards, "status": status,
+            "seconds": {name: round(spent, 1) for name, spent in self.seconds.items()},
+            "outcomes": self.outcomes, "claims": self.claims,
+        }, indent=1) + "\n", encoding="utf-8")
 
 
 def commit() -> str:
@@ -88,14 +99,10 @@ def run(file: str, *arguments: str) -> int:
         place = others.index("--shard")
         shard, shards = (int(number) for number in others[place + 1].split("/"))
         del others[place : place + 2]
-    recorder = Recorder(shard, shards)
-    status = pytest.main(["-m", "evidence", *others], plugins=[recorder])
-    Path(file).write_text(json.dumps({
-        **circumstances(), "shard": shard, "shards": shards,
-        "seconds": {name: round(spent, 1) for name, spent in recorder.seconds.items()},
-        "outcomes": recorder.outcomes, "claims": recorder.claims,
-    }, indent=1) + "\n", encoding="utf-8")
-    return int(status)
+    recorder = Recorder(Path(file), shard, shards)
+    status = int(pytest.main(["-m", "evidence", *others], plugins=[recorder]))
+    recorder.write(status)
+    return status
 
 
 def joined(claims: list[dict[str, Any]]) -> list[list[str]]:
@@ -115,7 +122,8 @@ def table(*files: str, page: Path = README) -> int:
     if len({(part["commit"], part["shards"]) for part in parts}) != 1:
         raise SystemExit("expected the shards of one commit")
     first = parts[0]
-    missing = set(range(1, first["shards"] + 1)) - {part["shard"] for part in parts}
+    ended = {part["shard"] for part in parts if part["status"] is not None}
+    missing = set(range(1, first["shards"] + 1)) - ended
     outcomes: Counter[str] = sum((Counter(each) for part in parts for each in
                                   part["outcomes"].values()), Counter())
     failed = [name for part in parts for name, each in part["outcomes"].items()
@@ -138,7 +146,8 @@ def table(*files: str, page: Path = README) -> int:
     for name in failed:
         print(f"failed: {name}")
     if missing:
-        print(f"missing: shards {', '.join(map(str, sorted(missing)))} of {first['shards']}")
+        numbers = ", ".join(map(str, sorted(missing)))
+        print(f"missing, or not ended: shards {numbers} of {first['shards']}")
     return int(bool(failed or missing))
 
 

@@ -21,7 +21,7 @@ def test_shards_are_joined_and_faults_named(tmp_path, capsys):
     for shard, worst in ((1, 2e-13), (2, 3e-12)):
         files.append(str(tmp_path / f"{shard}.json"))
         (tmp_path / f"{shard}.json").write_text(json.dumps({
-            **PART, "shard": shard, "seconds": {"t": 1800}, "claims": [claim(worst)],
+            **PART, "shard": shard, "status": 0, "seconds": {"t": 1800}, "claims": [claim(worst)],
             "outcomes": {"t": {"passed": 3}, "u": {"failed": shard - 1}}}))
     assert evidence.table(*files, page=page) == 1
     assert "failed: u" in capsys.readouterr().out
@@ -31,4 +31,8 @@ def test_shards_are_joined_and_faults_named(tmp_path, capsys):
     assert text.startswith("before\n")
     assert text.endswith("after\n")
     assert evidence.table(files[0], page=page) == 1
-    assert "missing: shards 2 of 2" in capsys.readouterr().out
+    assert "missing, or not ended: shards 2 of 2" in capsys.readouterr().out
+    stopped = tmp_path / "stopped.json"
+    stopped.write_text(json.dumps(json.loads((tmp_path / "1.json").read_text()) | {"status": None}))
+    assert evidence.table(str(stopped), files[1], page=page) == 1
+    assert "missing, or not ended: shards 1 of 2" in capsys.readouterr().out

@@ -255,8 +255,10 @@ def recorded_poses(
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
     on_board = [boards[name][marker] for name, _, marker in places]
-    columns: dict[str, Any] = {"neighbourhood": [_around(each) for each in on_board]}
-    if not simulated:
+    columns: dict[str, Any]
+    if simulated:
+        columns = {"neighbourhood": [_around(each) for each in on_board]}
+    else:
         images = {
             (name, number): reference((Path(folder) / name).parent / records[name].paths[number],
                                       records[name].digests[number], records[name].part)

@@ -305,11 +305,6 @@ def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) 
     return {key: value for key, value in values.items() if value is not None}
 
 
-def _scene_axes(reading: Reading) -> list[Axis]:
-    """Return the axes of the scene without ``trial``: those whose values can be conditions."""
-    return [axis for axis in reading.axes_of(Stage.scene) if axis.name != TRIAL]
-
-
 def _is_of_scene(reading: Reading, name: str) -> bool:
     """Return whether a name is a parameter of the scene."""
     return name in reading.parameters and reading.parameters[name].stage is Stage.scene

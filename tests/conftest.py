@@ -1,4 +1,4 @@
-"""Which tests run and in which order, that unit tests start no process, and a shared cluster."""
+"""Which tests run, in which order, and that unit tests start no process."""
 
 import contextlib
 import gc
@@ -8,7 +8,6 @@ import signal
 import sys
 
 import pytest
-from distributed import LocalCluster
 
 # Many processes import the same modules: they are compiled once, wherever the tests run.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -114,13 +113,3 @@ def claim(record_property):
             "what": what, "against": against, "worst": float(worst), "unit": unit})
 
     return recorded
-
-
-@pytest.fixture(scope="session")
-def cluster():
-    """A cluster of two worker processes, for tests to which it does not matter whose it is."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-        silence_logs=50,
-    ) as running:
-        yield running

@@ -1,7 +1,6 @@
 """Every command and every analysis on a store of boards: an answer, or one line that says why not.
 
-The targets are one marker, a ChArUco and a grid of the same area, on one axis; the other store
-shows the back of a board.
+The targets are one marker, a ChArUco and a grid of the same area, on one axis.
 """
 
 import pytest
@@ -12,80 +11,53 @@ from sweep import analysis
 from sweep.cli import main
 from sweep.errors import SweepError
 
-COMMON = {
+BOARDS = {
     "seed": 22,
     "camera": {"width_px": 320, "height_px": 240, "fx_px": 300},
-    "estimator": {"solver": "iterative"},
+    "marker": {"dictionary": "DICT_5X5_100", "quiet_zone_modules": 1},
     "pose": {"jitter_px": 5, "tilt_deg": {"uniform": [0, 50]},
              "azimuth_deg": {"uniform": [0, 360]}},
+    "board": {"rows": 2, "columns": 2, "gap_m": 0.006,
+              "squares_x": 3, "squares_y": 3, "square_m": 0.032},
     "scene": {"noise_grey": 2, "black": 40, "white": 200, "background": 120},
-}
-GRID = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.006}
-SIDE = {"dictionary": "DICT_5X5_100", "quiet_zone_modules": 1}
-AXES = {"distance_m": [0.25, 0.5], "solver": ["iterative", "sqpnp"], "trial": 5}
-BOARDS = {
-    "mixed": {
-        "marker": SIDE,
-        "board": {key: value for key, value in GRID.items() if key != "kind"}
-        | {"squares_x": 3, "squares_y": 3, "square_m": 0.032},
-        "axes": {"target": {"zip": {"kind": ["none", "charuco", "grid"],
-                                    "size_m": [0.08, 0.024, 0.04]}}, **AXES},
+    "axes": {
+        "target": {"zip": {"kind": ["none", "charuco", "grid"], "size_m": [0.08, 0.024, 0.04]}},
+        "distance_m": [0.25, 0.5], "solver": ["iterative", "sqpnp"], "trial": 5,
     },
-    "backs": {"marker": SIDE | {"size_m": 0.04}, "board": GRID, "axes": AXES,
-              "pose": {"tilt_deg": 180}},
 }
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory):
-    """Return the path of the store of each of `BOARDS`."""
-    folder = tmp_path_factory.mktemp("boards")
-    for name, own in BOARDS.items():
-        document = COMMON | own
-        document = {key: COMMON.get(key, {}) | value if isinstance(value, dict) else value
-                    for key, value in document.items()}
-        if "solver" in document["axes"]:
-            document.pop("estimator")
-        sweep.run(document, store=folder / f"{name}.zarr", workers=1)
-    return folder
+def store(tmp_path_factory):
+    url = tmp_path_factory.mktemp("boards") / "mixed.zarr"
+    sweep.run(BOARDS, store=url, workers=1)
+    return url
 
 
-REFUSED = {
-    "calibration": "expected at least", "compare": "not the same scenes",
-    "error-model": "needs 200 or more",
-}
-"""Command -> what stands in the line in which it refuses these stores."""
-
-ANSWERED = {("error-model", "backs"), ("compare", "mixed")}
-"""Commands of `REFUSED` that have an answer of a store: of one without poses, and of itself."""
+REFUSED = {"calibration": "expected at least", "error-model": "needs 200 or more"}
+"""Command -> what stands in the line in which it refuses this store."""
 
 COMMANDS = {
     "status": [], "plan": [], "verify": ["--sample", "2"], "error-model": [], "calibration": [],
     "tradeoff": ["--seconds", "0.1"], "require": ["detection >= 0.5", "--per", ""],
-    "report": ["-o", "report.html"], "export": ["images-{name}"], "compare": ["mixed.zarr"],
+    "report": ["-o", "report.md"], "export": ["images"], "compare": ["mixed.zarr"],
     "show": ["--at", "distance_m=0.25,trial=0", "-o", "scene.png"],
     "repro": ["--at", "distance_m=0.25,trial=0"],
 }
 
 
-@pytest.mark.parametrize(("command", "name"), [
-    (command, name) for command in COMMANDS for name in BOARDS
-    if name == "mixed" or command not in {"report", "tradeoff"}])
-def test_a_command_answers_of_boards_or_refuses_in_a_line(
-    command, name, stores, monkeypatch, capfd
-):
-    monkeypatch.chdir(stores)
-    arguments = [each.format(name=name) for each in COMMANDS[command]]
-    status = main([command, f"{name}.zarr", *arguments])
-    output = capfd.readouterr()
-    assert "Traceback" not in output.err
-    if command in REFUSED and (command, name) not in ANSWERED:
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_answers_of_boards_or_refuses_in_a_line(command, store, monkeypatch, capfd):
+    monkeypatch.chdir(store.parent)
+    status = main([command, "mixed.zarr", *COMMANDS[command]])
+    error = capfd.readouterr().err
+    assert "Traceback" not in error
+    if command in REFUSED:
         assert status == 2
-        assert REFUSED[command] in output.err
-        assert len(output.err.strip().splitlines()) == 1
+        assert REFUSED[command] in error
+        assert len(error.strip().splitlines()) == 1
     else:
-        expected = {0, 1, 3} if command == "require" else {0, 2} if name == "backs" else {0}
-        assert status in expected, output.err
+        assert status in ({0, 1, 3} if command == "require" else {0}), error
 
 
 ANALYSES = {
@@ -114,13 +86,13 @@ ANALYSES = {
 
 @pytest.mark.parametrize("markers", [False, True], ids=["boards", "markers"])
 @pytest.mark.parametrize("analysed", ANALYSES)
-def test_an_analysis_answers_of_boards_or_refuses_in_a_line(analysed, markers, stores):
-    for name in BOARDS:
-        results = sweep.open(stores / f"{name}.zarr")
-        results = analysis.per_marker(results) if markers else results
+def test_an_analysis_answers_of_boards_or_refuses_in_a_line(analysed, markers, store):
+    results = sweep.open(store)
+    results = analysis.per_marker(results) if markers else results
+    try:
+        assert isinstance(ANALYSES[analysed](results).compute(), xr.Dataset)
+    except SweepError as error:
+        refusal = str(error)
+    else:
         refusal = ""
-        try:
-            assert isinstance(ANALYSES[analysed](results).compute(), xr.Dataset)
-        except SweepError as error:
-            refusal = str(error)
-        assert "\n" not in refusal
+    assert "\n" not in refusal

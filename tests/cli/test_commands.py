@@ -6,7 +6,6 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,46 +59,27 @@ def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monke
     assert err.splitlines()[-1] == line
 
 
-def test_stopped_command_that_does_not_continue_does_not_say_so(monkeypatch, capsys):
-    def stopped(_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("sweep.execution.status.status", stopped)
-    assert told(capsys, "status", "any.zarr") == (130, "", "stopped\n")
-
-
 # Help and version.
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_each_help_ends_with_two_examples_and_the_guide(command, capsys):
+def test_each_help_has_two_examples_that_are_commands_and_a_text_for_each_argument(
+    command, capsys
+):
     code, out, _ = told(capsys, command.name, "--help")
     assert code == 0
     examples = out.split("examples:\n")[1]
-    assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [
-        *command.examples]
+    assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [*command.examples]
     assert len(command.examples) == 2
     assert out.endswith(f"\nguide: {command.guide}\n")
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_example_is_a_command_that_the_parser_takes(command):
     for example in command.examples:
-        program, *arguments = shlex.split(example)
-        assert program == "sweep"
-        options = build_parser()[0].parse_args(arguments)
-        assert options.command is command
-        for value in arguments:
-            if value.startswith("pipelines/"):
-                assert (TOP / value).is_file()
-
-
-def test_every_argument_has_a_help_text():
-    for command in COMMANDS:
-        parser = argparse.ArgumentParser()
-        command.add_arguments(parser)
-        for action in parser._actions:
-            assert action.help, (command.name, action.dest)
+        _, *arguments = shlex.split(example)
+        assert build_parser()[0].parse_args(arguments).command is command
+        assert all((TOP / value).is_file() for value in arguments
+                   if value.startswith("pipelines/"))
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    assert all(action.help for action in parser._actions)
 
 
 @pytest.mark.system
@@ -114,18 +94,9 @@ def test_help_and_version_import_nothing_heavy():
     assert done.stdout.endswith("imported:\n")
 
 
-def test_the_example_is_the_pipeline_of_the_guides_and_is_packaged():
+def test_the_example_is_the_pipeline_of_the_guides():
     example = TOP / "sweep" / "examples" / "smoke.toml"
     assert example.read_bytes() == (TOP / "pipelines" / "smoke.toml").read_bytes()
-    project = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))
-    assert "examples/*.toml" in project["tool"]["setuptools"]["package-data"]["sweep"]
-
-
-@pytest.mark.parametrize("arguments", [[], ["some.toml", "--example", "smoke"]])
-def test_a_run_is_of_a_file_or_of_an_example(arguments, capsys):
-    code, out, err = told(capsys, "run", *arguments)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "--example smoke" in err
 
 
 # Messages.
@@ -139,12 +110,9 @@ def parsed(monkeypatch):
 
 def test_an_argument_is_named_by_its_flag(capsys, parsed):
     flags = {
-        ("run", "workers"): "--workers", ("run", "time_limit_s"): "--time-limit",
-        ("run", "settings"): "--set", ("tradeoff", "limit_s"): "--seconds",
-        ("report", "form"): "--format", ("report", "output"): "--output",
-        ("report", "store"): "STORE", ("verify", "sample"): "--sample",
-        ("fit", "folders"): "FOLDER", ("photos", "folders"): "FOLDER",
-        ("verify", "some_other"): "--some-other",
+        ("run", "workers"): "--workers", ("run", "settings"): "--set",
+        ("tradeoff", "limit_s"): "--seconds", ("report", "store"): "STORE",
+        ("fit", "folders"): "FOLDER", ("verify", "some_other"): "--some-other",
     }
     for (name, argument), flag in flags.items():
         parsed(name, "x")
@@ -165,7 +133,7 @@ def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
     assert "\x1b" not in err  # it would reach the terminal
 
 
-@pytest.mark.parametrize("form", ["text", "markdown", "json"])
+@pytest.mark.parametrize("form", ["text", "json"])
 def test_names_and_texts_of_a_store_steer_no_terminal(form, capsys, monkeypatch):
     monkeypatch.setattr(SESSION, "form", form)
     clear = "name\x1b[2J\x07\x9b"
@@ -175,39 +143,16 @@ def test_names_and_texts_of_a_store_steer_no_terminal(form, capsys, monkeypatch)
     assert all(line.isprintable() for line in said.splitlines())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["repro", "x", "--time-limit", "0"], "--time-limit 0.0: expected seconds above 0\n"),
-        (["repro", "x", "--time-limit", "inf"], "--time-limit inf: expected seconds above 0\n"),
-        (["tradeoff", "x", "--seconds", "nan"],
-         "--seconds nan: expected a finite number above 0\n"),
-        (["tradeoff", "x", "--criterion", "speed"],
-         "--criterion speed: expected one of rotation_rmse_deg, "),
-    ],
-)
-def test_a_value_that_cannot_be_is_refused_before_any_work(arguments, line, capsys):
-    code, out, err = told(capsys, *arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith(line)
-    assert len(err.splitlines()) == 1
-
-
 # Installations.
 
-class Installed:
-    """A distribution as `importlib.metadata` describes it."""
-
-    def __init__(self, version, commands=()):
-        self.version = version
-        self.entry_points = [type("Entry", (), {"value": value}) for value in commands]
-
-
-def installed(monkeypatch, **distributions):
+def installed(monkeypatch, commands=(), **versions):
+    """Have these versions of distributions be installed alone, each with commands."""
     def distribution(name):
-        if name.replace("-", "_") not in distributions:
+        if name.replace("-", "_") not in versions:
             raise PackageNotFoundError(name)
-        return distributions[name.replace("-", "_")]
+        return SimpleNamespace(
+            version=versions[name.replace("-", "_")],
+            entry_points=[SimpleNamespace(value=value) for value in commands])
 
     monkeypatch.setattr(installation, "distribution", distribution)
 
@@ -220,14 +165,11 @@ def refused(capsys):
 
 
 @pytest.mark.parametrize("distributions", [
-    {"opencv_python": "4.14.0"},
     {"opencv_contrib_python_headless": "5.0.0", "opencv_python_headless": "4.11.0"},
-    {"opencv_contrib_python_headless": "5.0.0", "opencv_contrib_python": "5.0.0",
-     "opencv_python": "5.0.0"},
     {},
 ])
 def test_another_distribution_of_opencv_is_warned_of_once(distributions, capsys, monkeypatch):
-    installed(monkeypatch, **{name: Installed(each) for name, each in distributions.items()})
+    installed(monkeypatch, **distributions)
     installation._warn_of_other_opencv.cache_clear()
     _, _, err = told(capsys, "status", "none.zarr")
     warning, _ = err.splitlines()
@@ -241,7 +183,6 @@ def test_another_distribution_of_opencv_is_warned_of_once(distributions, capsys,
 
 @pytest.mark.parametrize(("loaded", "named"), [
     (None, "OpenCV cannot be imported: "),
-    (SimpleNamespace(__version__="4.14.0"), "OpenCV 4.14.0 is loaded, which has no cv2.aruco"),
     (SimpleNamespace(__version__="4.6.0", aruco=SimpleNamespace()),
      "OpenCV 4.6.0 is loaded, which has no cv2.aruco.ArucoDetector"),
     (SimpleNamespace(), "which has no cv2.aruco"),
@@ -253,26 +194,16 @@ def test_an_opencv_without_aruco_is_refused_in_one_line(loaded, named, capsys, m
     assert "`pip install --force-reinstall opencv-contrib-python-headless`" in line
 
 
-@pytest.mark.system
-def test_an_opencv_without_aruco_is_refused_in_one_line_by_the_library():
-    done = python(
-        "import sys, types\nsys.modules['cv2'] = types.SimpleNamespace(__version__='4.14.0')\n"
-        "import sweep\ntry:\n    sweep.Pipeline\n"
-        "except sweep.StoreError as error:\n    print(error)"
-    )
-    assert "OpenCV 4.14.0 is loaded, which has no cv2.aruco.ArucoDetector" in done.stdout
-
-
 def test_the_other_project_s_package_is_refused_and_an_older_one_of_ours_is_not(
     capsys, monkeypatch
 ):
-    installed(monkeypatch, sweep=Installed("0.1.0", ["sweep.main:run"]))
+    installed(monkeypatch, ["sweep.main:run"], sweep="0.1.0")
     assert refused(capsys) == (
         "another project's package `sweep` (0.1.0) is installed, and its files overwrite those of "
         "fiducial-sweep: `pip uninstall sweep`, then "
         "`pip install --force-reinstall fiducial-sweep`\n"
     )
-    installed(monkeypatch, sweep=Installed("0.5.0", ["sweep.cli:main"]))
+    installed(monkeypatch, ["sweep.cli:main"], sweep="0.5.0")
     assert "another project" not in refused(capsys)
 
 
@@ -282,8 +213,5 @@ def test_python_3_10_is_refused_in_one_line():
     ast.parse(source, feature_version=(3, 10))
     problem = "sweep needs Python 3.11 or newer; this is Python 3.10"
     old = "import sys; sys.version_info = (3, 10, 4); "
-    done = python(f"{old}import sweep")
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == f"ImportError: {problem}"
     done = python(f"{old}sys.argv[0] = '/usr/bin/sweep'; import sweep")
     assert (done.returncode, done.stderr) == (1, f"{problem}\n")

@@ -37,19 +37,16 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
     assert float(row[3].replace("\u2212", "-")) == pytest.approx(
         at.range_bias_percent.values[0], rel=0.01)
     assert "to" in row[6]
-    ratio = next(row for row in table.rows if row[0].startswith("rotation error, 90 %"))
-    assert ratio[5] == "ratio"
     assert gap_lines(gap) == ["12 photographs and their twins, pairs of markers"]
 
 
-def test_json_has_the_same_numbers_and_null_where_there_is_none():
+def test_json_has_null_where_there_is_no_number():
     rng = np.random.default_rng(2)
     gap = simulation_gap(results_of(rng, 3), twins(rng))
     records = json.loads(to_json(gap_table(gap).as_json()))["rows"]
     median = next(each for each in records
                   if each["statistic"].startswith("rotation error, median"))
-    assert median["compared by"] == "ratio"
-    assert median["cornerRefinementMethod"] == "none"
+    assert (median["compared by"], median["cornerRefinementMethod"]) == ("ratio", "none")
     assert (median["gap"]["low"], median["gap"]["high"]) == (None, None)
     assert math.isfinite(median["gap"]["value"])
     assert gap_lines(gap)[-1] == "fewer than 5 photographs: errors without intervals"
@@ -71,19 +68,6 @@ def test_the_figure_has_the_distributions_of_both_sources():
     assert np.allclose(real.get_xdata(), np.percentile(angles, real.get_ydata()))
     assert np.median(simulated.get_xdata()) < np.median(angles)
     assert b"<svg" in panels_file(panels[:1], ".svg")
-
-
-@pytest.mark.parametrize(("arguments", "expected"), [
-    (["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
-    (["--bins", "side_px"], "--bins side_px: expected a variable and increasing edges"),
-    (["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
-    ([], "runs/none.zarr"),
-])
-def test_a_fault_is_one_line(arguments, expected, capsys):
-    code, out, err = told(capsys, "compare", "runs/none.zarr", "scene.toml", *arguments)
-    assert (code, out) == (2, "")
-    assert expected in err
-    assert err.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -115,8 +99,10 @@ def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
 @pytest.mark.parametrize(("other", "flags", "named"), [
     ("c.zarr", [], "seeds 0 and 2"), ("d.zarr", [], "cornerRefinementMethod"),
     ("none.zarr", [], "none.zarr"), ("b.zarr", ["--bins", "side_px=1,2"], "--bins"),
+    ("s.toml", ["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
+    ("s.toml", ["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
 ])
-def test_stores_that_are_no_pair_are_refused_in_one_line(other, flags, named, stores, capsys):
+def test_what_is_no_pair_is_refused_in_one_line(other, flags, named, stores, capsys):
     code, out, err = told(capsys, "compare", stores / "a.zarr", stores / other, *flags)
     assert (code, out) == (2, "")
     assert named in err
@@ -150,12 +136,5 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys)
     code, _, err = told(capsys, "compare", tmp_path / "shots.zarr", scene)
     assert code == 2
     assert "holds another experiment" in err
-    empty = tmp_path / "empty.toml"
-    empty.write_text("seed = 3\n")
-    for name, expected in (("empty.toml", "expected a section [scene]"),
-                           ("missing.toml", "cannot be read: No such file")):
-        err = told(capsys, "compare", tmp_path / "shots.zarr", tmp_path / name)[2]
-        assert err.startswith("SIMULATION ")
-        assert expected in err
     assert "expected a store of photographs" in told(
         capsys, "compare", tmp_path / "shots-same.zarr", scene)[2]

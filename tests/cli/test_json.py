@@ -7,14 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pytest
-import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sweep.analysis import calibration_summary
 from sweep.messages import to_json
-from sweep.report.comparison_tables import calibration_table
 
 
 def strict(text):
@@ -68,19 +64,3 @@ def back(value, flag=None):
 )))
 def test_every_infinity_is_told_beside_its_number(content):
     assert back(strict(to_json(content))) == content
-
-
-def test_calibrations_are_numbers_with_units_in_the_keys():
-    intrinsics = ["fx_px", "k1"]
-    summary = calibration_summary(xr.Dataset({
-        "calibration": (("views", "set"), [[1, 1]]),
-        "intrinsic_error": (("views", "set", "intrinsic"), [[[-1.0, 0.1], [-3.0, 0.3]]]),
-        "intrinsic_std": (("views", "set", "intrinsic"), [[[1.0, 0.0], [1.0, 0.0]]]),
-        "position_error_m": (("views", "set", "direction", "xyz"), np.full((1, 2, 1, 3), -0.01)),
-    }, {"views": [6], "intrinsic": intrinsics, "direction": ["centre"], "xyz": list("xyz")},
-        {"points": "chessboard", "target_m": 3.0}))
-    rows = strict(to_json(calibration_table(summary).as_json()))["rows"]
-    assert [row["number"] for row in rows] == ["fx_px"]  # k1 was not estimated
-    assert (rows[0]["views"], rows[0]["tried"], rows[0]["calibrated"]) == (6, 2, 2)
-    assert rows[0]["z in the centre, mm"]["value"] == pytest.approx(10)
-    assert rows[0]["bias"]["value"] == -2.0

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 
@@ -47,14 +49,11 @@ def line_of(*arguments):
 NOT_FOUND = "store not found; create one with `sweep run`"
 
 PLACES = {
-    "none.zarr": NOT_FOUND,
     "small.toml/s.zarr": NOT_FOUND,
     "small.toml": "makes its store, by default runs/small.zarr",
     "/dev/null": "not a sweep store; choose another path",
     "loop.zarr": "cannot be read: Too many levels of symbolic links",
-    "x" * 300: "cannot be read: File name too long",
     "x/" * 3000: "cannot be read: File name too long",
-    "file:///a/b%20c.zarr": "a store on this machine is named by its path: /a/b c.zarr",
     "file:/a/b.zarr": "a store on this machine is named by its path: /a/b.zarr",
     "memory://x.zarr":
         "no other process sees what is in this one's memory; choose a path or s3://",
@@ -69,8 +68,7 @@ PLACES = {
 def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, folder):  # noqa: ARG001
     for reader in READERS:
         if not (reader[0] == "tradeoff" and place.endswith(".toml")):
-            line = line_of(*reader, place)
-            assert line.endswith(PLACES[place])
+            assert line_of(*reader, place).endswith(PLACES[place])
     assert line_of("run", "small.toml", "--store", "o.zarr", "--reuse", place).endswith(
         PLACES[place])
 
@@ -80,13 +78,11 @@ def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, f
     [
         ("small.toml/s.zarr", "cannot be written: Not a directory"),
         *((place, PLACES[place]) for place in (
-            "loop.zarr", "x" * 300, "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr", "a\0b")),
+            "loop.zarr", "x/" * 3000, "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr", "a\0b")),
         ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
         *((f"{protocol}://a/x.zarr", f"{protocol}://a/x.zarr: ") for protocol in (
-            "github", "gist", "data", "dbfs", "reference", "jupyter", "generic", "asyncwrapper",
-            "zip", "dir", "simplecache", "sftp", "foo", "S3")),
+            "github", "zip", "simplecache", "foo", "S3")),
         ("small.toml", "not a sweep store, but a pipeline file"),
-        ("group.zarr/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
         ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
     ],
     ids=lambda text: text[:20].replace("\0", "NUL"),
@@ -99,8 +95,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_starts(
     (group / "zarr.json").write_text("{}")
     before = sorted(path.name for path in folder.rglob("*"))
     for overwrite in ([], ["--overwrite"]):
-        line = line_of("run", "small.toml", "--store", place, *overwrite)
-        assert problem.format(folder) in line
+        assert problem.format(folder) in line_of("run", "small.toml", "--store", place, *overwrite)
     assert sorted(path.name for path in folder.rglob("*")) == before
 
 
@@ -146,7 +141,6 @@ ERRORS = {
     BlockingIOError(11, "Resource temporarily unavailable"):
         "the system refused a request: Resource temporarily unavailable; "
         "allow more processes (ulimit -u)",
-    OSError(27, "File too large", "x"): "x: File too large; allow larger files (ulimit -f)",
     MemoryError(): "out of memory; free memory, or allow more (ulimit -v)",
     RuntimeError("can't start new thread"):
         "the system refused a request: can't start new thread; allow more processes (ulimit -u)",
@@ -155,35 +149,28 @@ ERRORS = {
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: str(error)[:20])
 def test_what_the_system_refuses_is_told_in_one_line(error, monkeypatch):
-    def refused():
-        raise error
-
-    monkeypatch.setattr("sweep.cli.check_installation", refused)
+    monkeypatch.setattr("sweep.cli.check_installation", mock.Mock(side_effect=error))
     assert command("status", "x") == (1, "", ERRORS[error] + "\n")
 
 
 def test_a_defect_is_not_taken_for_the_system(monkeypatch):
-    def broken():
-        raise RuntimeError("some defect")
-
-    monkeypatch.setattr("sweep.cli.check_installation", broken)
+    monkeypatch.setattr(
+        "sweep.cli.check_installation", mock.Mock(side_effect=RuntimeError("some defect")))
     with pytest.raises(RuntimeError, match="some defect"):
         cli.main(["status", "x"])
 
 
 @pytest.mark.system
-def test_full_standard_output_is_told_in_one_line():
-    buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
-    for arguments, environment in (
-        ([], {**buffered, "PYTHONUNBUFFERED": "1"}), (["plan", "--help"], buffered),
-    ):
-        with open("/dev/full", "wb") as full:  # noqa: PTH123
-            done = subprocess.run(
-                [sys.executable, "-m", "sweep", *arguments], env=environment, stdout=full,
-                stderr=subprocess.PIPE, text=True, check=False)
-        assert done.returncode == 1
-        assert done.stderr == (
-            "standard output cannot be written: No space left on device; free space on the disk\n")
+@pytest.mark.parametrize("unbuffered", [True, False])
+def test_full_standard_output_is_told_in_one_line(unbuffered, monkeypatch):
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    words = ["-u", "-m", "sweep"] if unbuffered else ["-m", "sweep", "plan", "--help"]
+    with open("/dev/full", "wb") as full:  # noqa: PTH123
+        done = subprocess.run(
+            [sys.executable, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "standard output cannot be written: No space left on device; free space on the disk\n")
 
 
 @pytest.mark.system
@@ -200,9 +187,7 @@ def test_characters_that_a_terminal_lacks_are_printed_as_escapes(tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("optimize", [1, 2])
-def test_without_assertions_no_store_is_touched(optimize, monkeypatch, tmp_path):
-    flags = type("Flags", (), {"optimize": optimize})
-    monkeypatch.setattr("sweep.store.locations.sys.flags", flags)
+def test_without_assertions_no_store_is_touched(monkeypatch, tmp_path):
+    monkeypatch.setattr("sweep.store.locations.sys.flags", SimpleNamespace(optimize=1))
     with pytest.raises(StoreError, match="unset PYTHONOPTIMIZE"):
         check_writable(str(tmp_path / "x.zarr"))

@@ -72,12 +72,11 @@ def faults(report):
             if finding.verdict == "fault"}
 
 
-@pytest.mark.parametrize("source", [DETECTOR, SOLVER], ids=["detector", "solver"])
-def test_what_conforms_passes_six_checks(source, checked):
-    report = checked(source)
+def test_what_conforms_passes_six_checks(checked):
+    report = checked(DETECTOR)
     assert report.conforms, faults(report)
     assert [finding.verdict for finding in report.findings] == ["ok"] * 6
-    assert report.numbers.get("detected", report.numbers.get("solved")) == 32
+    assert report.numbers["detected"] == 32
 
 
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
@@ -86,15 +85,12 @@ def test_what_conforms_passes_six_checks(source, checked):
     (SOLVER, "translation = translation + 1e-9 * len(SEEN)", "repeats itself", "32 of 32"),
     (SOLVER, "translation = translation + 1e-6 * len(rotation)", "ignores the batch", "32 of 32"),
     *(pytest.param(*case, marks=pytest.mark.evidence) for case in (
-        (DETECTOR, "image[:] = 0", "returns markers", "changed the image"),
         (DETECTOR, "corners, ids = corners[:0], ids[:0]", "finds markers", "0 of 32"),
         (DETECTOR, "corners += np.random.default_rng().random() * 1e-3", "repeats itself",
          "32 of 32"),
         (DETECTOR, "corners += (len(SEEN) == 80) * 1e-3", "has no memory", "1 of 32"),
         (SOLVER, "translation = translation * 1000", "solves scenes", "metres"),
         (SOLVER, "rotation = rotation.transpose(0, 2, 1)", "keeps frames", "20 deg"),
-        (SOLVER, "translation = translation * 1.1", "keeps frames", "10 %"),
-        (SOLVER, "return rotation[:1], translation", "returns poses", "shape (1, 3, 3)"),
         (SOLVER, "raise ValueError('none')", "returns poses", "ValueError: none"),
         (SOLVER, "detections.corners[:] = 0; translation += np.random.default_rng().random() / 1e6",
          "repeats itself", "32 of 32"),
@@ -107,7 +103,6 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
 
 @pytest.mark.system
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
-    (DETECTOR, "os.abort()", "returns markers", "SIGABRT"),
     (DETECTOR, "image.shape[0] > 8 or os._exit(3)", "has no memory", "exit status 3"),
     (DETECTOR, "time.sleep(60)", "returns markers", "did not return"),
     (SOLVER, "os.abort()", "returns poses", "SIGABRT"),
@@ -115,7 +110,7 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
 def test_a_crash_or_an_endless_call_ends_the_checks(source, body, check, named, checked):
     from sweep.isolation.child_process import Child  # noqa: PLC0415
 
-    report = checked(source, body, child=Child, time_limit_s=5 if "sleep" in body else 60)
+    report = checked(source, body, child=Child, time_limit_s=2 if "sleep" in body else 60)
     assert named in faults(report)[check]
     assert report.findings[-1].check == check
 

@@ -33,7 +33,6 @@ def faults_of(change, ids=lambda number: number, *, declared=DECLARED, center=0.
     (lambda c: np.roll(c, 2, axis=1), "turned by two (180°): declare corner_order = (2, 3, 0, 1)"),
     (lambda c: c[:, [1, 0, 3, 2]], "the other way round, or cross: declare corner_order = (1, 0,"),
     (lambda c: c[..., ::-1], "no pixels of the image"),
-    (lambda c: c / 2, "no pixels of the image"),
     (lambda c: c * [1, -1] + np.array([0, 479]), "y downwards"),
     (lambda c: np.array([quad[np.lexsort(quad.T)] for quad in c]), "in no fixed order"),
 ])

@@ -1,15 +1,12 @@
 """Boards exported, answered by a plain OpenCV loop over the folder, and scored as a run is."""
 
-import csv
-import re
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
 import xarray as xr
 
+from support.answers import answer, rows_of, write
 from sweep.errors import PipelineError
 from sweep.evaluation.block import compute_block
 from sweep.exchange.export import export
@@ -71,11 +68,6 @@ def results_of(pipeline):
     return compute_block(pipeline.experiment, Block((0,) * len(lengths), lengths))
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def numbers(row, names):
     return [float(row[name]) for name in names]
 
@@ -86,8 +78,7 @@ def exchanged(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("boards") / "export"
     pipeline = Pipeline.from_text(TEXT + BOARDS[request.param], name="exchanged")
     export(pipeline, folder)
-    script = re.search(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)[1]
-    subprocess.run([sys.executable, "-c", script], cwd=folder, check=True)
+    answer(folder)
     return folder, results_of(pipeline)
 
 
@@ -104,9 +95,7 @@ def test_detections_of_a_plain_opencv_loop_are_scored_as_a_run(exchanged):
 @pytest.mark.parametrize("form", ["beside the corners", "alone"])
 def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, form, tmp_path):
     folder, ran = exchanged
-    places = {}
-    for row in rows_of(folder / "truth.csv"):
-        places[row["image"], row["id"]] = row
+    places = {(row["image"], row["id"]): row for row in rows_of(folder / "truth.csv")}
     found = {}
     for row in rows_of(folder / "detections.csv"):
         found.setdefault(row["image"], []).append(row)
@@ -126,10 +115,7 @@ def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, fo
         answers.append({"image": image, "id": "", **dict.fromkeys(corner_names, ""), **pose})
         if form == "beside the corners":
             answers += [row | dict.fromkeys(pose, "") for row in rows]
-    with (tmp_path / "poses.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(answers[0]))
-        table.writeheader()
-        table.writerows(answers)
+    write(tmp_path / "poses.csv", answers)
     ready = prepare(folder, [tmp_path / "poses.csv"], names=[form.replace(" ", "-")])
     assert ready.pipeline.fixed["solver"] == "recorded"
     scored = results_of(ready.pipeline)
@@ -142,20 +128,6 @@ def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, fo
             scored["marker_corner_error_px"], ran["marker_corner_error_px"])
     else:  # the corners are the image of the pose
         assert np.nanmax(scored["reprojection_error_px"]) < 1e-9
-
-
-def test_conventions_of_answers_on_boards_are_hinted_at(exchanged, tmp_path):
-    folder, _ = exchanged
-    rows = rows_of(folder / "detections.csv")
-    for row in rows:
-        for k in range(4):
-            row[f"x{k}"], row[f"y{k}"] = float(row[f"x{k}"]) + 0.5, float(row[f"y{k}"]) + 0.5
-    with (tmp_path / "shifted.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(rows[0]))
-        table.writeheader()
-        table.writerows(rows)
-    lines = prepare(folder, [tmp_path / "shifted.csv"]).lines
-    assert any("pass --pixel-center 0.5" in line for line in lines)
 
 
 def test_truth_of_a_charuco_has_its_chessboard(tmp_path):

@@ -2,6 +2,7 @@
 
 import math
 import time
+from unittest import mock
 
 import pytest
 
@@ -36,13 +37,6 @@ trial = 50
 """
 
 
-class Failing(Here):
-    """A child that dies."""
-
-    def call(self, *_, **__):
-        raise ChildDiedError("SIGSEGV")
-
-
 @pytest.mark.evidence
 def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
     pipeline = Pipeline.from_text(HUGE)
@@ -54,8 +48,9 @@ def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_si
     assert timing.scene_s >= 0.2
     assert math.prod(blocks_of(pipeline, timing.scene_s, 2).extents) <= max(
         BLOCK_S / timing.scene_s, 1)
-    with Failing() as child:
-        assumed = measured_or_assumed(child, pipeline, 1.0)
+    dying = Here()
+    dying.call = mock.Mock(side_effect=ChildDiedError("SIGSEGV"))
+    assumed = measured_or_assumed(dying, pipeline, 1.0)
     assert (assumed.sampled, assumed.over) == (0, False)
 
 
@@ -87,10 +82,10 @@ def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, 
         min(block_s, 3.0), rel=0.15, abs=scene_s)
 
 
-@pytest.mark.parametrize("lengths", [
-    (50, 200, 100_000), (999, 1001, 1003), (31, 32_258_065), (10,) * 9, (1, 14_999, 66_672),
-])
 @pytest.mark.parametrize("scene_s", [1e-3, 0.05])
+@pytest.mark.parametrize("lengths", [
+    (50, 200, 100_000), (31, 32_258_065), (10,) * 9, (1, 14_999, 66_672),
+])
 def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_bear(
     lengths, scene_s
 ):

@@ -2,9 +2,9 @@
 
 import contextlib
 import itertools
-import json
 import os
 import random
+import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -13,12 +13,14 @@ import psutil
 import pytest
 import xarray as xr
 
-from support.clusters import Cluster, workers_below
-from support.commands import command, complaints, started
+from support.clusters import CLIENT, Cluster, workers_below
+from support.commands import command, started
+from support.here import calls_here
 from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
-from sweep.execution.status import close
+from sweep.execution.runner import execute
+from sweep.execution.status import close, status
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed, receipts
@@ -50,18 +52,6 @@ PRECISION = """
 precision = { detection_rate = 0.03 }
 per = ["distance_m", "tilt_deg"]
 """
-
-CLIENT = """
-import sys
-from sweep.execution.runner import execute
-from sweep.experiment.pipeline import Pipeline
-
-if __name__ == "__main__":
-    pipeline, store, scheduler = sys.argv[1:]
-    execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
-            block_s=0.05)
-"""
-
 
 def whole(url, pipeline, reference):
     """Assert that a store is finished and equals another; each block is committed once."""
@@ -129,7 +119,8 @@ class Chaos:
 
     def _client(self, scheduler=""):
         log = self._left.enter_context((self._folder / "client.log").open("w"))
-        return started(["-c", CLIENT, self._path, self._url, scheduler], stdout=log, stderr=log)
+        return started(
+            ["-c", CLIENT, self._path, self._url, scheduler, 0.05], stdout=log, stderr=log)
 
     def _told(self):
         return (self._folder / "client.log").read_text()
@@ -226,27 +217,26 @@ def small(tmp_path_factory):
 def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(step, small, tmp_path):
     pipeline, path, reference = small
     url = str(tmp_path / "small.zarr")
-    store = create_store(url, pipeline, (1, 1, 1))
+    store = create_store(url, pipeline, (1, 1, 1 if step == 1 else 5))
     with pieces("block", url, path, step=step) as (_, count):
         pass
     # The receipt's renaming is what commits; what comes after it, if anything, may be lost.
     before = committed(store)
     assert before == set(range(count + 1 - len(before), count + 1))
     assert len(before) <= 4
-    state = command("status", url, "--json")
-    assert state.returncode == 0, state.stderr
-    assert json.loads(state.stdout)["blocks_done"] == len(before)
-    ran = command("run", path, "--store", url, "--json")
-    assert (ran.returncode, complaints(ran)) == (0, [])
-    told = json.loads(ran.stdout)
-    assert told["computed_blocks"] == len(store.blocks) - len(before)
-    assert told["crashed"] == 0
+    assert status(url).blocks_done == len(before)
+    with calls_here():
+        summary = execute(pipeline, url)
+    assert summary.computed_blocks == len(store.blocks) - len(before)
+    assert (summary.crashed, summary.warnings) == (0, [])
     whole(url, pipeline, reference)
 
 
 @pytest.mark.evidence
 @pytest.mark.filterwarnings("ignore:Object at zarr.*partial")  # left by a kill, and no fault
-def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(small, tmp_path):
+def test_kill_between_any_two_writes_of_closing_and_of_a_new_store_leaves_all_or_none(
+    small, tmp_path
+):
     pipeline, path, reference = small
     by_hand(str(tmp_path / "complete.zarr"), pipeline, (4, 2, 10))
     with pieces("closing", tmp_path, path) as (_, count):
@@ -257,11 +247,7 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(sm
             assert number < count
             close(open_store(url, "r+"))
         whole(url, pipeline, reference)
-
-
-@pytest.mark.evidence
-def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(small, tmp_path):
-    pipeline, path, _ = small
+        shutil.rmtree(url)
     with pieces("creating", tmp_path, path) as (_, count):
         pass
     for number in range(count + 1):
@@ -273,16 +259,14 @@ def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(small, tm
 
 
 @pytest.mark.evidence
-def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(small, cluster, tmp_path):
+def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(small, tmp_path):
     pipeline, path, _ = small
     url = str(tmp_path / "small.zarr")
     create_store(url, pipeline, (1, 1, 1))
-    other_text = SMALL.replace("seed = 3", "seed = 4")
-    other, other_path, reference = prepared(tmp_path, other_text, "other")
+    other, _, reference = prepared(tmp_path, SMALL.replace("seed = 3", "seed = 4"), "other")
     with pieces("block", url, path, "SIGSTOP") as (running, _):
-        ran = command("run", other_path, "--store", url, "--overwrite",
-                      "--scheduler", cluster.scheduler_address)
-        assert (ran.returncode, complaints(ran)) == (0, [])
+        with calls_here():
+            execute(other, url, overwrite=True)
         whole(url, other, reference)
         running.stdin.write("go on\n")
         running.stdin.flush()
@@ -290,84 +274,49 @@ def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(small, cluster, tm
     whole(url, other, reference)
 
 
-class Disk:
-    """A file system of a given size in memory."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def remount(self, options):
-        """Change its options; what is being written is given time to end."""
-        deadline = time.monotonic() + 30
-        while True:
-            ran = subprocess.run(
-                ["mount", "-o", f"remount,{options}", self.path], check=False, capture_output=True,
-                text=True,
-            )
-            if ran.returncode == 0:
-                return
-            assert time.monotonic() < deadline, ran.stderr
-            time.sleep(0.05)
-
-    def leave(self, size):
-        """Fill it until ``size`` bytes are left."""
-        filler = self.path / "filler"
-        filler.unlink(missing_ok=True)
-        state = os.statvfs(self.path)
-        if (fill := state.f_bavail * state.f_frsize - size) > 0:
-            with filler.open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, fill)
-
-    def clear(self):
-        """Take away what fills it."""
-        (self.path / "filler").unlink(missing_ok=True)
-
-
 PAGE = 4096
+FULL = "No space left on device"
 
 
 @pytest.fixture
 def disk(tmp_path):
-    """Give a disk of 1 MB; skip where mounting is not permitted."""
+    """Mount a disk of 64 MB in memory; give its folder, and a function that fills it."""
     path = tmp_path / "disk"
     path.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", path], check=False, capture_output=True,
-        text=True,
+        ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", path], check=False,
+        capture_output=True, text=True,
     )
     if mounted.returncode != 0:
         pytest.skip(f"mounting is not permitted: {mounted.stderr.strip()}")
+
+    def leave(pages):
+        state = os.statvfs(path)
+        if (fill := state.f_bavail * state.f_frsize - pages * PAGE) > 0:
+            with (path / "filler").open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, fill)
+
     try:
-        yield Disk(path)
+        yield path, leave
     finally:
         subprocess.run(["umount", "--lazy", path], check=True)
-
-
-def told_in_a_line(ran, what, codes=(1,)):
-    """Assert that a command failed, and said why in one line."""
-    assert ran.returncode in codes, (ran.returncode, ran.stdout, ran.stderr)
-    assert what in ran.stderr
-    assert len(ran.stderr.strip().splitlines()) == 1, ran.stderr
-    assert "Traceback" not in ran.stdout + ran.stderr
-
-
-FULL = "No space left on device"
 
 
 @pytest.mark.system
 def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(small, disk):
     pipeline, _, _ = small
-    url = disk.path / "small.zarr"
+    folder, leave = disk
+    url = folder / "small.zarr"
     create_store(str(url), pipeline, (1, 1, 10))
-    state = os.statvfs(disk.path)
+    state = os.statvfs(folder)
     pages = state.f_blocks - state.f_bfree
-    subprocess.run(["rm", "-r", url], check=True)
+    shutil.rmtree(url)
     for left in range(0, pages, 7):
-        disk.leave(left * PAGE)
+        leave(left)
         with pytest.raises(StoreError, match=f"cannot be written: {FULL}"):
             create_store(str(url), pipeline, (1, 1, 10))
-        assert [path.name for path in disk.path.iterdir()] == ["filler"]
-    disk.clear()
+        assert [path.name for path in folder.iterdir()] == ["filler"]
+        (folder / "filler").unlink()
     assert committed(create_store(str(url), pipeline, (1, 1, 10))) == set()
 
 
@@ -375,24 +324,23 @@ def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(small, disk):
 def test_disk_that_is_full_to_any_page_is_told_in_a_line(small, disk, tmp_path):
     """The lock, the marks, a block's variables, its receipt, and the closing: each hits the end."""
     pipeline, path, reference = small
-    disk.remount("size=64m")
-    arguments = ("run", path, "--workers", 2, "--store")
+    folder, leave = disk
     failed = 0
-    for left in (*range(12), *range(12, 90, 6)):
-        url = str(disk.path / f"{left}.zarr")
+    for left in (*range(12), *range(12, 90, 12)):
+        url = str(folder / f"{left}.zarr")
         store = create_store(url, pipeline, (2, 2, 5))
-        blocks = list(store.blocks)
-        for block in blocks[:2]:
+        for block in list(store.blocks)[:2]:
             compute_block(url, store.run_id, block)
-        disk.leave(left * PAGE)
-        ran = command(*arguments, url, cwd=tmp_path)
+        leave(left)
+        ran = command("run", path, "--workers", 2, "--store", url, cwd=tmp_path)
         if ran.returncode != 0:
-            told_in_a_line(ran, FULL, {1, 2})
+            assert ran.returncode in {1, 2}, (ran.returncode, ran.stdout, ran.stderr)
+            assert FULL in ran.stderr
+            assert len(ran.stderr.strip().splitlines()) == 1, ran.stderr
             failed += 1
-        disk.clear()
-        ran = command(*arguments, url, cwd=tmp_path)
-        assert (ran.returncode, complaints(ran)) == (0, [])
+        (folder / "filler").unlink(missing_ok=True)
+        with calls_here():
+            execute(pipeline, url)
         whole(url, pipeline, reference)
-        subprocess.run(["rm", "-r", url], check=True)
-    print(f"{failed} runs met a full disk")
+        shutil.rmtree(url)
     assert failed > 5

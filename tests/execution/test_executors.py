@@ -1,7 +1,5 @@
 """Processes that compute blocks: children of this machine, and workers of the caller's cluster."""
 
-import contextlib
-import logging
 import os
 import signal
 import subprocess
@@ -11,8 +9,9 @@ from unittest import mock
 
 import psutil
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
 
+from support.clusters import local_cluster
 from support.commands import started
 from support.here import Here
 from support.stores import by_hand, same
@@ -76,16 +75,6 @@ def suicide(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Failing(Here):
-    """A child whose calls fail."""
-
-    def __init__(self, error):
-        self._error = error
-
-    def call(self, *_, **__):
-        raise self._error
-
-
 def compute_in(store, child):
     waiting = AnyOrder(range(len(store.blocks)))
     with child, Interrupts() as interrupts, Children(child, 1, at_once=True) as executor:
@@ -108,8 +97,10 @@ def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch
     (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
 ])
 def test_block_that_fails_is_named(raised, error, reason, undisturbed):
+    child = Here()
+    child.call = mock.Mock(side_effect=raised)
     with pytest.raises(error, match=reason):
-        compute_in(open_store(undisturbed), Failing(raised))
+        compute_in(open_store(undisturbed), child)
 
 
 @pytest.mark.evidence
@@ -152,80 +143,69 @@ def test_children_end_with_their_client_whatever_ends_it(tmp_path):
 
 # The caller's cluster.
 
-@contextlib.contextmanager
-def local_cluster(workers=1, **options):
-    with LocalCluster(
-        n_workers=workers, threads_per_worker=1, host="127.0.0.1",
-        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL, **options,
-    ) as cluster:
-        yield cluster
-
-
 def elsewhere(pipeline, begun):
     """Return what a thread says, as if it were another process, of other versions."""
     return Worker(other_here(pipeline, begun | {"opencv": "0.0"}), ("elsewhere", 1), "AVX2")
 
 
-def refusal(client):
-    with pytest.raises(ArgumentError) as raised, connected(PIPELINE, None, client):
+def refusal(client, scheduler=None):
+    with pytest.raises(ArgumentError) as raised, connected(PIPELINE, scheduler, client):
         pass
     return str(raised.value)
 
 
 @pytest.mark.system
-def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypatch):
+def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(tmp_path, monkeypatch):
     monkeypatch.setattr(on_cluster, "WORKERS_S", 0.5)
-    with local_cluster(0) as cluster:
-        assert refusal(cluster) == (
-            f"client = LocalCluster({cluster.scheduler_address}): no workers within 0 s; start some"
-        )
-        client = Client(cluster, set_as_default=False)
-        address = cluster.scheduler_address
-        client.close()
-        assert refusal(client) == "client = Client(None): it is closed"
-    assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
-    for given in (address, 3, object()):
-        assert "expected a distributed.Client or a cluster object" in refusal(given)
-
-
-@pytest.mark.system
-def test_workers_that_are_threads_of_the_caller_or_have_other_versions_are_refused(
-    tmp_path, monkeypatch
-):
-    # A scene that crashes, and the time limit, end the process of a worker.
+    # A scene that crashes, and the time limit, end the process of a worker: threads do not do.
     with local_cluster(1, processes=False, protocol="tcp://") as cluster:
         assert "its workers are threads of this process" in refusal(cluster)
-        monkeypatch.setattr(on_cluster, "this_process", elsewhere)
-        for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
-            with pytest.raises(ArgumentError, match=r"tcp://.*: opencv is .*, the run began"):
-                execute(PIPELINE, tmp_path / "other.zarr", **given)
-    assert not (tmp_path / "other.zarr").exists()
+        with monkeypatch.context() as patch:
+            patch.setattr(on_cluster, "this_process", elsewhere)
+            for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
+                with pytest.raises(ArgumentError, match=r"tcp://.*: opencv is .*, the run began"):
+                    execute(PIPELINE, tmp_path / "other.zarr", **given)
+        assert not (tmp_path / "other.zarr").exists()
+        address = cluster.scheduler_address
+        client = Client(cluster, set_as_default=False)
+        client.close()
+        assert refusal(client) == "client = Client(None): it is closed"
+        client = Client(cluster, set_as_default=False)
+        client.retire_workers()
+        assert refusal(client).endswith("no workers within 0 s; start some")
+        client.close()
+    assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
 
 
-@pytest.mark.parametrize(("states", "line"), [
-    (("running", "running"), "1 are with 2 workers; a block ends after at most 7 s"),
-    (("paused", "running"), "1 are with 2 workers, 1 of them paused by Dask"),
-])
-def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch, capsys):
+@pytest.mark.parametrize("client", ["tcp://127.0.0.1:9", 3, object()])
+def test_what_is_no_client_is_refused(client):
+    assert "expected a distributed.Client or a cluster object" in refusal(client)
+
+
+@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a"])
+def test_what_is_no_address_is_refused(address):
+    assert "expected an address such as tcp://host:8786" in refusal(None, address)
+
+
+def test_run_without_progress_says_so_once_in_a_while(monkeypatch, capsys):
     monkeypatch.setattr(executors, "SILENCE_S", 0.1)
     monkeypatch.setattr(executors, "POLL_S", 0.02)
     monkeypatch.setattr(OnCluster, "_look", lambda _: None)
     engine = OnCluster(mock.Mock(status="closed"))
-    engine._states = {str(k): {"nthreads": 1, "status": name} for k, name in enumerate(states)}
+    engine._states = {str(k): {"nthreads": 1, "status": name}
+                      for k, name in enumerate(("paused", "running"))}
     end = time.monotonic() + 0.35
     engine.room = lambda: 9 if time.monotonic() < end else pytest.fail("time is up")
     with Interrupts() as interrupts, pytest.raises(pytest.fail.Exception):
         list(engine.map(AnyOrder([0]), lambda _: (), 7, interrupts))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # after 0.1 s, and after 0.2 s
-    assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
+    assert all("no block was finished for 0 s: 1 are with 2 workers, 1 of them paused by Dask"
+               in each for each in lines)
 
 
 @pytest.mark.evidence
 def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_path, capfd):
-    pipeline = Pipeline.from_text(
-        '[pose]\nside_px = 60\n[detector]\ncornerRefinementMethod = "subpix"\n[axes]\ntrial = 4\n'
-        "tilt_deg = [0, 20]\n[scene]\nnoise_grey = 1\n")
     older = os.environ | {"OPENCV_CPU_DISABLE": "AVX2,AVX512-SKX", "OPENCV_IPP": "disabled"}
     with (
         local_cluster() as cluster,
@@ -235,8 +215,8 @@ def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_
     ):
         client.wait_for_workers(2, timeout=60)
         capfd.readouterr()
-        store = create_store(str(tmp_path / "mixed.zarr"), pipeline, (1, 1))
-        summary = execute(pipeline, store.url, client=client)
+        store = create_store(str(tmp_path / "mixed.zarr"), PIPELINE, (1, 1))
+        summary = execute(PIPELINE, store.url, client=client)
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("warning: processors with 2 different sets of features: last digits ")
     assert "(1 workers: " in line

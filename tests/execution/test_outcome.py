@@ -8,11 +8,6 @@ from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.outcome import FailedCell, failure_groups, outcome_of
 
-TEXT = """
-pose = { jitter_px = 0.5 }
-axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 2 }
-"""
-
 TRACEBACK = """Traceback (most recent call last):
   File "a.py", line 3, in f
     raise ValueError("x")
@@ -21,15 +16,10 @@ TRACEBACK = """Traceback (most recent call last):
 """
 
 
-def counts(flags, **given):
-    return [given.get(flag.name, 0) for flag in flags]
-
-
-def outcome(detection, estimate, cells=()):
-    return outcome_of(
-        "a b.zarr", counts(DetectionStatus, **detection), counts(EstimateStatus, **estimate), cells,
-        "trial=0",
-    )
+def outcome(detection, estimate, cells):
+    counts = [[given.get(flag.name, 0) for flag in flags]
+              for flags, given in ((DetectionStatus, detection), (EstimateStatus, estimate))]
+    return outcome_of("a b.zarr", *counts, cells, "trial=0")
 
 
 def failed(message, at, kind="failed", stage="estimation"):
@@ -61,21 +51,16 @@ def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
         ({"detected": 40}, {"failed": 40}, True, 1.0, "nothing computed: all 40 estimates failed"),
         ({"failed": 30, "crashed": 10}, {"no_detection": 40}, True, 1.0,
          "nothing computed: all 40 detections failed or crashed"),
-        ({"detected": 30, "not_visible": 10}, {"failed": 30, "no_detection": 10}, True, 1.0,
-         "nothing computed: all 30 estimates failed"),
         ({"detected": 80, "crashed": 20}, {"solved": 80, "no_detection": 20}, False, 0.2,
          "warning: 20 crashed of 100 detections (20 %)"),
         ({"detected": 990, "failed": 10}, {"solved": 990, "no_detection": 10}, False, 0.01,
          "10 failed of 1,000 detections (1 %)"),
-        ({"no_candidate": 7}, {"no_detection": 7}, False, 0.0,
-         "warning: nothing was detected: 7 no_candidate (No candidate at the marker)"),
         ({"not_visible": 7}, {"no_detection": 7}, False, 0.0,
          "warning: nothing was detected: 7 not_visible (The marker is wholly outside"),
         ({"detected": 7}, {"solver_failed": 7}, False, 0.0,
          "warning: no pose was estimated: 7 solver_failed (The solver returned no solution"),
         ({"detected": 7}, {"solved": 7}, False, 0.0, None),
         ({"detected": 7}, {"not_explained": 7}, False, 0.0, None),
-        ({}, {}, False, 0.0, None),
     ],
 )
 def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, share, first):
@@ -90,8 +75,6 @@ def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, sha
     assert found.advice == f"sweep repro 'a b.zarr' {expected}"
 
 
-# Rates.
-
 def blocks(workers, count, *, begin, took=2.0, scenes=100, lockstep=True):
     """Return blocks of workers that are always busy, from ``begin`` on."""
     shift = 0.0 if lockstep else took / workers
@@ -102,7 +85,7 @@ def blocks(workers, count, *, begin, took=2.0, scenes=100, lockstep=True):
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
-@pytest.mark.parametrize(("workers", "count"), [(1, 8), (2, 20), (2, 400), (64, 640), (1000, 9000)])
+@pytest.mark.parametrize(("workers", "count"), [(1, 8), (2, 20), (1000, 9000)])
 def test_rate_is_within_a_fifth_of_the_true_one(workers, count, lockstep):
     truth = workers * 100 / 2.0
     run = blocks(workers, count, begin=5000.0, lockstep=lockstep)

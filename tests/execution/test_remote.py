@@ -7,24 +7,20 @@ import http.client
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import boto3
+import dask
 import pytest
 import trustme
 
 import sweep
 from support.blocks import run_block
-from support.clusters import Cluster
-from support.commands import command
+from support.clusters import CLIENT, Cluster
+from support.commands import command, started
 from support.here import calls_here
 from sweep.cli import main
-from sweep.errors import ArgumentError, StoreError
-from sweep.execution.on_cluster import connected
+from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
 from sweep.experiment.grid import Block
@@ -54,22 +50,6 @@ trial = 3
 
 MANY = "[axes]\ntrial = 5000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
 
-RUN = """
-import sys
-from sweep.execution.runner import execute
-from sweep.errors import StoreError, SweepError
-from sweep.experiment.pipeline import Pipeline
-
-if __name__ == "__main__":
-    path, store, scheduler = sys.argv[1:]
-    try:
-        execute(
-            Pipeline.from_toml(path), store, workers=2, scheduler=scheduler or None, block_s=0.5
-        )
-    except SweepError as error:
-        sys.exit(str(error))
-"""
-"""As `sweep run`, its blocks small."""
 
 def wait_until(true, what):
     deadline = time.monotonic() + TIMEOUT_S
@@ -86,26 +66,12 @@ def expected(text):
     return {name: hashlib.sha256(v.tobytes()).hexdigest() for name, v in values.items()}
 
 
-def digests(url, text=SMALL):
-    """Return the digests of the variables and draws that a store of a pipeline must hold."""
+def see_expected(url, text=SMALL):
+    """Assert that a store holds the variables and draws that its pipeline must."""
     with sweep.open(url) as results:
         whole = results.reset_coords().load()
-    return {name: hashlib.sha256(whole[name].to_numpy().tobytes()).hexdigest()
-            for name in expected(text)}
-
-
-@contextlib.contextmanager
-def started(log, *arguments, environment=None):
-    """Run a Python command beside the test; kill it when the test is over."""
-    with Path(log).open("w") as told, subprocess.Popen(
-        [sys.executable, *map(str, arguments)], stdout=told, stderr=told,
-        start_new_session=True, env={**os.environ, **(environment or {})},
-    ) as process:
-        try:
-            yield process
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+    for name, digest in expected(text).items():
+        assert hashlib.sha256(whole[name].to_numpy().tobytes()).hexdigest() == digest, name
 
 
 @pytest.fixture
@@ -115,15 +81,7 @@ def small(tmp_path):
     return path
 
 
-@pytest.fixture
-def many(tmp_path):
-    (tmp_path / "run.py").write_text(RUN)
-    path = tmp_path / "many.toml"
-    path.write_text(MANY)
-    return path
-
-
-# --- the S3 server ---
+# Stores on an S3 server.
 
 
 @dataclasses.dataclass
@@ -158,7 +116,9 @@ class Bucket:
 def bucket(tmp_path_factory):
     folder = tmp_path_factory.mktemp("s3")
     log = folder / "server.log"
-    with started(log, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0") as server:
+    with log.open("w") as told, started(
+        ["-m", "moto.server", "-H", "127.0.0.1", "-p", "0"], stdout=told, stderr=told
+    ) as server:
         def endpoint():
             return re.search(r"http://127\.0\.0\.1:\d+", log.read_text())
 
@@ -209,12 +169,12 @@ def _account():
 
 @pytest.mark.system
 def test_server_refuses_changes_while_a_process_writes(bucket, monkeypatch):
-    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 3.0)
+    monkeypatch.setattr("sweep.store.lock.SILENCE_S", 1.5)
     url = "s3://bucket/written.zarr"
     pipeline = Pipeline.from_text("axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40")
     store = create_store(url, pipeline, (2,))
     with writing(url, store.storage):
-        time.sleep(3.5)  # its key is renewed
+        time.sleep(1.8)  # its key is renewed
         assert is_written(store.storage)
         for change in (
             lambda: remove_store(url), lambda: drop_failed(store),
@@ -231,65 +191,42 @@ def test_server_refuses_changes_while_a_process_writes(bucket, monkeypatch):
     assert not exists(url)
 
 
-# --- the cluster ---
-
-
-@pytest.fixture(scope="module")
-def certificates(tmp_path_factory):
-    """Certificates of two authorities, and the settings by which Dask finds them."""
-    settings = {}
-    for name in ("ours", "theirs"):
-        folder = tmp_path_factory.mktemp(name)
-        authority = trustme.CA()
-        issued = authority.issue_cert("127.0.0.1")
-        authority.cert_pem.write_to_path(folder / "ca.pem")
-        issued.cert_chain_pems[0].write_to_path(folder / "cert.pem")
-        issued.private_key_pem.write_to_path(folder / "key.pem")
-        settings[name] = {
-            "ca": folder / "ca.pem", "cert": folder / "cert.pem", "key": folder / "key.pem",
-        }
-    return settings
-
-
-def client_environment(settings):
-    """Dask's configuration of a client."""
-    return {
-        "DASK_DISTRIBUTED__COMM__TLS__CA_FILE": str(settings["ca"]),
-        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT": str(settings["cert"]),
-        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY": str(settings["key"]),
-    }
-
-
-def tls(settings):
-    """Return what makes a cluster's processes use certificates."""
-    return {"protocol": "tls", "options": (
-        "--tls-ca-file", settings["ca"], "--tls-cert", settings["cert"], "--tls-key",
-        settings["key"])}
-
-
-# --- stores on the server ---
+@pytest.fixture
+def tls(tmp_path):
+    """Return what makes a cluster's processes use certificates; this process's client, too."""
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    files = [tmp_path / name for name in ("ca.pem", "cert.pem", "key.pem")]
+    for content, path in zip(
+        (authority.cert_pem, issued.cert_chain_pems[0], issued.private_key_pem), files, strict=True
+    ):
+        content.write_to_path(path)
+    ca, cert, key = map(str, files)
+    with dask.config.set({
+        "distributed.comm.tls.ca-file": ca,
+        "distributed.comm.tls.client.cert": cert, "distributed.comm.tls.client.key": key,
+    }):
+        yield {"protocol": "tls",
+               "options": ("--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key)}
 
 
 @pytest.mark.system
 def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
-    bucket, certificates, small, tmp_path
+    bucket, tls, small, tmp_path, capfd
 ):
     url = "s3://bucket/all.zarr"
-    told = ""
-    with Cluster(tmp_path / "cluster", **tls(certificates["ours"])) as cluster:
+    with Cluster(tmp_path / "cluster", **tls) as cluster:
         cluster.worker()
-        ran = command(
-            "run", small, "--store", url, "--scheduler", cluster.address, "--json",
-            env={**os.environ, **client_environment(certificates["ours"])},
-        )
-        assert ran.returncode == 0, ran.stderr
-        assert ran.stderr in ("", "starting\n")  # the latter on a busy machine
-        assert json.loads(ran.stdout)["computed_scenes"] == 48
-        told += ran.stdout + ran.stderr
-        assert digests(url) == expected(SMALL)
-        state = command("status", url, "--json")
-        assert json.loads(state.stdout)["finished"], state.stderr
-        told += state.stdout + state.stderr + cluster.log()
+        assert main(["run", str(small), "--store", url, "--scheduler", cluster.address,
+                     "--json"]) == 0
+        ran = capfd.readouterr()
+        assert ran.err in ("", "starting\n")  # the latter on a busy machine
+        assert json.loads(ran.out)["computed_scenes"] == 48
+        see_expected(url)
+        assert main(["status", url, "--json"]) == 0
+        state = capfd.readouterr()
+        assert json.loads(state.out)["finished"]
+        told = ran.out + ran.err + state.out + state.err + cluster.log()
     assert "tls://127.0.0.1" in told
     assert not bucket.told_in(told)
     for key, content in bucket.content().items():
@@ -311,12 +248,9 @@ def test_remote_store_is_left_alone_and_reused(bucket, small, capsys):
             assert told.err == ""
             assert not bucket.told_in(told.out)
             outcomes.append(json.loads(told.out)["computed_scenes"])
-        assert main(["run", str(small), "--store", url, "--set", "seed=6"]) == 2
-    assert "seed: the store has 5, this run 6" in capsys.readouterr().err
     assert outcomes == [48, 0, 24]
-    assert digests(url) == expected(SMALL)
-    text = SMALL.replace("tilt_deg = [0, 50]", "tilt_deg = [0, 50, 60]")
-    assert digests(grown, text) == expected(text)
+    see_expected(url)
+    see_expected(grown, SMALL.replace("tilt_deg = [0, 50]", "tilt_deg = [0, 50, 60]"))
 
 
 REFUSED = {
@@ -329,51 +263,29 @@ REFUSED = {
 @pytest.mark.parametrize("settings", REFUSED.values(), ids=REFUSED)
 def test_server_that_refuses_is_told_in_a_line(settings, bucket, small):
     url = "s3://bucket/no.zarr"
-    environment = {**os.environ, **settings}
-    ran = command(
-        "run", small, "--store", url, "--workers", "1",
-        env={name: value for name, value in environment.items() if value},
-    )
-    assert ran.returncode == 2, ran.stderr
-    assert ran.stdout == ""
+    environment = {name: value for name, value in {**os.environ, **settings}.items() if value}
+    ran = command("run", small, "--store", url, "--workers", "1", env=environment)
+    assert (ran.returncode, ran.stdout) == (2, ""), ran.stderr
     assert ran.stderr.startswith(f"{url}: cannot be ")
     assert len(ran.stderr.splitlines()) == 1
     assert not bucket.told_in(ran.stderr)
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "s3://AKIDEXAMPLE:wJalrXUtnFEMI@bucket/x.zarr",
-        "s3://bucket/x.zarr?secret=wJalrXUtnFEMI",
-        "s3://wJalrXUtnFEMI@bucket/x.zarr",
-    ],
-)
-@pytest.mark.parametrize("option", ["--store", "--reuse"])
-def test_credentials_in_a_store_name_are_refused_and_not_repeated(
-    option, url, small, tmp_path, capsys
-):
-    options = [option, url] + (["--store", str(tmp_path / "x.zarr")] if option != "--store" else [])
-    assert main(["run", str(small), *options]) == 2
-    told = capsys.readouterr()
-    assert "credentials" in told.err
-    assert len(told.err.splitlines()) == 1
-    assert "wJalrXUtnFEMI" not in told.out + told.err
-    assert "AKIDEXAMPLE" not in told.out + told.err
+@pytest.mark.parametrize("url", [
+    "s3://AKIDEXAMPLE:wJalrXUtnFEMI@bucket/x.zarr", "s3://bucket/x.zarr?secret=wJalrXUtnFEMI",
+    "s3://wJalrXUtnFEMI@bucket/x.zarr",
+])
+def test_credentials_in_a_store_name_are_refused_and_not_repeated(url, small, tmp_path, capsys):
+    for options in (["--store", url], ["--reuse", url, "--store", str(tmp_path / "x.zarr")]):
+        assert main(["run", str(small), *options]) == 2
+        out, err = capsys.readouterr()
+        assert "credentials" in err
+        assert len(err.splitlines()) == 1
+        assert "wJalrXUtnFEMI" not in out + err
+        assert "AKIDEXAMPLE" not in out + err
 
 
-# --- schedulers that refuse ---
-
-
-@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a"])
-def test_what_is_no_address_is_told(address):
-    with pytest.raises(
-        ArgumentError, match="expected an address such as tcp://host:8786"
-    ), connected(Pipeline.from_text(SMALL), address, None):
-        pass
-
-
-# --- workers that come and go ---
+# Workers that come and go.
 
 
 def blocks_done(url):
@@ -383,16 +295,18 @@ def blocks_done(url):
 
 
 @pytest.mark.evidence
-def test_workers_join_and_leave_during_a_run(many, claim, tmp_path):
-    url = str(tmp_path / "many.zarr")
-    with Cluster(tmp_path / "cluster") as cluster:
+def test_workers_join_and_leave_during_a_run(claim, tmp_path):
+    many, url = tmp_path / "many.toml", str(tmp_path / "many.zarr")
+    many.write_text(MANY)
+    with Cluster(tmp_path / "cluster") as cluster, (tmp_path / "run.log").open("w+") as log:
         first = cluster.worker()
-        log = tmp_path / "run.log"
-        with started(log, tmp_path / "run.py", many, url, cluster.address) as running:
+        with started(
+            ["-c", CLIENT, many, url, cluster.address, 0.5], stdout=log, stderr=log
+        ) as running:
             def after(count):
                 wait_until(
                     lambda: running.poll() is not None or blocks_done(url) >= count, "no progress")
-                assert running.poll() is None, log.read_text()
+                assert running.poll() is None
 
             after(1)
             cluster.worker()
@@ -401,8 +315,9 @@ def test_workers_join_and_leave_during_a_run(many, claim, tmp_path):
             first.wait(TIMEOUT_S)
             after(5)
             cluster.worker()
-            assert running.wait(TIMEOUT_S) == 0, log.read_text()
-        assert log.read_text() == ""
-    assert digests(url, MANY) == expected(MANY)
+            assert running.wait(TIMEOUT_S) == 0
+        log.seek(0)
+        assert log.read() == ""
+    see_expected(url, MANY)
     claim("a run whose workers join, leave and are killed", "a block computed alone", 0.0,
           "bits differ")

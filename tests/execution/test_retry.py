@@ -1,9 +1,11 @@
 """Failed cells that are tried again: what comes is what a run without failures has."""
 
+import itertools
 import shutil
 
 import pytest
 import xarray as xr
+import zarr.storage._local as local
 
 from support.poison import Poison, poisoned
 from support.stores import by_hand, same
@@ -58,6 +60,20 @@ def failed(pipeline, tmp_path_factory):
     return url
 
 
+class StoppedError(Exception):
+    pass
+
+
+def counted(function, calls, at):
+    """Return a function that stops instead of the call number ``at``."""
+    def wrapped(*arguments, **options):
+        if next(calls) == at:
+            raise StoppedError
+        return function(*arguments, **options)
+
+    return wrapped
+
+
 @pytest.fixture
 def copied(failed, tmp_path):
     return shutil.copytree(failed, str(tmp_path / "copied.zarr"))
@@ -85,52 +101,28 @@ def test_command_says_that_there_is_nothing_to_try_again(clean, capsys):
 
 
 @pytest.mark.evidence
-def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied, monkeypatch):
-    import zarr.storage._local as local  # noqa: PLC0415
-
-    class StoppedError(Exception):
-        pass
-
-    left = 0
-    put, delete = local._put, local.LocalStore.delete_dir
-
-    def counted(function):
-        def wrapped(*arguments, **options):
-            nonlocal left
-            left -= 1
-            if left < 0:
-                raise StoppedError
-            return function(*arguments, **options)
-        return wrapped
-
-    template = shutil.copytree(copied, copied.replace("copied", "template"))
-    instants = 0
-    while True:
-        shutil.rmtree(copied)
-        shutil.copytree(template, copied)
-        left = instants
-        with monkeypatch.context() as patch:
-            patch.setattr(local, "_put", counted(put))
-            patch.setattr(local.LocalStore, "delete_dir", counted(delete))
+def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, failed, tmp_path):
+    stopped, at = True, 0
+    while stopped:
+        url = shutil.copytree(failed, str(tmp_path / f"{at}.zarr"))
+        calls = itertools.count()
+        with pytest.MonkeyPatch.context() as patch:
+            for owner, name in ((local, "_put"), (local.LocalStore, "delete_dir")):
+                patch.setattr(owner, name, counted(getattr(owner, name), calls, at))
             try:
-                drop_failed(open_store(copied, "r+"))
+                drop_failed(open_store(url, "r+"))
             except StoppedError:
-                stopped = True
+                pass
             else:
                 stopped = False
-        store = open_store(copied, "r")
-        if not store.finished:
-            assert committed(store) >= {1}
-            with xr.open_zarr(copied, consolidated=False):
-                pass
-        else:
-            assert committed(store) == {0, 1, 2}
-        instants += 1
-        if not stopped:
-            break
-    assert instants >= 4  # a mark, two blocks, and the end
-    execute(pipeline, copied, retry_failed=True)
-    assert same(copied, clean)
+        store = open_store(url, "r")
+        assert committed(store) >= ({0, 1, 2} if store.finished else {1})
+        with xr.open_zarr(url, consolidated=False):
+            pass
+        at += 1
+    assert at >= 4  # a mark, two blocks, and the end
+    execute(pipeline, url, retry_failed=True)
+    assert same(url, clean)
 
 
 def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):

@@ -13,11 +13,9 @@ from distributed import Client, LocalCluster
 
 
 def settings():
-    loggers = {"": logging.getLogger()}
-    loggers.update(
-        (name, logger) for name, logger in logging.Logger.manager.loggerDict.items()
-        if isinstance(logger, logging.Logger)
-    )
+    loggers = {name: logger for name, logger in logging.Logger.manager.loggerDict.items()
+               if isinstance(logger, logging.Logger)}
+    loggers[""] = logging.getLogger()
     return {
         "dask": copy.deepcopy(dask.config.config),
         "zarr": copy.deepcopy(zarr.config.config),
@@ -25,8 +23,7 @@ def settings():
         "numba": {n: str(getattr(numba.config, n)) for n in dir(numba.config) if n.isupper()},
         "numpy": numpy.geterr(),
         "logging": {
-            name: (logger.level, logger.disabled, logger.propagate, list(logger.filters),
-                   [(handler, handler.level) for handler in logger.handlers])
+            name: (logger.level, logger.disabled, logger.propagate, list(logger.handlers))
             for name, logger in loggers.items()
         },
         "signals": {n: signal.getsignal(n) for n in signal.valid_signals()},
@@ -53,13 +50,6 @@ def changes(before, after):
     return found
 
 
-class Kept(logging.Handler):
-    records = []
-
-    def emit(self, record):
-        self.records.append(record)
-
-
 def handler(number, frame):
     raise SystemExit(f"signal {number}")
 
@@ -75,7 +65,7 @@ if __name__ == "__main__":
     numpy.seterr(under="warn")
     logging.getLogger("distributed").setLevel(logging.INFO)
     logging.getLogger("distributed.scheduler").setLevel(logging.DEBUG)
-    logging.getLogger("distributed").addHandler(Kept(level=7))
+    logging.getLogger("distributed").addHandler(logging.NullHandler(level=7))
     signal.signal(signal.SIGINT, handler)
     signal.signal(signal.SIGTERM, handler)
     (folder,) = sys.argv[1:]

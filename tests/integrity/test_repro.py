@@ -64,17 +64,12 @@ def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, caps
     with xr.open_zarr(finished) as store:
         cell = store.isel(distance_m=0, distortion=0, trial=1).sel(
             cornerRefinementMethod="subpix", solver="iterative"
-        )
-        wanted = {
-            name: float(cell[name]) for name in
-            ("rotation_error_deg", "reprojection_error_px", "marker_area_px")
-        }
-        depth = float(cell["true_tvec_m"].sel(xyz="z"))
-    for name, value in wanted.items():
-        line = next(line for line in told.splitlines() if line.split()[:1] == [name])
-        assert float(line.split()[1]) == pytest.approx(value, rel=1e-5), line
-    line = next(line for line in told.splitlines() if line.split()[:1] == ["true_tvec_m"])
-    assert float(line.split()[3]) == pytest.approx(depth, rel=1e-5)
+        ).load()
+    lines = {line.split()[0]: line.split()[1:] for line in told.splitlines() if line.split()}
+    for name in ("rotation_error_deg", "reprojection_error_px", "marker_area_px"):
+        assert float(lines[name][0]) == pytest.approx(float(cell[name]), rel=1e-5), name
+    depth = float(cell["true_tvec_m"].sel(xyz="z"))
+    assert float(lines["true_tvec_m"][2]) == pytest.approx(depth, rel=1e-5)
     assert re.search(r"^ *detection +detected *$", told, re.MULTILINE)
     shown = tmp_path / "shown.png"
     assert main(["show", str(pipeline), "--at", NEAR, "-o", str(shown), "--plain"]) == 0

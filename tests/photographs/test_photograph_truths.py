@@ -142,18 +142,6 @@ def test_the_other_camera_is_the_truth_in_two_folders_and_side_by_side(stereo, t
             assert np.median(error) < 0.01  # of 0.3 m; poses by four corners of 25 px
 
 
-def test_one_photograph_is_measured_without_intervals(folder, tmp_path):
-    shots = tmp_path / "one"
-    shots.mkdir()
-    for name in ("a.png", "b.png"):
-        (shots / name).write_bytes((folder / "shots" / "shot0.png").read_bytes())
-    made = prepare([shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path)
-    assert made.photographs == 1
-    said = "\n".join(made.lines)
-    assert "left out b.png (= a.png): the same photographs again" in said
-    assert "one photograph: errors and rates without intervals" in said
-
-
 def exif(jpeg, orientation):
     """Return a JPEG file with the tag by which viewers turn it."""
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
@@ -184,12 +172,3 @@ def test_turned_deep_and_coloured_photographs_have_the_poses_of_plain_ones(folde
     with pytest.raises(ArgumentError, match="they are turned, perhaps by their EXIF tags"):
         prepare([tmp_path / "turned"], tmp_path / "upright.json", board=folder / "board.toml",
                 home=tmp_path)
-
-
-def test_a_camera_of_another_resolution_is_found_out_by_the_board(folder, tmp_path):
-    fx, fy, cx, cy = VIEW
-    text = camera(SIZE, (fx / 2, fy / 2, cx / 2, cy / 2))
-    path = tmp_path / "half.json"
-    path.write_text(text.replace('"image_width": 360, "image_height": 270, ', ""))
-    with pytest.raises(ArgumentError, match="if its numbers are times 2: it is of another"):
-        prepare([folder / "shots"], path, board=folder / "board.toml", home=tmp_path)

@@ -107,19 +107,16 @@ def test_a_scene_of_another_resolution_is_said(prepared, tmp_path, capsys):
 
 
 def test_only_photographs_have_twins(prepared, tmp_path):
-    with pytest.raises(SweepError, match="expected a store of photographs"):
-        twin_pipeline(Pipeline.from_dict({"pose": {"distance_m": 1}}), {})
-    with pytest.raises(SweepError, match="expected a store of photographs"):
-        twin_pipeline(twin_pipeline(prepared, {}), {})
+    twins = twin_pipeline(prepared, {})
+    for other in (Pipeline.from_dict({"pose": {"distance_m": 1}}), twins):
+        with pytest.raises(SweepError, match="expected a store of photographs"):
+            twin_pipeline(other, {})
     with pytest.raises(SweepError, match="simulated = true: expected photographs beside it"):
         Pipeline.from_dict({"pose": {"distance_m": 1}, "scene": {"simulated": True}})
     with pytest.raises(SweepError, match="nothing beside photographs, which have their own poses"):
         Pipeline.from_text(
-            twin_pipeline(prepared, {}).to_toml() + "\n[pose]\ndistance_m = 1\n",
-            folder=prepared.folder,
-        )
+            twins.to_toml() + "\n[pose]\ndistance_m = 1\n", folder=prepared.folder)
     (tmp_path / "none.toml").write_text("seed = 1\n")
-    with pytest.raises(SweepError, match=r"expected a section \[scene\]"):
-        read_scene(tmp_path / "none.toml")
-    with pytest.raises(SweepError, match="cannot be read"):
-        read_scene(tmp_path / "missing.toml")
+    for name, line in (("none", r"expected a section \[scene\]"), ("missing", "cannot be read")):
+        with pytest.raises(SweepError, match=line):
+            read_scene(tmp_path / f"{name}.toml")

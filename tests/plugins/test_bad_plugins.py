@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import signal
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from support.blocks import run_cells
+from support.here import Here
 from sweep.errors import PipelineError, PluginError
 from sweep.execution.block_task import other_here
 from sweep.experiment.pipeline import Pipeline
@@ -17,7 +19,6 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.loading import call
 from sweep.store.provenance import fingerprint
 from sweep.tradeoff.costs import clock_of
-from tests.support.here import Here
 
 DETECTORS = '''
 import os
@@ -37,27 +38,16 @@ ONE = np.zeros((1, 4, 2))
 nan = at(lambda image: (ONE * np.nan, [0]))
 shape = at(lambda image: (ONE[0], [0]))
 many = at(lambda image: (np.zeros((10000, 4, 2)), np.zeros(10000, int)))
-words = at(lambda image: ([["a"]], [0]))
 masked = at(lambda image: (np.ma.masked_array(ONE, mask=True), [0]))
 ids_float = at(lambda image: (ONE, [0.0]))
 ids_negative = at(lambda image: (ONE, [-1]))
-ids_many = at(lambda image: (ONE, [0, 1]))
 nothing = at(lambda image: None)
 changes = at(lambda image: (image.fill(0), ([], []))[1])
 raises = at(lambda image: open("model.onnx"))
 exits = at(lambda image: os.sys.exit(3))
 
-def talking(image):
-    print("found nothing")
-    return [], []
-
-aborts = at(lambda image: os.abort())
-prints = at(talking)
 never_made = lambda settings, family: 1 / 0
 no_function = lambda settings, family: 3
-dies = lambda settings, family: os.abort()
-sleeps = lambda settings, family: __import__("time").sleep(1000)
-number = 3
 '''
 
 GRID = """
@@ -83,11 +73,9 @@ def pipeline(tmp_path):
     ("nan", "returned corners that are not finite"),
     ("shape", "returned corners of shape (4, 2); expected (n, 4, 2)"),
     ("many", "returned 10,000 corners for one image; expected at most 1,000"),
-    ("words", "returned corners of type <U1; expected real numbers"),
     ("masked", "returned corners of which some are masked; expected NaN or none"),
     ("ids_float", "returned ids of type float64; expected whole numbers"),
     ("ids_negative", "returned the ID -1; expected at least 0"),
-    ("ids_many", "returned ids of shape (2,); expected (1,), one of each marker"),
     ("nothing", "returned a NoneType; expected a tuple (corners, ids)"),
     ("changes", "changed the image that it was given; copy it first"),
     ("raises", "raises FileNotFoundError"),
@@ -106,9 +94,7 @@ def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, name, tol
 
 
 def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
-    def interrupted():
-        raise KeyboardInterrupt
-
+    interrupted = mock.Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):  # as the user's
         call("bad:interrupted", interrupted)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as workers are
@@ -130,7 +116,7 @@ def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, name, told):
 
 
 @pytest.mark.parametrize(("source", "told"), [
-    ("import missing_library", "cannot be imported" ),
+    ("import missing_library", "missing_library"),
     ("x =", "SyntaxError"),
     ("D = 3", "a record DetectorPlugin, not a value of type int"),
     ("", "a name in mine.py"),
@@ -138,8 +124,6 @@ def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, name, told):
      "TypeError: make: expected a class or function of settings and family (line 2 of mine.py)"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
-    ("from sweep.plugins import *\nD = EstimatorPlugin(make=print)",
-     "a record DetectorPlugin, not a value of type EstimatorPlugin"),
     ("""
 from dataclasses import dataclass
 from sweep.plugins import DetectorPlugin, parameter
@@ -166,7 +150,7 @@ def test_a_plug_in_that_cannot_be_used_is_one_line(tmp_path, source, told):
         )
     (line,) = refused.value.faults
     assert line.startswith('pipeline: detector.detector = "mine:D": expected ')
-    assert told in line or (told == "cannot be imported" and "missing_library" in line)
+    assert told in line
 
 
 def test_a_plug_in_is_one_file(tmp_path, monkeypatch):
@@ -180,26 +164,20 @@ def test_a_plug_in_is_one_file(tmp_path, monkeypatch):
             )
 
 
-def test_names_of_plug_ins_that_are_not_there(tmp_path):
-    for key, value, told in (
-        ("detector.detector", "nowhere:D", "expected the file nowhere.py in"),
-        ("detector.detector", "apriltagg", "expected an installed detector plug-in"),
-        ("estimator.solver", "nowhere:S", "expected the file nowhere.py in"),
-        ("scene.renderer", "nowhere:R", "expected the file nowhere.py in"),
-    ):
-        section, name = key.split(".")
-        with pytest.raises(PipelineError) as refused:
-            Pipeline.from_text(
-                f'[pose]\nside_px = 24\n[{section}]\n{name} = "{value}"\n', folder=tmp_path
-            )
-        (line,) = refused.value.faults
-        assert line.startswith(f'pipeline: {key} = "{value}": {told}')
-    with pytest.raises(PipelineError, match=r"did you mean ippe\?"):
-        Pipeline.from_text('[pose]\nside_px = 24\n[estimator]\nsolver = "ippee"\n')
-    with pytest.raises(PipelineError, match=r'effects = \["fog"\]|expected an installed effect'):
-        Pipeline.from_text('effects = ["fog"]\n[pose]\nside_px = 24\n')
-    with pytest.raises(PipelineError, match="expected a list of plug-ins, each once"):
-        Pipeline.from_text('effects = "fog"\n[pose]\nside_px = 24\n')
+@pytest.mark.parametrize(("text", "told"), [
+    ('[detector]\ndetector = "nowhere:D"',
+     'detector.detector = "nowhere:D": expected the file nowhere.py in'),
+    ('[detector]\ndetector = "apriltagg"', "expected an installed detector plug-in"),
+    ('[estimator]\nsolver = "ippee"', "did you mean ippe?"),
+    ('[scene]\nrenderer = "nowhere:R"', "expected the file nowhere.py in"),
+    ('effects = ["fog"]', "expected an installed effect"),
+    ('effects = "fog"', "expected a list of plug-ins, each once"),
+])
+def test_names_of_plug_ins_that_are_not_there(text, told, tmp_path):
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(f"{text}\n[pose]\nside_px = 24\n", folder=tmp_path)
+    (line,) = refused.value.faults
+    assert told in line
 
 
 SOLVERS = """
@@ -217,7 +195,6 @@ nan = returning(lambda n: (poses(n)[0] * np.nan, poses(n)[1]))
 behind = returning(lambda n: poses(n, depth=-0.4))
 wrong = returning(lambda n: poses(n, depth=4.0))
 mirrored = returning(lambda n: poses(n, np.eye(3) * [1, 1, -1]))
-scaled = returning(lambda n: poses(n, 2 * EYE))
 few = returning(lambda n: poses(n + 1))
 nothing = returning(lambda n: None)
 half = returning(lambda n: (*poses(n), None, poses(n)[0]))
@@ -229,7 +206,6 @@ half = returning(lambda n: (*poses(n), None, poses(n)[0]))
     ("behind", EstimateStatus.solver_failed, None),
     ("wrong", EstimateStatus.solver_failed, None),
     ("mirrored", EstimateStatus.failed, "returned a rotation that is no rotation matrix"),
-    ("scaled", EstimateStatus.failed, "returned a rotation that is no rotation matrix"),
     ("few", EstimateStatus.failed, "returned a rotation of shape (2, 3, 3); expected (1, 3, 3)"),
     ("nothing", EstimateStatus.failed, "returned a NoneType; expected a tuple"),
     ("half", EstimateStatus.failed, "returned half an alternative"),

@@ -7,7 +7,7 @@ import pytest
 
 from support.blocks import run_cells
 from sweep.errors import PipelineError, PluginError
-from sweep.experiment.pipeline import Pipeline, cell
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import use
 from sweep.measure.flags import DetectionStatus
 
@@ -84,20 +84,6 @@ def test_settings_are_checked_as_our_own(folder):
     )
     with pytest.raises(PipelineError, match=r"unknown key; did you mean shift_px\?"):
         Pipeline.from_text(GRID + "shift_pixels = [0, 10]\n", folder=folder)
-    chosen = Pipeline.from_text(GRID, ["shift_px=1.5"], folder=folder)
-    assert chosen.values_of("shift_px") == (1.5,)
-
-
-def test_a_detector_goes_together_with_its_settings(folder):
-    text = GRID.replace('detector = ["opencv", "mine:TURNED"]', """
-by = { zip = { detector = ["opencv", "mine:TURNED"], shift_px = [0, 0.5] } }""")
-    pipeline = Pipeline.from_text(text, folder=folder)
-    columns = run_cells(pipeline, [np.arange(2)]).columns
-    opencv, shifted = columns["corner_error_px"]
-    np.testing.assert_allclose(shifted, opencv + 0.5, rtol=0, atol=1e-5)
-    at = cell(pipeline, "by=1,tilt_deg=40")
-    assert (at.fixed["detector"], at.fixed["shift_px"]) == ("mine:TURNED", 0.5)
-    assert cell(pipeline, "by=0,tilt_deg=0").fixed["detector"] == "opencv"
 
 
 def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from support.blocks import run_cells
 from support.solving import of_markers
@@ -17,7 +18,6 @@ from sweep.model.marker import modules
 from sweep.model.scene import build_scenes
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
-
 
 SCENE = """
 [camera]
@@ -58,12 +58,8 @@ def test_the_renderer_samples_each_pixel_at_its_centre():
     )
     tilt, azimuth, roll = np.radians([35, 20, 12])
     axis = np.array([np.cos(azimuth), np.sin(azimuth), 0])
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turn = np.eye(3) + np.sin(tilt) * cross + (1 - np.cos(tilt)) * cross @ cross
-    about_z = np.array(
-        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
-    )
-    rotation = turn @ about_z @ np.diag([1.0, -1.0, -1.0])
+    turn = Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", roll)
+    rotation = turn.as_matrix() @ np.diag([1.0, -1.0, -1.0])
     v, u = np.mgrid[:120, :160]
     rays = np.stack([(u - 79.5) / 200, (v - 59.5) / 200, np.ones(u.shape)], axis=-1)
     # The ray meets the marker's plane, whose normal is the third column, at depth 0.2 of its centre

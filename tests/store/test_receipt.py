@@ -56,13 +56,8 @@ def test_receipt_of_another_block_or_run_commits_nothing(change, store):
     write_files(store.storage, {receipt_key(1): other.to_bytes()})
     with pytest.raises(StoreError, match=r"receipt of block 1 is damaged.*verify --repair"):
         list(receipts(store, [1]))
-
-
-def test_damage_is_seen():
-    content = RECEIPT.to_bytes()
-    for damaged in (
-        content[:-1], content[:3], b"", content[:9] + bytes([content[9] ^ 1]) + content[10:],
-    ):
+    content = own.to_bytes()
+    for damaged in (content[:-1], b"", content[:9] + bytes([content[9] ^ 1]) + content[10:]):
         with pytest.raises(ValueError, match=r"\w"):
             Receipt.from_bytes(damaged)
 

@@ -5,17 +5,7 @@ import uuid
 
 import pytest
 
-from sweep.cli import main
 from sweep.store.files import whole_file, write_whole
-
-PIPELINE = "[pose]\ndistance_m = 0.3\njitter_px = 0.5\n[axes]\ntrial = 2\n"
-
-
-@pytest.fixture
-def outside(tmp_path):
-    path = tmp_path / "mine.txt"
-    path.write_text("mine")
-    return path
 
 
 def test_a_file_is_replaced_whole_or_not_at_all_and_keeps_its_permissions(tmp_path):
@@ -30,7 +20,9 @@ def test_a_file_is_replaced_whole_or_not_at_all_and_keeps_its_permissions(tmp_pa
     assert [each.name for each in tmp_path.iterdir()] == ["result"]
 
 
-def test_nothing_is_written_through_links_that_wait(tmp_path, outside, monkeypatch):
+def test_nothing_is_written_through_links_that_wait(tmp_path, monkeypatch):
+    outside = tmp_path / "mine.txt"
+    outside.write_text("mine")
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "result").symlink_to(outside)
@@ -41,23 +33,4 @@ def test_nothing_is_written_through_links_that_wait(tmp_path, outside, monkeypat
     (folder / f".sweep-{uuid.UUID(int=5).hex}").symlink_to(outside)
     with pytest.raises(FileExistsError):
         write_whole(folder / "other", b"ours")
-    assert outside.read_text() == "mine"
-
-
-def test_an_export_writes_through_no_link(tmp_path, outside, capsys):
-    file, folder = tmp_path / "few.toml", tmp_path / "exported"
-    file.write_text(PIPELINE)
-    assert main(["export", str(file), str(folder)]) == 0
-    names = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    assert len(names) > 6
-    for name in names:
-        for waiting in (f"{name}.part", f"{name}.tmp"):
-            (folder / waiting).symlink_to(outside)
-        if name.suffix not in (".json", ".png"):  # what says that the export was begun, and images
-            (folder / name).unlink()
-            (folder / name).symlink_to(outside)
-        elif name.suffix == ".png":
-            (folder / name).unlink()
-    capsys.readouterr()
-    assert main(["export", str(file), str(folder)]) == 0, capsys.readouterr().err
     assert outside.read_text() == "mine"

@@ -2,12 +2,37 @@
 
 import contextlib
 import json
+import logging
 import os
 import time
 
 import psutil
+from distributed import LocalCluster
 
 from support.commands import started
+
+
+@contextlib.contextmanager
+def local_cluster(workers=1, **options):
+    """Yield a cluster that this process starts, of workers of one thread."""
+    with LocalCluster(
+        n_workers=workers, threads_per_worker=1, host="127.0.0.1",
+        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL, **options,
+    ) as cluster:
+        yield cluster
+
+
+CLIENT = """
+import sys
+from sweep.execution.runner import execute
+from sweep.experiment.pipeline import Pipeline
+
+if __name__ == "__main__":
+    pipeline, store, scheduler, block_s = sys.argv[1:]
+    execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
+            block_s=float(block_s))
+"""
+"""As `sweep run`, its blocks small."""
 
 
 class Cluster:

@@ -61,7 +61,7 @@ def test_a_rate_needs_trials_until_its_interval_is_narrow(trials):
 
 
 def test_every_configuration_and_every_quantity_must_be_known():
-    """Of 1,200 normal errors the RMSE is known to about 2.33 / sqrt(2,400) = 4.7 %."""
+    """Of 1,200 normal errors the RMSE is known to about 1.96 / sqrt(2,400) = 4 %."""
     trials = 600
     for wanted, expected in (('range_rmse_percent = "6 %"', False),
                              ('range_rmse_percent = "4.5 %"', True),

@@ -333,9 +333,21 @@ def exponential(mean, error, freedom):
 
 
 def root_mean_square(vectors, run):
-    """Return the RMS of ``[(pose, vector)]``."""
+    """Return the RMS of ``[(pose, vector)]``.
+
+    The share of draws that none showed is below 1 - 0.025^(1/n); they are as the largest that was
+    seen.
+    """
     pairs = [(pose, length(vector) ** 2) for pose, vector in vectors]
-    return tuple(math.sqrt(end) for end in exponential(*mean_of(pairs, run)))
+    mean, low, high = exponential(*mean_of(pairs, run))
+    if not math.isnan(high):
+        of_draw = {}
+        for pose, value in pairs:
+            of_draw.setdefault((pose["cell"], pose["draw"]), []).append(value)
+        largest = max(map(np.mean, of_draw.values()))
+        unseen = 1 - 0.025 ** (1 / (freedom_in([pose for pose, _ in pairs]) + 1))
+        high = max(high, (1 - unseen) * high + unseen * largest)
+    return math.sqrt(mean), math.sqrt(low), math.sqrt(high)
 
 
 def mean_vector(vectors):

@@ -67,37 +67,11 @@ def test_a_known_law_is_found_again(models):
     assert models.knots.sel(predictor="distance_m").values.tolist() == [2] * 6
     error = (models.exponent_high - models.exponent).values / 1.96
     assert (np.abs(models.exponent - [2, 2, 2.5, 1.5, 1.5, 1]) < 4.9 * error).all()
-
-
-def test_a_model_holds_in_nearly_all_cells_of_its_own_law(models):
     # 20 cells of 6 errors; one of 150 errors is outside 0.93 - 0.017 or 0.97 + 0.017 in 6 %.
     use = models.use.values
     assert (use == Use.holds).mean() > 0.8
     assert set(np.unique(use)) <= {Use.holds, Use.too_narrow, Use.too_wide}
     assert float(models.coverage.mean()) == pytest.approx(0.9545, abs=0.01)
-
-
-def test_each_cell_as_a_knot_gives_the_moments_of_plain_numpy():
-    def jumping(distance, side, angle):
-        bias, sigma = power_law(distance, side, angle)
-        factor = np.where(np.isclose(distance, 2.2), 8.0, 1.0) * np.where(angle > 30, 5.0, 1.0)
-        factor *= np.where(np.isclose(distance, 1.5) & (angle > 50), 6.0, 1.0)
-        return bias, sigma * factor[..., None]
-
-    results = poses_with_law(2, axes(100), jumping)
-    models = error_models(results)
-    assert models.sizes["distance_m"] == 5
-    errors = in_sight(results)
-    full = models.knots.sel(predictor=["distance_m", "viewing_angle_deg"]).values.tolist() == (
-        [[5, 4]] * 6)
-    assert full
-    n = errors[..., 0].size
-    expected = errors.std(axis=2) * math.sqrt(n / (n - 20))
-    found = models.sigma.isel(side_px=0).transpose("distance_m", "viewing_angle_deg", "quantity")
-    # Knots at the ends lie 2e-6 outside; the ridge moves a knot by 1e-3 of what differs.
-    np.testing.assert_allclose(found, expected, rtol=0.02)
-    bias = models.bias.isel(side_px=0).transpose("distance_m", "viewing_angle_deg", "quantity")
-    assert (np.abs(bias - errors.mean(axis=2)) < 0.05 * expected).all()
 
 
 def test_the_fit_is_the_maximum_of_the_likelihood(results, models):
@@ -159,17 +133,15 @@ def test_flips_missing_poses_and_tails_are_flagged():
     results = poses_with_law(4, grid, power_law, normal=law)
     results["flipped"].values[0, 0, :20] = Flipped.flipped
     results["rotation_error_rad"].values[0, 0, :20] = 1.0
-    lost = results["estimate"].values
-    lost[1, 0, :60] = EstimateStatus.no_detection
-    results["detection"].values[1, 0, :60] = DetectionStatus.no_candidate
-    results["translation_error_m"].values[1, 0, :60] = np.nan
-    results["rotation_error_rad"].values[1, 0, :60] = np.nan
+    for name, lost in (("estimate", EstimateStatus.no_detection),
+                       ("detection", DetectionStatus.no_candidate),
+                       ("translation_error_m", np.nan), ("rotation_error_rad", np.nan)):
+        results[name].values[1, 0, :60] = lost
     models = error_models(results)
     use = models.use.isel(cell_side_px=0, cell_viewing_angle_deg=0)
-    assert (use.isel(cell_distance_m=0) == Use.flips).all()
-    assert (use.isel(cell_distance_m=1) == Use.rarely_solved).all()
+    for cell, flag in ((0, Use.flips), (1, Use.rarely_solved), (4, Use.too_wide)):
+        assert (use.isel(cell_distance_m=cell) == flag).all()
     assert (use.isel(cell_distance_m=2) == Use.holds).sum() >= 3
-    assert (use.isel(cell_distance_m=4) == Use.too_wide).all()
     assert models.flip_rate.values.ravel()[0] == pytest.approx(0.05)
     assert models.solved_rate.values.ravel()[1] == pytest.approx(0.85)
     # A single error of 50 m: each half is judged by the model of the other.
@@ -221,9 +193,6 @@ def test_configurations_are_not_pooled():
     results = poses_with_law(7, axes | {"trial": list(range(120))}, power_law)
     results["translation_error_m"].values[..., 1, :] *= 3.0
     models = error_models(results)
-    ratio = (models.sigma.sel(solver="b") / models.sigma.sel(solver="a")).sel(
-        quantity=["x", "y", "z"])
-    np.testing.assert_allclose(ratio, 3.0, rtol=0.5)
     alone = error_models(results.isel(solver=[1]))
     for name in ("coverage", "use", "judged", "exponent", "region_low", "region_seen"):
         np.testing.assert_allclose(
@@ -247,20 +216,14 @@ def stores_of_regions():
            (4, 60, None, 0), (1.5, 17.5, None, 0)],
            [(1, 60, None, 0), (4, 0, None, 0), (1, 30, None, 0), (2, 0, None, 0),
             (2.5, 60, None, 0)])
-    yield ("zigzag", seen_in(on_axis, (on_axis["distance_m"] == 2) == (on_axis["tilt_deg"] == 60)),
-           [(1, 0, None, 0), (2, 60, None, 0), (4, 30, None, 0)],
-           [(1, 60, None, 0), (2, 0, None, 0), (4, 60, None, 0)])
+
     bearings = poses_with_law(12, grid, power_law, bearing_deg=15.0)
     yield ("bearings", bearings, [(2, 30, None, 0), (2, 30, None, 14), (1, 0, None, 10)],
            [(2, 30, None, 30), (2, 30, None, 63), (2, 30, None, 120), (1, 30, 50, 5)])
-    far = bearings["true_tvec_m"].isel(xyz=[0, 1])
-    bearing = np.degrees(np.arctan2(np.hypot(far[..., 0], far[..., 1]), bearings["distance_m"]))
-    narrow = seen_in(bearings, (bearings["distance_m"] == 1) | (bearing < 4))
-    yield ("narrow", narrow, [(1, 30, None, 14), (4, 30, None, 2)], [(4, 30, None, 14)])
+
     sizes = poses_with_law(13, {"distance_m": [1.0, 2.0, 4.0], "tilt_deg": [30.0],
                                 "size_m": [0.1, 0.2]} | trials, power_law)
-    yield ("sizes", sizes, [(1, 30, 90, 0), (1, 30, 135, 0), (4, 30, 22.5, 0), (3, 30, 45, 0)],
-           [(1, 30, 45, 0), (1, 30, 70, 0), (4, 30, 90, 0), (2, 30, 30, 0)])
+
     paired = seen_in(sizes, (sizes["size_m"] == 0.1) == (sizes["distance_m"] == 1))
     yield ("paired", paired, [(1, 30, 90, 0), (4, 30, 45, 0)],
            [(1, 30, 180, 0), (4, 30, 22.5, 0), (2, 30, 45, 0)])
@@ -271,19 +234,10 @@ def stores_of_regions():
         return {"size_m": size, "distance_m": FX * size / side,
                 "tilt_deg": rng.uniform(0, 60, shape)}
 
-    yield ("drawn", poses_with_law(14, {"trial": list(range(4000))}, power_law, drawn=correlated),
+    yield ("drawn", poses_with_law(14, {"trial": list(range(2000))}, power_law, drawn=correlated),
            [(1, 30, 130, 0), (3.5, 30, 45, 0), (1.5, 50, 100, 0), (1.5, 5, 80, 0)],
            [(1, 30, 60, 0), (3, 30, 110, 0), (1, 30, 230, 0), (1.5, 75, 100, 0),
             (1.5, 30, 100, 20)])
-
-    def tied(rng, shape):
-        share = rng.uniform(0, 1, shape)
-        return {"distance_m": 1 + 3 * share,
-                "tilt_deg": np.clip(60 * share + rng.normal(0, 3, shape), 0, 60)}
-
-    yield ("tied", poses_with_law(15, {"trial": list(range(4000))}, power_law, drawn=tied),
-           [(1.3, 6, None, 0), (2.5, 30, None, 0), (3.8, 57, None, 0)],
-           [(1.2, 55, None, 0), (3.8, 5, None, 0), (2, 55, None, 0)])
 
 
 @pytest.fixture(scope="module")
@@ -291,8 +245,7 @@ def regions():
     return {name: rest for name, *rest in stores_of_regions()}
 
 
-@pytest.mark.parametrize("name", [
-    "grid", "zipped", "zigzag", "bearings", "narrow", "sizes", "paired", "drawn", "tied"])
+@pytest.mark.parametrize("name", ["grid", "zipped", "bearings", "paired", "drawn"])
 def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
     results, seen, unseen = regions[name]
     models = error_models(results)
@@ -306,11 +259,8 @@ def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
     document, read_errors = json.loads(error_model_text(models, {})), reader_of_the_guide()
     for conditions, expected in ((seen, True), (unseen, False)):
         for distance, angle, side, bearing in conditions:
-            if bearing < 90:
-                x = distance * math.tan(math.radians(bearing))
-                position = (0.6 * x, -0.8 * x, distance)
-            else:
-                position = (0.0, distance, -0.1)
+            x = distance * math.tan(math.radians(bearing))
+            position = (0.6 * x, -0.8 * x, distance) if bearing < 90 else (0.0, distance, -0.1)
             pose = model_covariance(models, position, angle, side)
             where = (distance, angle, side, bearing)
             assert bool(np.isfinite(pose.covariance.values[0, 2, 2])) is expected, where
@@ -338,45 +288,25 @@ def test_what_cannot_be_modelled_says_so_in_a_line(results, change, words):
     assert "\n" not in str(caught.value)
 
 
-STORE = """
-seed = 3
-[camera]
-width_px = 640
-height_px = 480
-hfov_deg = 60
-[marker]
-dictionary = "DICT_4X4_50"
-size_m = 0.06
-[pose]
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-15, 15] }}
-tilt_deg = {{ uniform = [0, 60] }}
-[scene]
-noise_grey = 2
-[detector]
-cornerRefinementMethod = "apriltag"
-[axes]
-distance_m = [0.3, 0.5, 0.7]
-trial = {trials}
-"""
-
-
-def stored(folder, trials, seed=3):
-    pipeline = Pipeline.from_text(STORE.format(trials=trials).replace("seed = 3", f"seed = {seed}"))
+def stored(folder, seed):
     url = str(folder / f"tags{seed}.zarr")
-    by_hand(url, pipeline)
+    by_hand(url, Pipeline.from_dict({
+        "seed": seed, "camera": {"width_px": 640, "height_px": 480, "hfov_deg": 60},
+        "marker": {"dictionary": "DICT_4X4_50", "size_m": 0.06},
+        "pose": {"azimuth_deg": {"uniform": [0, 360]}, "roll_deg": {"uniform": [0, 360]},
+                 "bearing_x_deg": {"uniform": [-15, 15]}, "tilt_deg": {"uniform": [0, 60]}},
+        "scene": {"noise_grey": 2}, "detector": {"cornerRefinementMethod": "apriltag"},
+        "axes": {"distance_m": [0.3, 0.5, 0.7], "trial": 1500}}))
     return sweep.open(url)
 
 
 @pytest.mark.evidence
-def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
+def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path, claim):
     """Cells that hold cover 0.93 to 0.97 of the errors of another seed, with a binomial tolerance.
 
     4.9 standard deviations a cell: 1e-6.
     """
-    models = error_models(stored(tmp_path, 1500))
-    other = stored(tmp_path, 1500, seed=4)
+    models, other = error_models(stored(tmp_path, 3)), stored(tmp_path, 4)
     position = other["true_tvec_m"].values.reshape(-1, 3)
     rvec = other["true_rvec"].values.reshape(-1, 3)
     angle = viewing_angle_of(rvec, position)
@@ -401,32 +331,31 @@ def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
                 assert 0.93 - tolerance < within[used, k].mean() < 0.97 + tolerance
                 checked += 1
                 pooled.append(within[used, k])
-    print(f"{checked} cells, coverage of all {np.concatenate(pooled).mean():.4f}")
+    share = np.concatenate(pooled).mean()
+    claim("errors within two sigma of an error model that holds, of 95.45 %",
+          f"another store, {checked} cells", 100 * abs(share - 0.9545), "points")
     assert checked > 60
-    assert 0.94 < np.concatenate(pooled).mean() < 0.965
+    assert 0.94 < share < 0.965
 
 
 @pytest.mark.evidence
-def test_intervals_hold_the_law_as_often_as_they_say():
-    """300 simulations: 0.95 of 300 x 4 corners within 0.90 to 0.98, normal and Laplace errors."""
-    for normal in (None, lambda rng, size: rng.laplace(size=size) / math.sqrt(2)):
-        held = {"sigma": [], "bias": [], "exponent": []}
-        for seed in range(300):
-            results = poses_with_law(seed, {
-                "distance_m": [1.0, 2.0, 4.0], "tilt_deg": [0.0, 40.0],
-                "trial": list(range(60))}, power_law, normal=normal)
-            models = error_models(results)
-            ends = models.isel(side_px=0, distance_m=[0, -1], viewing_angle_deg=[0, -1])
-            distance, angle = np.meshgrid(
-                ends.distance_m, ends.viewing_angle_deg, indexing="ij")
-            truth = dict(zip(("bias", "sigma"), power_law(distance, None, angle), strict=True))
-            truth["exponent"] = np.array([2, 2, 2.5, 1.5, 1.5, 1])
-            for name, value in truth.items():
-                of = models if name == "exponent" else ends
-                expected = np.moveaxis(value, -1, 0)
-                low, high = (of[f"{name}_{end}"].values for end in ("low", "high"))
-                held[name].append(((low <= expected) & (expected <= high)).mean())
-        shares = {name: float(np.mean(each)) for name, each in held.items()}
-        print(shares)
-        # The six errors of a simulation are independent: 1,800 intervals at least.
-        assert all(0.92 < share < 0.975 for share in shares.values()), shares
+@pytest.mark.parametrize("normal", [
+    None, lambda rng, size: rng.laplace(size=size) / math.sqrt(2)], ids=["normal", "Laplace"])
+def test_intervals_hold_the_law_as_often_as_they_say(normal):
+    """Of 300 simulations, 0.95 of the intervals at 4 corners within 0.92 to 0.975."""
+    held = {"sigma": [], "bias": [], "exponent": []}
+    for seed in range(300):
+        models = error_models(poses_with_law(seed, {
+            "distance_m": [1.0, 2.0, 4.0], "tilt_deg": [0.0, 40.0], "trial": list(range(60))},
+            power_law, normal=normal))
+        ends = models.isel(side_px=0, distance_m=[0, -1], viewing_angle_deg=[0, -1])
+        distance, angle = np.meshgrid(ends.distance_m, ends.viewing_angle_deg, indexing="ij")
+        bias, sigma = power_law(distance, None, angle)
+        for name, of, value in (("bias", ends, bias), ("sigma", ends, sigma),
+                                ("exponent", models, np.array([2, 2, 2.5, 1.5, 1.5, 1]))):
+            expected = np.moveaxis(value, -1, 0)
+            low, high = (of[f"{name}_{end}"].values for end in ("low", "high"))
+            held[name].append(((low <= expected) & (expected <= high)).mean())
+    # The six errors of a simulation are independent: 1,800 intervals at least.
+    for name, shares in held.items():
+        assert 0.92 < np.mean(shares) < 0.975, name

@@ -24,7 +24,7 @@ from support.small_datasets import (
     is_detected,
     is_run,
     is_solved,
-    jeffreys,
+    is_unflipped,
     length,
     looked_for,
     mean_of,
@@ -36,17 +36,11 @@ from support.small_datasets import (
     root_mean_square,
     spread,
     student,
-    wilson,
 )
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
 from sweep.analysis.estimator import MeanEstimate, length_interval
-from sweep.analysis.summaries import hypergeometric_moments
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-
-
-def is_unflipped(pose):
-    return is_solved(pose) and pose["flipped"] == Flipped.not_flipped
 
 
 def bias(vectors, run):
@@ -195,28 +189,16 @@ def assert_all_agree(answer, groups, names, expected):
         assert_values(here, expected(found), dict(zip(names, index, strict=True)))
 
 
-EVERY = [
-    ("all", ()), ("all", ("tilt_deg",)), ("all", ("side_px", "dictionary")),
-    ("all", ("noise_grey", "cornerRefinementMethod")), ("all", ("trial",)),
-    ("all", ("trial", "marker_id")), ("small", tuple(n for n in ALL if n != "solver")),
-    ("plain", ()), ("plain", ("distance_m",)), ("plain", ("marker_id", "distance_m")),
-    ("plain", ("trial",)), ("draws", ()), ("draws", ("marker_id",)),
-    ("no trial", ()), ("no trial", ("cornerRefinementMethod",)),
-    ("one trial", ()), ("one trial", ("tilt_deg",)), ("only trial", ()), ("only trial", ("trial",)),
-    ("settings first", ()), ("settings first", ("distance_m",)),
-]
-OF_ESTIMATION = [
-    ("all", ("solver",)), ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
-    ("settings first", ("solver",)), ("settings first", ("cornerRefinementMethod", "solver")),
-]
-CASES = pytest.mark.parametrize(("grid", "per"), EVERY + OF_ESTIMATION)
-LAST = [case for case, following in zip(EVERY, [*EVERY[1:], ("", ())], strict=True)
-        if case[0] != following[0]]
-SLOWER_CASES = pytest.mark.parametrize(("grid", "per"), [
-    pytest.param(*case, marks=() if case in LAST + OF_ESTIMATION else pytest.mark.evidence)
-    for case in EVERY + OF_ESTIMATION
+def compositions(results, per=(), **options):
+    """Return the composition of failures with a variable for each outcome."""
+    return by_outcome(failure_composition(results, per, **options).compute())
+
+
+FUNCTIONS = pytest.mark.parametrize(("function", "of", "expected"), [
+    (detection_rate, "detection", expected_detection), (flip_rate, "estimate", expected_flips),
+    (compositions, "estimate", expected_composition),
+    (error_statistics, "estimate", expected_errors),
 ])
-"""The same, of which by default one of each grid is tried."""
 
 
 @functools.cache
@@ -224,41 +206,18 @@ def poses_of(grid, of, per):
     return poses(GRIDS[grid], of, per)
 
 
-@pytest.mark.parametrize(("grid", "per"), EVERY)
-def test_detection_rates_are_those_of_plain_loops(grid, per):
-    assert_all_agree(detection_rate(GRIDS[grid], per), poses_of(grid, "detection", per), per,
-                     expected_detection)
-
-
-@CASES
-def test_flip_rates_are_those_of_plain_loops(grid, per):
-    assert_all_agree(flip_rate(GRIDS[grid], per), poses_of(grid, "estimate", per), per,
-                     expected_flips)
-
-
-@SLOWER_CASES
-def test_failures_are_those_of_plain_loops(grid, per):
-    results = GRIDS[grid]
-    answer = failure_composition(results, per).compute()
-    assert set(answer["count"].dims) == {*per, "outcome"}
-    assert_all_agree(by_outcome(answer), poses_of(grid, "estimate", per), per, expected_composition)
-    total = answer["share"].sum("outcome").values
-    anything = answer["share"].notnull().any("outcome").values
-    np.testing.assert_allclose(total[anything], 1.0, rtol=1e-12)
-    assert (answer["count"].sum("outcome") == results["estimate"].size
-            // math.prod(results.sizes[name] for name in per)).all()
-
-
-@SLOWER_CASES
-def test_errors_are_those_of_plain_loops(grid, per):
-    assert_all_agree(error_statistics(GRIDS[grid], per), poses_of(grid, "estimate", per), per,
-                     expected_errors)
-
-
-FUNCTIONS = pytest.mark.parametrize(("function", "of", "expected"), [
-    (detection_rate, "detection", expected_detection), (flip_rate, "estimate", expected_flips),
-    (error_statistics, "estimate", expected_errors),
+@FUNCTIONS
+@pytest.mark.parametrize(("grid", "per"), [
+    ("all", ()), ("all", ("noise_grey", "cornerRefinementMethod")), ("all", ("trial", "marker_id")),
+    ("small", tuple(n for n in ALL if n != "solver")), ("plain", ("marker_id", "distance_m")),
+    ("plain", ("trial",)), ("draws", ("marker_id",)), ("no trial", ("cornerRefinementMethod",)),
+    ("one trial", ("tilt_deg",)), ("only trial", ()), ("settings first", ("distance_m",)),
+    ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
+    ("settings first", ("cornerRefinementMethod", "solver")),
 ])
+def test_values_and_intervals_are_those_of_plain_loops(function, of, expected, grid, per):
+    per = tuple(name for name in per if name in GRIDS[grid][of].dims)
+    assert_all_agree(function(GRIDS[grid], per), poses_of(grid, of, per), per, expected)
 
 
 @FUNCTIONS
@@ -297,10 +256,6 @@ def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
         np.testing.assert_array_equal(answer[f"{name}_high"], edges[1:])
 
 
-FUNCTIONS_OF_ONE = pytest.mark.parametrize(
-    "function", [detection_rate, flip_rate, failure_composition, error_statistics])
-
-
 def test_a_small_spread_about_a_large_bias_keeps_its_digits():
     rng = np.random.default_rng(11)
     sizes = {"marker_id": 3, "trial": 40}
@@ -309,41 +264,6 @@ def test_a_small_spread_about_a_large_bias_keeps_its_digits():
     results = perfect(rng, sizes, rotation=vectors, position=1e3 * vectors)
     assert_all_agree(
         error_statistics(results), poses(results, "estimate"), (), expected_errors)
-
-
-@FUNCTIONS_OF_ONE
-def test_a_dimension_that_is_not_there_is_refused_in_one_line(function):
-    with pytest.raises(ArgumentError, match=r"^per = speed: no such dimension; there") as refused:
-        function(GRIDS["plain"], per=("speed",))
-    assert "\n" not in str(refused.value)
-    assert all(name in str(refused.value) for name in ("trial", "distance_m", "marker_id"))
-    with pytest.raises(ArgumentError, match="bins = speed: no such variable"):
-        function(GRIDS["plain"], bins={"speed": [0.0, 1.0]})
-
-
-# The references themselves.
-
-@pytest.mark.parametrize("n", [1, 2, 7, 50, 1000])
-def test_the_references_intervals_are_those_of_scipy(n):
-    for k in {0, 1, n // 3, n - 1, n}:
-        theirs = {wilson: stats.binomtest(k, n).proportion_ci(method="wilson"),
-                  jeffreys: stats.beta(k + 0.5, n - k + 0.5).interval(0.95)}
-        for interval, (low, high) in theirs.items():
-            mine = interval(k, n)
-            if k > 0:  # at none and all of n Jeffreys' ends are 0 and 1: BCD 2001, section 3.1.3
-                assert mine[0] == pytest.approx(low, rel=1e-9)
-            if k < n:
-                assert mine[1] == pytest.approx(high, rel=1e-9)
-
-
-def test_the_references_mean_without_cells_is_students():
-    rng = np.random.default_rng(10)
-    values = rng.normal(3, 1, 20)
-    found = [({"cell": (), "draw": k}, value) for k, value in enumerate(values)]
-    mean, error, freedom = mean_of(found, [pose for pose, _ in found])
-    ends = stats.ttest_1samp(values, 0).confidence_interval(0.95)
-    assert freedom == 19
-    assert student(mean, error, freedom) == pytest.approx((values.mean(), ends.low, ends.high))
 
 
 # What users do to datasets.
@@ -377,16 +297,6 @@ def test_the_interval_of_a_length_is_scheffes_and_students(components, freedom):
     assert high == pytest.approx(10.0 + 0.5 * stats.t.ppf(0.975, freedom), rel=1e-9)
 
 
-@pytest.mark.parametrize(("own", "total", "hits"), [(1, 2, 1), (1, 3, 1), (2, 5, 3), (4, 9, 2)])
-def test_moments_of_hits_are_those_of_the_hypergeometric_distribution(own, total, hits):
-    k = np.arange(own + 1)
-    chance = stats.hypergeom.pmf(k, total, hits, own)
-    mean = (chance * k).sum()
-    expected = mean, (chance * (k - mean)**2).sum(), (chance * (k - mean)**3).sum()
-    found = hypergeometric_moments(*map(np.float64, (own, total, hits)))
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
 def test_a_solved_pose_without_a_number_counts_in_no_mean():
     results = perfect(np.random.default_rng(2), {"trial": 60})
     results["rotation_error_rad"].values[:3] = np.nan
@@ -397,23 +307,20 @@ def test_a_solved_pose_without_a_number_counts_in_no_mean():
     assert answer["rotation_p99_deg"] == np.inf
 
 
-NO_EDGES, NO_NAMES = "expected at least two increasing edges", "expected names of dimensions"
-
-
-@pytest.mark.parametrize(("call", "error", "message"), [
-    (lambda r: detection_rate(r, per=[3]), ArgumentError, NO_NAMES),
-    (lambda r: detection_rate(r, per=None), ArgumentError, NO_NAMES),
-    (lambda r: detection_rate(r, bins=["marker_area_px"]), ArgumentError,
-     "expected names with edges"),
-    (lambda r: detection_rate(r, bins={"marker_area_px": "abc"}), ArgumentError, NO_EDGES),
-    (lambda r: detection_rate(r, bins={"marker_area_px": [1, np.nan]}), ArgumentError, NO_EDGES),
-    (lambda r: detection_rate(r.drop_vars("estimate")), DatasetError,
-     "no variable estimate; there are"),
-    (lambda _: error_statistics(xr.Dataset()), DatasetError, "no variable detection, estimate"),
-    (lambda r: detection_rate(r.isel(trial=slice(0))), DatasetError,
-     "there are no poses: trial has no values"),
+@pytest.mark.parametrize(("change", "arguments", "error", "message"), [
+    (None, {"per": ("speed",)}, ArgumentError, r"^per = speed: no .*; there.*tilt_deg.*trial"),
+    (None, {"per": [3]}, ArgumentError, "names of dimensions"),
+    (None, {"per": None}, ArgumentError, "names of dimensions"),
+    (None, {"bins": {"speed": [0.0, 1.0]}}, ArgumentError, "bins = speed: no such variable"),
+    (None, {"bins": ["marker_area_px"]}, ArgumentError, "names with edges"),
+    (None, {"bins": {"marker_area_px": "abc"}}, ArgumentError, "increasing edges"),
+    (None, {"bins": {"marker_area_px": [1, np.nan]}}, ArgumentError, "increasing edges"),
+    (lambda r: r.drop_vars("estimate"), {}, DatasetError, "no variable estimate; there are"),
+    (lambda _: xr.Dataset(), {}, DatasetError, "no variable detection, estimate"),
+    (lambda r: r.isel(trial=slice(0)), {}, DatasetError, "trial has no values"),
 ])
-def test_arguments_that_cannot_be_is_refused_in_one_line(call, error, message):
+def test_arguments_that_cannot_be_are_refused_in_one_line(change, arguments, error, message):
+    results = GRIDS["draws"] if change is None else change(GRIDS["draws"])
     with pytest.raises(error, match=message) as refused:
-        call(GRIDS["draws"])
+        detection_rate(results, **arguments)
     assert "\n" not in str(refused.value)

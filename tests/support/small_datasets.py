@@ -24,7 +24,8 @@ VALUES = {
 }
 GEOMETRY = ("dictionary", "marker_id", "tilt_deg", "side_px", "distance_m")
 OF_DETECTION, OF_ESTIMATION = ("cornerRefinementMethod",), ("solver",)
-INNER = {"xyz": ["x", "y", "z"]}
+INNER = ("xyz", "pose_parameter", "corner", "xy")
+"""Dimensions of the values of one pose."""
 
 TEXT = """seed = {seed}
 [camera]
@@ -109,7 +110,7 @@ def perfect(rng, sizes, *, rotation=None, position=None):
             "translation_error_m": ((*estimated, "xyz"), np.asarray(position, dtype=np.float32)),
             "rotation_error_deg": (estimated, np.degrees(size).astype(np.float32)),
         },
-        coordinates_of(sizes) | INNER,
+        coordinates_of(sizes) | {"xyz": ["x", "y", "z"]},
         {"pipeline": pipeline_text(sizes)},
     )
 
@@ -211,6 +212,10 @@ def is_detected(pose):
 
 def is_solved(pose):
     return pose["estimate"] == EstimateStatus.solved
+
+
+def is_unflipped(pose):
+    return is_solved(pose) and pose["flipped"] == Flipped.not_flipped
 
 
 def degrees(pose):

@@ -111,12 +111,8 @@ def test_the_summary_is_that_of_numpy(results):
     ({"views": [6], "coefficients": 3}, "one of 0, 1, 2, 4, 5"),
     ({"views": [6], "target_m": 0.0}, "above 0 m"),
     ({"views": [6], "points": "corners"}, "chessboard, markers"),
+    ({"views": [10, 40]}, "12 trials: expected at least 40"),
 ])
 def test_arguments_that_cannot_be_are_refused(arguments, fault, results):
-    with pytest.raises(ArgumentError, match=fault):
+    with pytest.raises((ArgumentError, DatasetError), match=fault):
         camera_calibrations(results, **arguments)
-
-
-def test_too_few_trials_are_refused(results):
-    with pytest.raises(DatasetError, match="12 trials: expected at least 40"):
-        camera_calibrations(results, [10, 40])

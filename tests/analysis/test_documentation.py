@@ -13,13 +13,14 @@ import sweep.analysis
 from support.example_results import example_results
 
 FUNCTIONS = [getattr(sweep.analysis, name) for name in sweep.analysis.__all__]
-PUBLIC = pytest.mark.parametrize("function", FUNCTIONS, ids=sweep.analysis.__all__)
+GUIDE = (Path(sweep.analysis.__file__).parent / "README.md").read_text(encoding="utf-8")
 MODULES = [importlib.import_module(f"sweep.analysis.{module.name}")
            for module in pkgutil.iter_modules(sweep.analysis.__path__)]
 
 
-@PUBLIC
-def test_a_public_function_has_the_sections_of_numpydoc(function):
+@pytest.mark.parametrize("function", FUNCTIONS, ids=sweep.analysis.__all__)
+def test_a_public_function_has_the_sections_of_numpydoc_and_is_in_the_guide(function):
+    assert f"`{function.__name__}`" in GUIDE
     lines = [line.strip() for line in function.__doc__.splitlines()]
     for section in ("Parameters", "Returns", "Raises", "Notes", "Examples"):
         assert lines[lines.index(section) + 1] == "-" * len(section), section
@@ -38,11 +39,3 @@ def test_examples_run(module):
     examples = [f for f in FUNCTIONS if f.__module__ == module.__name__]
     assert runner.tries >= 2 * len(examples)
 
-
-@PUBLIC
-def test_the_guide_names_a_public_function(function):
-    assert f"`{function.__name__}`" in guide()
-
-
-def guide():
-    return (Path(sweep.analysis.__file__).parent / "README.md").read_text(encoding="utf-8")

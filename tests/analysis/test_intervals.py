@@ -1,6 +1,7 @@
 """Intervals of a binomial proportion against 50 digits, published values and their coverage."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -31,8 +32,6 @@ def drawn_counts(rng, largest):
     return (some if rng.random() < 0.5 else n - some), n
 
 
-# Wilson.
-
 def exact_wilson(successes, n, level):
     """Brown, Cai and DasGupta 2001, eq. 4, as it stands."""
     kappa = mp.findroot(
@@ -45,7 +44,7 @@ def exact_wilson(successes, n, level):
 
 
 @lengths(30, 3000)
-def test_wilson_keeps_its_digits_up_to_a_million_billion(count):
+def test_wilson_keeps_its_digits_up_to_a_million_billion(count, claim):
     rng = np.random.default_rng(1)
     cases = [(s, n) for n in (1, 2, 10, 10**3, 10**9, MAX_N) for s in edges(n)]
     cases += [drawn_counts(rng, MAX_N) for _ in range(count)]
@@ -56,11 +55,9 @@ def test_wilson_keeps_its_digits_up_to_a_million_billion(count):
         for end, truth in zip(wilson(successes, n, level), exact, strict=True):
             if truth > mpf(10) ** -45:  # at 0 of n the formula leaves what 50 digits cancel to
                 worst = max(worst, float(abs(mpf(float(end)) / truth - 1)))
-    print(f"{len(cases)} intervals: worst {worst:.1e}")
+    claim("intervals of rates, up to 10^15 draws", "mpmath, 50 digits", worst)
     assert worst < 2e-15  # measured 5e-16: a few roundings
 
-
-# Jeffreys.
 
 @pytest.mark.parametrize("n", [1, 2, 10, 1000])
 def test_jeffreys_is_the_root_that_fifty_digits_find(n):
@@ -80,14 +77,6 @@ def root(a, b, tail, near):
     )
 
 
-# Both.
-
-@METHODS
-def test_nothing_seen_says_nothing(interval):
-    for ends in (interval(0, 0), interval([0, 0], [0, 0])):
-        assert np.isnan(ends).all()
-
-
 @METHODS
 @pytest.mark.parametrize("level", LEVELS)
 def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
@@ -98,22 +87,16 @@ def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
     low, high = interval(n, n, level)
     assert (high == 1.0).all()
     assert ((low > 0) & (low <= 1)).all()
+    assert np.isnan(interval([0, 0], [0, 0], level)).all()
 
 
 @METHODS
 @pytest.mark.parametrize(("successes", "n", "said"), [
-    (-1, 5, "successes = -1, n = 5: expected whole numbers"),
-    ([1, 6], 5, "successes = 6, n = 5: expected whole numbers with 0 <= successes <= n <= 1e+15"),
-    (1.5, 5, "successes = 1.5, n = 5: "),
-    (1, 5.5, "successes = 1, n = 5.5: "),
-    (np.nan, 5, "successes = nan, n = 5: "),
-    (1, np.nan, "successes = 1, n = nan: "),
-    (1, np.inf, "successes = 1, n = inf: "),
-    (0, -1, "successes = 0, n = -1: "),
-    (1, 10**15 + 1, "successes = 1, n = 1000000000000001: "),
+    (-1, 5, "successes = -1, n = 5"), ([1, 6], 5, "successes = 6, n = 5"),
+    (1.5, 5, "successes = 1.5, n = 5"), (1, 5.5, "successes = 1, n = 5.5"),
+    (np.nan, 5, "successes = nan, n = 5"), (1, np.inf, "successes = 1, n = inf"),
+    (1, 10**15 + 1, "successes = 1, n = 1000000000000001"),
 ])
 def test_impossible_counts_are_refused_in_one_line(interval, successes, n, said):
-    with pytest.raises(ValueError, match=r"expected whole numbers") as refused:
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}: expected whole .*$"):
         interval(successes, n)
-    assert str(refused.value).startswith(said)
-    assert "\n" not in str(refused.value)

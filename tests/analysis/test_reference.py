@@ -309,6 +309,8 @@ def test_a_solved_pose_without_a_number_counts_in_no_mean():
 
 @pytest.mark.parametrize(("change", "arguments", "error", "message"), [
     (None, {"per": ("speed",)}, ArgumentError, r"^per = speed: no .*; there.*tilt_deg.*trial"),
+    (lambda r: r.assign_coords(size_m=("tilt_deg", [0.1, 0.2])), {"per": ["size_m"]}, ArgumentError,
+     "size_m: goes with the axis tilt_deg: name that"),
     (None, {"per": [3]}, ArgumentError, "names of dimensions"),
     (None, {"per": None}, ArgumentError, "names of dimensions"),
     (None, {"bins": {"speed": [0.0, 1.0]}}, ArgumentError, "bins = speed: no such variable"),

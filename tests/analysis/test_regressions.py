@@ -28,7 +28,7 @@ def percent(results, side, solver):
     return np.abs(100.0 * error / results["true_tvec_m"].values[side, :, 2])
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.02, 1.1, 1.5])
+@pytest.mark.parametrize("factor", [1.02, 1.1])
 def test_a_worse_error_is_found_as_by_plain_paired_intervals(factor):
     old = perfect(np.random.default_rng(3), SIZES)
     new = changed(old, factor=factor)
@@ -49,7 +49,7 @@ def test_a_worse_error_is_found_as_by_plain_paired_intervals(factor):
     assert any(one.worse for one in found) == (factor > 1.05)
 
 
-@pytest.mark.parametrize("lost", [0, 6, 9, 10, 20])
+@pytest.mark.parametrize("lost", [0, 9, 10])
 def test_a_worse_rate_is_found_as_by_the_exact_test(lost):
     old = perfect(np.random.default_rng(4), SIZES)
     found = regressions(old, changed(old, lost=[0, lost]), ["detection_rate"], ["side_px"])

@@ -11,6 +11,7 @@ from support.small_datasets import (
     degrees,
     is_detected,
     is_solved,
+    is_unflipped,
     length,
     looked_for,
     mixed,
@@ -29,7 +30,6 @@ from sweep.analysis.requirements import (
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
-PER = ["tilt_deg", "side_px"]
 MEANS, EXACT = 0.99, 0.95
 
 
@@ -72,10 +72,6 @@ def absolute(interval):
     return abs(value), nearest, max(abs(low), abs(high))
 
 
-def unflipped(pose):
-    return is_solved(pose) and pose["flipped"] != Flipped.flipped
-
-
 def errors_of(found, error):
     return [length(error(pose)) if is_solved(pose) else math.inf for pose in found
             if looked_for(pose)]
@@ -84,7 +80,7 @@ def errors_of(found, error):
 def interval_of(variable, found, level):
     """Return value, low, high and draws of a quantity of some poses."""
     seen, solved = [p for p in found if looked_for(p)], [p for p in found if is_solved(p)]
-    good = [p for p in found if unflipped(p)]
+    good = [p for p in found if is_unflipped(p)]
     run = sum(p["detection"] != DetectionStatus.not_run for p in found)
     match variable:
         case "detection_rate":
@@ -131,38 +127,21 @@ def decision_of(variable, relation, limit, found, count):
     return Decision.met if met else Decision.not_met if failed else Decision.undecided
 
 
-def is_that_of_the_reference(seed, sizes, most):
-    rng = np.random.default_rng(seed)
-    results = mixed(sizes, seed=seed, good=rng.uniform(0.85, 0.99))
-    per = [name for name in PER if name in sizes]
-    by_condition = poses(results, "estimate", ["solver", *per])
-    texts = []
-    for variable in rng.permutation(sorted(LEVELS))[:most]:
-        # A limit near what there is, so that all decisions occur.
-        middle = interval_of(variable, next(iter(by_condition.values())), 0.5)
-        limit = float(np.clip(middle[0] * rng.uniform(0.7, 1.3), 1e-6, 1e6))
-        if "rate" in variable or not math.isfinite(middle[0]):
-            limit = rng.uniform(0.6, 0.95) if "rate" in variable else 3.0
-        texts.append(f"{variable} {rng.choice(['>=', '<='])} {limit:.12g}")
-    # Implied contradictions are refused: judged one by one.
+@pytest.mark.parametrize("variable", LEVELS)
+def test_decisions_are_those_of_plain_numpy(variable):
+    results = mixed({"side_px": 2, "trial": 80, "solver": 1}, seed=3, good=0.985)
+    groups = poses(results, "estimate", ["side_px"])
+    value = interval_of(variable, groups[0,], 0.5)[0]
+    most = 0.999 if "rate" in variable else 180.0
     seen = set()
-    for text in texts:
-        table = check_requirements(results, [text], per=per)
-        (requirement,) = parse_requirements([text])
-        for index, found in by_condition.items():
-            at = dict(zip(["solver", *per], index, strict=True))
-            expected = decision_of(requirement.variable, requirement.relation,
-                                   requirement.limit, found,
-                                   count=math.prod(sizes[name] for name in per))
-            cell = table.isel(at).isel(requirement=0)
-            assert Decision(int(cell["decision"])) == expected, (seed, text, at)
-            seen.add(expected)
-    return seen
-
-
-def test_decisions_are_those_of_plain_numpy():
-    sizes = {"side_px": 2, "trial": 80, "solver": 1}
-    seen = set().union(*(is_that_of_the_reference(seed, sizes, 3) for seed in range(5)))
+    for relation, factor in ((">=", 0.2), ("<=", 0.2), (">=", 1.0), ("<=", 5.0)):
+        text = f"{variable} {relation} {min(factor * value, most):.12g}"
+        limit = parse_requirements([text])[0].limit
+        table = check_requirements(results, [text], per=["side_px"])
+        for (side,), found in groups.items():
+            decision = int(table["decision"].isel(solver=0, side_px=side, requirement=0))
+            assert decision == decision_of(variable, relation, limit, found, count=2), text
+            seen.add(decision)
     assert seen == {Decision.met, Decision.not_met, Decision.undecided}
 
 
@@ -185,31 +164,23 @@ def with_detected(share_by_distance, trials=100, tilts=None):
     return results
 
 
-def test_the_limit_along_distance_has_an_interval_and_a_cause():
-    results = with_detected([1.0, 1.0, 0.97, 0.85, 0.2])
-    reach = farthest_met(results, ["detection >= 0.9", "rotation_median_deg <= 90"], "distance_m")
-    one = reach.isel(solver=0)
-    assert [float(one[name]) for name in ("low", "value", "high")] == [3.0, 3.0, 4.0]
+@pytest.mark.parametrize(("rates", "reach", "ends", "fails", "beyond"), [
+    ([1.0, 1.0, 0.97, 0.85, 0.2], Reach.found, [1.0, 3.0, 3.0, 4.0], (4.0, 0.85), (0.0, None)),
+    # A dip ends it.
+    ([1.0, 0.6, 1.0, 1.0], Reach.found, [1.0, 1.0, 1.0, 1.0], (2.0, 0.6), (2.0, 4.0)),
+    # It need not begin at the easiest value.
+    ([0.6, 1.0, 0.6, 1.0, 1.0, 0.6], Reach.within, [4.0, 5.0, 5.0, 5.0], (6.0, 0.6), (0.0, None)),
+])
+def test_the_limit_along_distance_has_an_interval_and_a_cause(rates, reach, ends, fails, beyond):
+    required = ["detection >= 0.9", "rotation_median_deg <= 90"]
+    one = farthest_met(with_detected(rates), required, "distance_m").isel(solver=0)
+    assert Reach(int(one["reach"])) is reach
+    assert [float(one[name]) for name in ("start", "low", "value", "high")] == ends
+    assert (float(one["fails_at"]), float(one["failing_value"])) == pytest.approx(fails)
     assert one["limited_by"].item() == "detection_rate >= 0.9"
-    assert float(one["fails_at"]), float(one["failing_value"]) == (4.0, 0.85)
-    assert Reach(int(one["reach"])) is Reach.found
-    assert float(one["met_beyond"]) == 0.0
-
-
-def test_a_dip_ends_the_limit_and_is_told():
-    one = farthest_met(with_detected([1.0, 0.3, 1.0, 1.0]), ["detection >= 0.9"],
-                       "distance_m").isel(solver=0)
-    assert [float(one[name]) for name in ("low", "value", "high")] == [1.0, 1.0, 1.0]
-    assert (float(one["met_beyond"]), float(one["farthest_beyond"])) == (2.0, 4.0)
-    assert one["keeps"].values.tolist() == [True, False, True, True]
-
-
-def test_values_at_which_all_is_met_need_not_begin_at_the_easiest():
-    one = farthest_met(with_detected([0.3, 1.0, 0.5, 1.0, 1.0, 0.2]), ["detection >= 0.9"],
-                       "distance_m").isel(solver=0)
-    assert Reach(int(one["reach"])) is Reach.within
-    assert [float(one[name]) for name in ("start", "low", "value", "high")] == [4.0, 5.0, 5.0, 5.0]
-    assert (float(one["fails_at"]), float(one["failing_value"])) == (6.0, 0.2)
+    assert float(one["met_beyond"]) == beyond[0]
+    assert beyond[1] in {None, float(one["farthest_beyond"])}
+    assert one["keeps"].values.tolist() == [rate >= 0.9 for rate in rates]
 
 
 def test_requirements_hold_at_all_tilts_together():
@@ -253,7 +224,7 @@ def test_about_as_many_draws_as_are_said_decide():
     assert Decision(int(many["decision"].item())) is Decision.met
 
 
-@pytest.mark.parametrize("trials", [2, 3, 10, 40])
+@pytest.mark.parametrize("trials", [2, 40])
 def test_few_draws_of_a_spread_far_below_its_limit_need_no_endless_number(trials):
     results = with_detected([1.0], trials=trials)
     results["translation_error_m"].values[..., 0] = np.random.default_rng(8).normal(
@@ -282,18 +253,11 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["flip_rate <= 0"], "no number of draws can show 0"),
     (["detection >= 0"], "holds always"),
     (["detection == 1"], "no relation"),
-    (["detection >= nan"], "expected NAME >= NUMBER"),
     (["detection >= 1e999"], "finite"),
     (["detektion >= 0.9"], "did you mean detection_rate?"),
-    (["range_error_p95_m <= 1"], "its unit is %: write range_p95_percent"),
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
-    (["rotation_p95 <= 1"], "write rotation_p95_deg"),
     (["rotation_p95_deg <= 0.01 rad"], "the number alone, in degrees"),
-    (["detection_percent >= 99"], "a share from 0 to 1: write detection_rate"),
     (["rotation_error <= 5"], "which statistic of it? There are rotation_median_deg, "),
-    (["rotation_deg <= 5"], "which statistic of it?"),
-    (["range <= 1"], "which statistic of it? There are range_median_percent, "),
-    (["x <= 0.01"], "x_p95_m"),
     (["detection >= 0,95"], "write 0.95"),
     (["detection >= 0.9\nsolved >= 0.9"], "each requirement is a text of its own"),
     (["x_p95_m <= 0.005", "x_median_m >= 0.01"], "contradicts"),
@@ -303,7 +267,6 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["looked_for >= 100"], "is a count"),
     (["detection >= 0.99", "detection <= 0.5"], "contradicts detection_rate <= 0.5"),
     (["detection >= 0.9", "detection >= 0.8"], "another such limit"),
-    (["range_p95_percent >= 5", "range_p99_percent <= 4"], "contradicts"),
     (["solved >= 0.9", "detection <= 0.8"], "contradicts"),
     (["range_p95_percent <= 4", "detection <= 0.8"], "contradicts"),
     ([], "expected at least one"),
@@ -315,9 +278,7 @@ def test_a_requirement_that_cannot_be_is_refused(texts, problem):
 
 
 @pytest.mark.parametrize(("change", "text", "problem"), [
-    (lambda r: r.isel(trial=slice(1)), "detection >= 0.5", "a single draw of each pose"),
     (lambda r: r.isel(trial=0), "detection >= 0.5", "a single draw of each pose"),
-    (lambda r: r, "nees <= 7", "lacks nees"),
     (lambda r: r, "rotation_efficiency >= 0.5", "lacks bound_std"),
     (lambda r: r.drop_vars("true_rvec"), "yaw_bias_deg <= 1", "lacks true_rvec"),
 ])
@@ -325,13 +286,6 @@ def test_a_store_that_cannot_answer_says_so(change, text, problem):
     results = change(perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1}))
     with pytest.raises(DatasetError, match=problem):
         check_requirements(results, [text])
-
-
-def test_a_member_of_an_axis_of_several_names_the_axis():
-    results = perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1})
-    results = results.assign_coords(size_m=("side_px", [0.1, 0.2]))
-    with pytest.raises(ArgumentError, match="size_m: goes with the axis side_px: name that"):
-        check_requirements(results, ["detection >= 0.5"], per=["size_m"])
 
 
 def test_all_faults_are_told_at_once():

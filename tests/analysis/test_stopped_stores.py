@@ -67,24 +67,19 @@ def full():
 def stopped(full):
     """Return the store of the trials that were needed, as `sweep.open` has it."""
     run = xr.DataArray(np.arange(TRIALS) < STOPPED_AT[:, None], dims=("side_px", "trial"))
-    flags = {"detection": DetectionStatus, "estimate": EstimateStatus, "flipped": Flipped}
-    return full.assign({
-        name: full[name].where(run, flags[name].not_needed).astype(np.uint8)
-        if name in flags else full[name].where(run) for name in full.data_vars
-    }).assign_attrs(pipeline=PIPELINE)
+    flags = {name: full[name].where(run, kind.not_needed).astype(np.uint8) for name, kind in (
+        ("detection", DetectionStatus), ("estimate", EstimateStatus), ("flipped", Flipped))}
+    return full.where(run).assign(flags).assign_attrs(pipeline=PIPELINE)
 
 
 def test_conditions_have_all_their_trials_and_clopper_and_pearsons_interval(stopped, full):
     table = detection_rate(stopped, ["side_px"])
     assert table.looked_for.values.tolist() == STOPPED_AT.tolist()
-    for k, n in enumerate(STOPPED_AT):
+    for k, n in enumerate(STOPPED_AT.tolist()):
         hits = int((full.detection.values[k, :n] == 1).sum())
-        low = stats.beta.ppf(0.015, hits, n - hits + 1) if hits else 0.0
-        high = stats.beta.isf(0.015, hits + 1, n - hits) if hits < n else 1.0
-        row = table.isel(side_px=k)
-        assert row.detection_rate == hits / n
-        assert row.detection_rate_low == pytest.approx(low, rel=1e-9)
-        assert row.detection_rate_high == pytest.approx(high, rel=1e-9)
+        ends = stats.binomtest(hits, n).proportion_ci(0.97, method="exact")
+        found = [table[f"detection_rate{end}"].values[k] for end in ("", "_low", "_high")]
+        assert found == pytest.approx([hits / n, *ends], rel=1e-9)
 
 
 def test_what_is_pooled_is_pooled_over_the_trials_that_all_have(stopped, full):
@@ -108,9 +103,7 @@ def test_tables_say_which_rule_stopped_the_sampling(stopped, full):
                       stopped.expand_dims(marker_id=[1, 2]))):
         assert table.attrs["sampling"] == expected
     assert "sampling" not in detection_rate(full).attrs
-
-
-def test_cells_in_which_nothing_was_looked_for_do_not_lessen_the_trials(stopped):
+    # Cells in which nothing was looked for do not lessen the trials.
     flags = stopped.detection.copy()
     flags[0, :50] = DetectionStatus.not_visible
     assert detection_rate(stopped.assign(detection=flags)).looked_for == 2 * 100

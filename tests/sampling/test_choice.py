@@ -87,8 +87,9 @@ def test_an_answer_that_a_better_one_may_replace_is_not_decided(wish, rates, bou
     assert list(shown["known"]) == ["size_m"]
 
 
-def test_a_decided_answer_is_told_as_one(chosen):
-    choice = chosen([[0.0, 0.0], [1.0, 1.0], [1.0, 1.0]], 200)
+@pytest.mark.parametrize("largest", [1.0, np.nan], ids=["kept", "not in the image"])
+def test_a_decided_answer_is_told_as_one(largest, chosen):
+    choice = chosen([[0.0, 0.0], [1.0, 1.0], [largest, largest]], 200)
     assert choice.decision is Decision.met
     assert size_lines.headline(choice).startswith("size_m=0.04 is the smallest choice")
     assert size_lines.as_json(choice)["answer"] == {"size_m": 0.04}
@@ -100,12 +101,6 @@ def test_estimates_beyond_an_undecided_value_are_no_findings(chosen):
     assert choice.decision is Decision.undecided
     assert "seem" not in text
     assert "detection_rate >= 0.9 is not decided: 0.880 (" in text
-
-
-def test_sizes_at_which_nothing_can_be_judged_are_left_out(chosen):
-    """The largest does not fit into the image."""
-    choice = chosen([[0.0, 0.0], [1.0, 1.0], [np.nan, np.nan]], 200)
-    assert (choice.decision, choice.answers[0].value) == (Decision.met, 0.04)
 
 
 def test_trials_are_needed_up_to_the_first_size_that_fails():
@@ -125,7 +120,7 @@ def test_trials_are_needed_up_to_the_first_size_that_fails():
     assert not rule.needed(group(pipeline, rates, 400, np.random.default_rng(1))).any()
 
 
-def test_pipelines_are_read_again_from_their_text():
+def test_pipelines_are_read_again_from_their_text_and_others_are_told_apart():
     pipeline = Pipeline.from_dict(changed(require={"all": ["detection >= 0.9", "budget_ms <= 2"]}))
     again = Pipeline.from_text(pipeline.to_toml())
     assert again.stopping == pipeline.stopping
@@ -134,10 +129,9 @@ def test_pipelines_are_read_again_from_their_text():
     assert pipeline.stopping.among == ("dictionary", "solver")
 
 
-def test_another_choice_does_not_continue_a_store():
-    rule = Pipeline.from_dict(DOCUMENT).stopping
-    other = Pipeline.from_dict(changed(search={"max_trials": 500})).stopping
-    assert not_continued(other, rule) == "search.max_trials: the store has 400, this run 500"
+    rule = Pipeline.from_dict(changed(search={"max_trials": 500})).stopping
+    assert not_continued(rule, pipeline.stopping) == (
+        "search.max_trials: the store has 400, this run 500")
     assert not not_continued(rule, rule)
 
 

@@ -1,7 +1,4 @@
-"""The search for a limit: its error by enumeration, its coverage by simulation, its faults.
-
-Simulated coverage is compared with the binomial quantile of the promised rate at a chance of 1e-6.
-"""
+"""The search for a limit: its error by enumeration, its coverage by simulation, its faults."""
 
 import itertools
 import math
@@ -27,7 +24,6 @@ from sweep.sampling.searches import (
     wanted_values,
 )
 
-CHANCE = 1e-6
 SIDES = np.geomspace(60, 8, 20)
 
 
@@ -48,17 +44,16 @@ def ever_met(rate, tail, ends):
 
 @pytest.mark.parametrize(("units", "most", "errors", "rates", "bound"), [
     ([40], [40, 240, 600], [0.025, 1e-3], [0.5, 0.9], 1.0),
-    pytest.param([5, 40, 50, 100], [40, 80, 120, 200, 300, 500, 1000, 2400, 10000],
-                 [0.025, 0.025 / 20, 0.025 / 250], [0.01, 0.1, 0.5, 0.8, 0.9, 0.95, 0.99], 1.01,
-                 marks=pytest.mark.long),
+    pytest.param([5, 50], [40, 120, 500, 2400], [0.025, 0.025 / 250],
+                 [0.01, 0.1, 0.5, 0.8, 0.9, 0.95, 0.99], 1.01, marks=pytest.mark.long),
 ])
-def test_several_looks_err_no_more_than_one(units, most, errors, rates, bound):
+def test_several_looks_err_no_more_than_one(units, most, errors, rates, bound, claim):
     ratios = [
         ever_met(rate, error / looks_factor(len(ends)), ends) / error
         for unit, trials, error, rate in itertools.product(units, most, errors, rates)
         for ends in [wave_ends(trials, unit)]
     ]
-    print(f"error of several looks, of that of one: at most {max(ratios):.3f}")
+    claim("error of decisions at several waves, of that of one", "exact enumeration", max(ratios))
     assert 0.5 < max(ratios) <= bound
     # Without the factor they err more.
     assert ever_met(0.9, 0.025, wave_ends(600, 40)) > 2 * 0.025
@@ -129,12 +124,12 @@ def test_limits_are_those_of_plain_intervals():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rate", [0.9, 0.99])
-@pytest.mark.parametrize("shape", ["steep", "slow", "dip", "at the limit"])
-def test_intervals_cover_the_limit(rate, shape):
+@pytest.mark.parametrize(("rate", "shape"), [
+    (0.9, "slow"), (0.9, "dip"), (0.9, "at the limit"), (0.99, "at the limit")])
+def test_intervals_cover_the_limit(rate, shape, claim):
     rng = np.random.default_rng(11)
     count = 600
-    width = {"steep": 1.0, "slow": 4.0}.get(shape, 2.0)
+    width = 4.0 if shape == "slow" else 2.0
     curves = 0.9995 * special.expit((SIDES - rng.uniform(14, 30, (count, 1))) / width)
     if shape == "dip":
         curves[np.arange(count), rng.integers(1, 6, count)] *= rng.uniform(0.8, 0.99, count)
@@ -144,12 +139,10 @@ def test_intervals_cover_the_limit(rate, shape):
         curves[np.arange(count), np.minimum(first + 1, 19)] = 0.5 * rate
     limits = searched(curves, SIDES, f"detection >= {rate}", 2400, seed=4)
     covered = int(is_covered(limits, true_limits(curves, SIDES, rate)).sum())
-    poses = float(limits["poses"].mean())
-    print(f"{rate}, {shape}: covered {covered} of {count}, {poses:,.0f} poses of "
-          f"{len(SIDES) * 2400:,}, settled {float(limits['settled'].mean()):.2f}")
-    assert covered >= stats.binom.ppf(CHANCE, count, 0.95)
+    claim("95 % intervals of limits that are searched for", "600 simulated searches each",
+          max(0.0, 95 - 100 * covered / count), "% below 95 %")
     assert covered / count >= 0.95
-    assert poses < len(SIDES) * 2400 / 3
+    assert float(limits["poses"].mean()) < len(SIDES) * 2400 / 3
 
 
 def test_a_store_of_equal_trials_has_limits_too():
@@ -171,7 +164,7 @@ def test_a_store_of_equal_trials_has_limits_too():
 def test_a_limit_that_is_not_decided_is_never_told_as_met():
     rng = np.random.default_rng(4)
     told = {False: 0, True: 0}
-    for curve in rng.uniform(0.8, 1.0, (6, 1, 1)) * special.expit((SIDES - 12.0) / 2):
+    for curve in rng.uniform(0.8, 1.0, (4, 1, 1)) * special.expit((SIDES - 12.0) / 2):
         limits = searched(curve, SIDES, "detection >= 0.9", 80, seed=6)
         (listed,) = as_json(limits)["limits"]
         (row,) = limit_table(limits).shown_rows

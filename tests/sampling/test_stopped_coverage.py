@@ -4,7 +4,6 @@ Each repetition is a condition of a pipeline, and the rule itself decides wave b
 need more trials. Of a coverage of 0.95 a test fails with a probability below 1e-6.
 """
 
-import itertools
 
 import numpy as np
 import pytest
@@ -35,11 +34,6 @@ def poses(found, error=0.0, flipped=False, axis=2):
     }
     flags = {name: np.where(found, yes, no).astype(np.uint8) for name, (yes, no) in chosen.items()}
     return {**flags, "rotation_error_rad": errors, "translation_error_m": errors}
-
-
-def detections(rate):
-    """Return what draws poses of which a share is found, without errors."""
-    return lambda rng, shape: poses(rng.random(shape) < rate)
 
 
 def depths(sample):
@@ -76,13 +70,13 @@ def quantile(share, p, spread=3.0):
 
 
 def intervals(wanted, values):
-    """Return value, low and high ends (groups,) of poses, as they are where sampling stopped."""
+    """Return low and high ends (groups,) of poses, as they are where sampling stopped."""
     arrays = {key: array[:, None, :, None] for key, array in values.items()}
     arrays["true_depth_m"] = arrays["true_tvec_m"][..., 2]
     columns, table = Columns(arrays, Poses), {}
     for statistic in wanted.requirable.computed("", LEVEL):
         table |= statistic.variables(columns, Design(stopped=True))
-    return [table[f"{wanted.name}{end}"] for end in ("", "_low", "_high")]
+    return [table[f"{wanted.name}_{end}"] for end in ("low", "high")]
 
 
 STRATA = np.array([0.02, 0.3, 0.9])
@@ -90,39 +84,31 @@ STRATA = np.array([0.02, 0.3, 0.9])
 
 def strata(rng, shape):
     """Draw pooled cells of unlike rates: the interval of their rate is a little wide."""
-    return detections(STRATA[np.arange(shape[1]) % 3])(rng, shape)
-
-
-def laplace(rng, shape):
-    return rng.laplace(size=shape)
+    return poses(rng.random(shape) < STRATA[np.arange(shape[1]) % 3])
 
 
 CASES = [
-    *(("detection_rate", rate, 0.04, 800, detections(rate))
-      for rate in (0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 1.0)),
     ("detection_rate", STRATA.mean(), 0.05, 900, strata),
-    *(case for rate in (0.001, 0.01, 0.1) for case in (
+    *(case for rate in (0.01, 0.1) for case in (
         ("flip_rate", rate, 0.05, 600, flipping(rate)),
         ("rotation_rmse_deg", float(np.sqrt(rate * 60**2 + (1 - rate) * 0.25)), 0.3, 1000,
-         flipping(rate)),
-        ("rotation_rmse_unflipped_deg", 0.5, 0.1, 1000, flipping(rate)))),
-    *(("range_rmse_percent", truth, width, 3000 if width == 0.05 else 2000, depths(sample))
-      for width in (0.05, 0.1, 0.2) for sample, truth in (
-          (normal(), 1.0), (laplace, np.sqrt(2.0)), (normal(share=0.1), rms(0.1)),
-          (normal(share=0.03), rms(0.03)))),
-    *(("range_bias_percent", truth, width, 1500, depths(sample))
-      for width in (0.05, 0.1, 0.2) for sample, truth in (
-          (normal(), 0.0), (normal(0.5), 0.5), (normal(share=0.1), 0.0))),
-    *((f"range_{name}_percent", quantile(share, p), width, 1500, depths(normal(share=share)))
-      for share, width, (name, p) in itertools.product(
-          (0.0, 0.1), (0.1, 0.2), (("median", 0.5), ("p95", 0.95), ("p99", 0.99)))),
+         flipping(rate)))),
+    ("rotation_rmse_unflipped_deg", 0.5, 0.1, 1000, flipping(0.1)),
+    ("range_rmse_percent", 1.0, 0.1, 2000, depths(normal())),
+    ("range_rmse_percent", rms(0.03), 0.2, 2000, depths(normal(share=0.03))),
+    ("range_bias_percent", 0.5, 0.1, 1500, depths(normal(0.5))),
+    ("range_bias_percent", 0.0, 0.2, 1500, depths(normal(share=0.1))),
+    *((f"range_{name}_percent", quantile(0.1, p), 0.1, 1500, depths(normal(share=0.1)))
+      for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))),
 ]
 """Quantity, truth, half-width, most trials, and what draws poses."""
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "truth", "width", "most", "draw"), CASES)
-def test_intervals_with_which_sampling_stops_cover_the_truth(name, truth, width, most, draw):
+def test_intervals_with_which_sampling_stops_cover_the_truth(
+    name, truth, width, most, draw, claim
+):
     pipeline = Pipeline.from_text(f"""
         seed = 1
         pose = {{ jitter_px = 0.5, side_px = 30 }}
@@ -130,23 +116,19 @@ def test_intervals_with_which_sampling_stops_cover_the_truth(name, truth, width,
         search = {{ precision = {{ {name} = {width} }}, max_trials = {most} }}
     """)
     rule, wanted = make_rule(pipeline), wanted_precisions({name: width})[0]
-    scale = 1.0 if wanted.requirable.is_rate else abs(truth) or 1.0
     values = {"true_tvec_m": np.broadcast_to([0.0, 0.0, 1.0], (REPETITIONS, most, 3)),
               **draw(np.random.default_rng(20), (REPETITIONS, most))}
-    left, held, deviations, trials = np.arange(REPETITIONS), 0, [], 0
+    left, held = np.arange(REPETITIONS), 0
     for wave, end in enumerate(rule.ends, 1):
         now = {key: array[left, :end] for key, array in values.items()}
         results = GroupResults(pipeline, (0,), (len(left),), wave, end, now)
         stop = np.ones(len(left), bool) if end == most else ~rule.needed(results)
         if stop.any():
-            value, low, high = intervals(wanted, {key: array[stop] for key, array in now.items()})
+            low, high = intervals(wanted, {key: array[stop] for key, array in now.items()})
             held += int(((low <= truth) & (truth <= high)).sum())
-            deviations.append((value - truth) / scale / width)
-            trials += end * int(stop.sum())
         left = left[~stop]
         if not len(left):
             break
-    print(f"{name} {truth:.3g} {width}: coverage {held / REPETITIONS:.4f}, "
-          f"bias {np.nanmean(np.concatenate(deviations)):+.3f} half-widths, "
-          f"{trials / REPETITIONS:.0f} trials")
+    claim("95 % intervals of quantities whose sampling stops", "2,000 simulations each",
+          max(0.0, 95 - 100 * held / REPETITIONS), "% below 95 %")
     assert held >= FEWEST

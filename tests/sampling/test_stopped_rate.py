@@ -1,5 +1,6 @@
 """The exact properties of a rate whose sampling stops, against all sequences and against SciPy."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -14,6 +15,7 @@ ALPHA = 0.05 * TAIL_SHARE
 RATES = (0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 1.0)
 
 
+@functools.cache
 def clopper_pearson(k, n):
     """Return the interval as SciPy's beta distribution has it."""
     low = stats.beta.ppf(ALPHA / 2, k, n - k + 1) if k else 0.0
@@ -37,34 +39,25 @@ def of_all_sequences(half_width, ends, rate):
     return coverage, mean - rate, draws
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.3, 0.5])
+@pytest.mark.parametrize("rate", [0.02, 0.3])
 def test_the_enumeration_has_the_properties_of_all_sequences(rate):
     expected = of_all_sequences(0.31, (3, 6, 9), rate)
     assert StoppedRate(0.31, (3, 6, 9)).at(rate) == pytest.approx(expected, abs=1e-12)
     assert expected[2] < 9   # some stop before
 
 
-@pytest.mark.parametrize("half_width", [0.02, 0.05])
-def test_coverage_is_kept_at_rates_from_0_to_1(half_width):
-    rule = StoppedRate(half_width, wave_ends(3000, 50))
+def test_coverage_is_kept_at_rates_from_0_to_1_and_needs_the_smaller_tails():
+    ends = wave_ends(3000, 50)
+    rule = StoppedRate(0.02, ends)
     assert min(rule.at(rate).coverage for rate in RATES) >= 0.95
+    assert rule.at(0.0).draws <= 150
+    assert rule.at(0.5).draws > 2500
     for rate in RATES:
         total = sum(probability.sum() for _, _, probability in rule.stopped(rate))
         assert total == pytest.approx(1.0, abs=1e-9)
-
-
-def test_waves_are_what_saves_poses():
-    rule = StoppedRate(0.02, wave_ends(3000, 50))
-    assert rule.at(0.0).draws <= 150
-    assert rule.at(0.5).draws > 2500
-
-
-def test_an_interval_without_smaller_tails_would_cover_less():
-    """Why tails are smaller: with alpha = 0.05 the same rule covers less than 95 % somewhere."""
-    ends = wave_ends(3000, 50)
+    # With alpha = 0.05 the same rule covers less than 95 % somewhere.
     plain = StoppedRate(0.02, ends, level=1.0 - 0.05 / TAIL_SHARE)
-    rates = np.linspace(0.02, 0.08, 120)
-    assert min(plain.at(rate).coverage for rate in rates) < 0.95
+    assert min(plain.at(rate).coverage for rate in np.linspace(0.02, 0.08, 120)) < 0.95
 
 
 def enough(half_width):
@@ -74,7 +67,7 @@ def enough(half_width):
 
 def rules_of_width(half_width, rng):
     """Yield rules of waves of any first length (those of flips are shorter) and most trials."""
-    for unit in (5, 18, 50, 64, 99):
+    for unit in (5, 50, 99):
         for most in (enough(half_width), int(enough(half_width) * rng.uniform(0.05, 0.5)) + unit):
             yield StoppedRate(half_width, wave_ends(most, unit))
 
@@ -90,20 +83,20 @@ def rules_of_level(level, _rng):
 
 def rules_of_solved(share, rng):
     """Yield rules of a flip rate: of the solved poses alone, whose waves have random lengths."""
-    for _ in range(10):
+    for _ in range(5):
         n = np.cumsum(rng.binomial(np.diff((0, *wave_ends(4500, 50))), share))
         yield StoppedRate(0.02, tuple(np.unique(n[n > 0]).tolist()))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("rules", "value", "most", "error"), [
-    *((rules_of_width, half_width, 120, 0.05) for half_width in np.geomspace(0.005, 0.25, 24)),
+    *((rules_of_width, half_width, 60, 0.05) for half_width in (0.01, 0.03, 0.1, 0.25)),
     # At 0.9999 the error is up to 1.11 times that promised.
-    *((rules_of_level, level, 60, times * (1 - level))
-      for level, times in ((0.9, 1.0), (0.99, 1.0), (0.999, 1.0), (0.9999, 1.15))),
-    *((rules_of_solved, share, 60, 0.05) for share in (0.03, 0.3, 0.8)),
+    *((rules_of_level, level, 30, times * (1 - level))
+      for level, times in ((0.9, 1.0), (0.99, 1.0), (0.9999, 1.15))),
+    (rules_of_solved, 0.3, 60, 0.05),
 ])
-def test_the_least_coverage_of_any_rate_is_as_promised(rules, value, most, error):
+def test_the_least_coverage_of_any_rate_is_as_promised(rules, value, most, error, claim):
     """It lies beside an end of an interval, of which ``most`` are drawn."""
     rng = np.random.default_rng(20)
     for rule in rules(value, rng):
@@ -112,12 +105,9 @@ def test_the_least_coverage_of_any_rate_is_as_promised(rules, value, most, error
         if len(ends) > most:
             ends = rng.choice(ends, most, replace=False)
         beside = np.concatenate([ends * (1 - 1e-9), ends * (1 + 1e-9)])
-        assert min(rule.at(rate).coverage for rate in beside) >= 1.0 - error
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("half_width", [0.01, 0.02, 0.05, 0.1])
-def test_the_bias_of_a_rate_is_below_a_fifth_of_the_half_width(half_width):
-    rule = StoppedRate(half_width, wave_ends(enough(half_width), 50))
-    biases = [abs(rule.at(rate).bias) for rate in np.linspace(0.002, 0.5, 250)]
-    assert max(biases) < 0.2 * half_width
+        missed = 1.0 - min(rule.at(rate).coverage for rate in beside)
+        if error == 0.05:
+            claim("intervals of 95 % of rates whose sampling stops, and do not hold the truth",
+                  "exact enumeration", 100 * missed, "%")
+            assert max(abs(rule.at(rate).bias) for rate in ends) < 0.25 * rule.half_width
+        assert missed <= error

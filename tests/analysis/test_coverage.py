@@ -80,7 +80,7 @@ SCALES = {"rotation": ("deg", math.degrees(0.01)), "range": ("percent", 1.0),
 
 @lengths(300, 10_000)
 @pytest.mark.parametrize(("tails", "cells", "trials"), [
-    ("normal", 1, 50), ("normal", 25, 2), ("uniform", 5, 10)])
+    ("normal", 1, 50), ("normal", 25, 2), ("uniform", 5, 10), ("t4", 1, 50)])
 def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count, covered):
     # Chance of a false alarm: below 1e-6 for each, for coverages of a mean within 0.93 ... 0.97, of
     # what is of squares within 0.94 ... 0.995 (the largest of a cell's two draws says much of it),

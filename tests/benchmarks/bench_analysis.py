@@ -1,10 +1,10 @@
 """The analysis functions on a store of many poses: time and peak memory of each, by itself.
 
-    python tests/benchmarks/bench_analysis.py [POSES [SECONDS]]
+    python -m tests.benchmarks analysis
 
 The store is one as `sweep run` makes it, in chunks of about 10,000 poses along the axes of the
-scene, with the variables that the analyses read, filled at random (default 10^7 poses). Each
-function runs in a fresh interpreter on the default threads, and is stopped after SECONDS (600).
+scene, with the variables that the analyses read, filled at random. Each function runs in a fresh
+interpreter on the default threads.
 """
 
 import json
@@ -17,11 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import header, row
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import region, write_block
 from sweep.store.lifecycle import create_store, finish
 from sweep.store.receipt import STAGES, Receipt
+
+POSES = 10**7
 
 GRID = """
 seed = 1
@@ -55,6 +58,8 @@ CALLS = {
     "compare": "compare(results.isel(solver=0), results.isel(solver=1), ('tilt_deg',))",
     "detection_limit": "detection_limit(results, 0.9)",
 }
+
+QUICK = {"POSES": 10**4, "CALLS": dict(list(CALLS.items())[:2])}
 
 CHILD = """
 import json, sys, time
@@ -137,35 +142,19 @@ def chunk(rng, pipeline, block):
     } | {name: np.moveaxis(values, 4, 3) for name, values in of_solvers.items()}
 
 
-def measured(store, call, seconds=600):
+def measured(store, call):
     """Run a call on a store in a fresh interpreter; return its figures."""
-    ran = subprocess.run(
-        [sys.executable, "-c", CHILD.format(call=call), store], capture_output=True, text=True,
-        check=False, timeout=seconds)
-    if ran.returncode:
-        raise RuntimeError(ran.stderr[-2000:])
-    return json.loads(ran.stdout)
+    return json.loads(subprocess.check_output(
+        [sys.executable, "-c", CHILD.format(call=call), store], text=True))
 
 
 def main():
-    from tables import header, row  # noqa: PLC0415  (tests import this file from elsewhere)
-
-    poses = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10**7
-    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 600
     with tempfile.TemporaryDirectory(prefix="sweep-bench-") as folder:
         begun = time.perf_counter()
-        store, written = write_store(folder, poses)
+        store, written = write_store(folder, POSES)
         print(f"{written:,} poses written in {time.perf_counter() - begun:.0f} s")
         header("call", "s", "peak MB", "values")
         for name, call in CALLS.items():
-            try:
-                found = measured(store, call, seconds)
-            except (subprocess.TimeoutExpired, RuntimeError) as error:
-                row(name, str(error).splitlines()[-1][-100:])
-                continue
+            found = measured(store, call)
             row(name, f"{found['seconds']:.1f}", f"{found['peak'] / 1e6:.0f}",
                 f"{found['values']:,}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """All detectors on the same exact images: corners, offsets, misses, time.
 
     pip install '.[detectors]'
-    python tests/benchmarks/bench_detectors.py              # 1,000 scenes, without and with noise
+    python -m tests.benchmarks detectors
 
 Frames of 640 x 480 px with one 36h11 marker, sides of 60 to 150 px, tilts to 45°; the second half
 of the scenes is the point reflection of the first. Whole frames, one thread. STag has markers of
@@ -10,14 +10,12 @@ its own (HD21), in the same poses. Offsets come with their standard error over p
 by a bootstrap over pairs, and Wilson's; times are medians. Each detector has a process of its own.
 """
 
-import argparse
 import time
 
-import bench_detectors  # functions that a child process calls are of a module
 import cv2
 import numpy as np
-from tables import header, row
 
+from benchmarks.tables import header, row
 from sweep.analysis.intervals import wilson
 from sweep.conformance.check import trial_pipeline, trial_scenes
 from sweep.isolation.child_process import Child, ChildDiedError
@@ -33,6 +31,8 @@ METHODS = {
        for name in ("standard", "high_accuracy")},
     "stag-python": ("stag-python", STAG, ()),
 }
+SCENES, NOISE_GREY = 1000, (0.0, 3.0)
+QUICK = {"SCENES": 8, "NOISE_GREY": (0.0,), "METHODS": dict(list(METHODS.items())[:1])}
 
 
 def searched(name, scenes, noise):
@@ -79,27 +79,14 @@ def line(errors, seconds, rng):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=1000)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 3.0])
-    parser.add_argument("--only", default="", help="methods whose names contain this")
-    options = parser.parse_args()
-    for noise in options.noise:
-        print(f"\n{options.scenes} scenes, noise of {noise:g} grey levels\n")
+    for noise in NOISE_GREY:
+        print(f"\n{SCENES} scenes, noise of {noise:g} grey levels\n")
         header("detector", "RMS, px", "mean offset x, y, px", "found", "ms")
         for name in METHODS:
-            if options.only in name:
-                with Child("bench_detectors") as child:
-                    try:
-                        errors, seconds = child.call(
-                            bench_detectors.searched, name, options.scenes, noise, limit_s=3600
-                        )
-                    except ChildDiedError as death:
-                        row(name, f"ended its process: {death}")
-                    else:
-                        rng = np.random.default_rng(4)
-                        row(name, *line(errors, seconds, rng))
-
-
-if __name__ == "__main__":
-    main()
+            with Child(__name__) as child:
+                try:
+                    errors, seconds = child.call(searched, name, SCENES, noise, limit_s=3600)
+                except ChildDiedError as death:
+                    row(name, f"ended its process: {death}")
+                else:
+                    row(name, *line(errors, seconds, np.random.default_rng(4)))

@@ -1,20 +1,19 @@
 """The kernel against a user's good loop, and against the bare calls that it makes.
 
-    python tests/benchmarks/bench_kernel.py [markers] [boards]
+    python -m tests.benchmarks kernel [markers] [boards]
 
-Single markers and boards; both if none is named. One core, medians of
-paired runs, seconds of the processor: ratios count.
+Single markers and boards of 35; both if none is named. One core, medians of paired runs, seconds of
+the processor: ratios count.
 """
 
 import itertools
 import statistics
-import sys
 import time
 
 import cv2
 import numpy as np
-from tables import header, row
 
+from benchmarks.tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import scenes_at, searched_windows
@@ -22,47 +21,25 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import Detector, charuco_board
 from sweep.model.renderers import render_all
 
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}
-REPEATS = 5
-DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
-
-MARKER = """
-seed = 1
-[camera]
-width_px = {width}
-height_px = {height}
-fx_px = {focal}
-[marker]
-dictionary = "DICT_5X5_50"
-size_m = 0.04
-[pose]
-distance_m = {{ uniform = [0.2, 2.0] }}
-tilt_deg = {{ uniform = [0, 70] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-15, 15] }}
-bearing_y_deg = {{ uniform = [-15, 15] }}
-[scene]
-background = 255
-[axes]
-trial = {poses}
-"""
-
 BOARD_SIZES = ((640, 480), (4000, 3000))
 BOARD_POSES = {640: 60, 4000: 15}
 DISTANCES = ((0.4, 0.8), (0.8, 1.6), (1.6, 3.2))
-MARKER_M, SQUARE_M = 0.03, 0.0375
-PX_PER_M = 10 * 7 / MARKER_M
-"""Pixels of the naive loop's bitmap: ten a module."""
-
 BOARDS = {
     "grid of 7 x 5": 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.0075',
     "ChArUco of 10 x 7": 'kind = "charuco"\nsquares_x = 10\nsquares_y = 7\nsquare_m = 0.0375',
 }
 """Boards of 35 markers of 30 mm."""
 
-BOARD = """
+REPEATS = 5
+QUICK = {
+    "SIZES": SIZES[:1], "POSES": {640: 20}, "BOARD_SIZES": SIZES[:1], "BOARD_POSES": {640: 2},
+    "DISTANCES": DISTANCES[:1], "BOARDS": dict(list(BOARDS.items())[:1]), "REPEATS": 1,
+}
+
+TEXT = """
 seed = 1
 [camera]
 width_px = {width}
@@ -70,40 +47,45 @@ height_px = {height}
 fx_px = {focal}
 [marker]
 dictionary = "DICT_5X5_50"
-size_m = 0.03
-[board]
+size_m = {size_m}
 {board}
 [pose]
 distance_m = {{ uniform = [{near}, {far}] }}
-tilt_deg = {{ uniform = [0, 60] }}
+tilt_deg = {{ uniform = [0, {tilt}] }}
 azimuth_deg = {{ uniform = [0, 360] }}
 roll_deg = {{ uniform = [0, 360] }}
-jitter_px = 20
+{place}
 [scene]
 background = 255
-[estimator]
-solver = "iterative"
 [axes]
 trial = {poses}
 """
+MARKER = {
+    "size_m": 0.04, "board": "", "near": 0.2, "far": 2.0, "tilt": 70,
+    "place": "bearing_x_deg = {uniform = [-15, 15]}\nbearing_y_deg = {uniform = [-15, 15]}",
+}
+BOARD = {"size_m": 0.03, "tilt": 60, "place": 'jitter_px = 20\n[estimator]\nsolver = "iterative"'}
 
 
 class Block:
     """A pipeline's trials: their values and scenes, and where visible ones are searched."""
 
-    def __init__(self, text, width, height, poses, **given):
-        self.pipeline = Pipeline.from_text(text.format(
+    def __init__(self, width, height, poses, **given):
+        self.pipeline = Pipeline.from_text(TEXT.format(
             width=width, height=height, focal=4 / 4.8 * width, poses=poses, **given))
         self.poses, self.indices = poses, [np.arange(poses)]
         batch = scenes_at(self.pipeline.experiment, self.indices)
-        self.values, self.scenes, self.boxes = batch.values, batch.scenes, batch.boxes
+        self.scenes, self.boxes, self.target = batch.scenes, batch.boxes, batch.scenes.targets[0]
+        unit = given["size_m"] if self.target.is_marker else 1.0
+        self.corners_m = self.target.corners_m * unit  # (markers, 4, 3)
         self.rows = np.flatnonzero(batch.visible)
         self.setting = self.pipeline.experiment.detectors[0]
         (self.cut,) = searched_windows(batch)
         self.camera = self.scenes.cameras.matrix(0)
         self.posed = [
-            (cv2.Rodrigues(self.scenes.rotation[k])[0], self.scenes.translation[k])
-            for k in self.rows
+            (cv2.Rodrigues(rotation)[0], tvec, np.column_stack([rotation[:, :2], tvec]))
+            for rotation, tvec in zip(
+                self.scenes.rotation[self.rows], self.scenes.translation[self.rows], strict=True)
         ]
 
     def run(self):
@@ -145,38 +127,92 @@ def compared(block, bare, *loops):
             *(f"{each:.1f}" for each in medians[count + 1:-1]), f"{medians[-1]:.2f}"]
 
 
-def square_points(side):
-    half = side / 2
-    return np.array(
-        [[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float32)
+def drawn(target, corners_m):
+    """Return a target's bitmap, ten pixels a module, and what takes its pixels to metres."""
+    side = float(np.linalg.norm(corners_m[0, 1] - corners_m[0, 0]))
+    px_per_m = 10 * 7 / side
+    points = corners_m.reshape(-1, 3)
+    low, high = points.min(axis=0)[:2] - side / 7, points.max(axis=0)[:2] + side / 7
+    size = np.round((high - low) * px_per_m).astype(int)
+    # Pixel (0, 0) is the middle of the bitmap's top left pixel; y is up on the target.
+    to_target = np.array([
+        [1 / px_per_m, 0, low[0] + 0.5 / px_per_m], [0, -1 / px_per_m, high[1] - 0.5 / px_per_m],
+        [0, 0, 1],
+    ])
+    bitmap = np.full(size[::-1], 255, np.uint8)
+    if target.chessboard is not None:
+        squares = target.chessboard
+        charuco = charuco_board(target).generateImage(
+            tuple(round(count * squares.square_m * px_per_m)
+                  for count in (squares.squares_x, squares.squares_y)))
+        top, left = (np.array(bitmap.shape) - charuco.shape) // 2
+        bitmap[top:top + charuco.shape[0], left:left + charuco.shape[1]] = charuco
+        return bitmap, to_target
+    for number, corners in zip(target.marker_ids, corners_m, strict=True):
+        left = round((corners[0, 0] - low[0]) * px_per_m)
+        top = round((high[1] - corners[0, 1]) * px_per_m)
+        bitmap[top:top + 70, left:left + 70] = cv2.aruco.generateImageMarker(
+            DICTIONARY, number, 70)
+    return bitmap, to_target
 
 
-def marker_loop(block, margin_px=None):
+def charuco_detector(target):
+    """Return the detector of a board's chessboard corners, or None."""
+    return None if target.chessboard is None else cv2.aruco.CharucoDetector(charuco_board(target))
+
+
+def user_loop(block, margin_px=None):
     """Return a user's good loop: bitmap cached, one detector, plain calls.
 
     It draws and searches whole frames; with a margin, windows of that margin about the corners.
     """
     detector = cv2.aruco.ArucoDetector(DICTIONARY, cv2.aruco.DetectorParameters())
-    objects, frame = square_points(0.04), tuple(block.scenes.frame[0].tolist())
-    marker = cv2.aruco.generateImageMarker(DICTIONARY, 0, 70)
-    bitmap = cv2.copyMakeBorder(marker, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=255)
-    source = np.array([[9.5, 9.5], [79.5, 9.5], [79.5, 79.5], [9.5, 79.5]], np.float32)
+    charuco, frame = charuco_detector(block.target), tuple(block.scenes.frame[0].tolist())
+    bitmap, to_target = drawn(block.target, block.corners_m)
+    objects = block.corners_m.reshape(-1, 3).astype(np.float32)
+    board = cv2.aruco.Board(
+        block.corners_m.astype(np.float32), DICTIONARY, np.array(block.target.marker_ids))
 
     def loop():
-        for rvec, tvec in block.posed:
-            corners = cv2.projectPoints(objects, rvec, tvec, block.camera, None)[0].reshape(4, 2)
-            first, size = np.zeros(2), frame
+        for rvec, tvec, plane in block.posed:
+            first, size, to_frame = np.zeros(2), frame, block.camera @ plane @ to_target
             if margin_px is not None:
+                corners = cv2.projectPoints(objects, rvec, tvec, block.camera, None)[0][:, 0]
                 first = np.clip(np.floor(corners.min(axis=0)) - margin_px, 0, frame)
                 last = np.clip(np.ceil(corners.max(axis=0)) + margin_px, 0, frame)
                 size = tuple(map(int, last - first))
-            transform = cv2.getPerspectiveTransform(source, (corners - first).astype(np.float32))
+                to_frame = np.array([[1, 0, -first[0]], [0, 1, -first[1]], [0, 0, 1]]) @ to_frame
             image = cv2.warpPerspective(
-                bitmap, transform, size, flags=cv2.INTER_LINEAR, borderValue=(255,))
+                bitmap, to_frame, size, flags=cv2.INTER_LINEAR, borderValue=(255,))
             quads, ids, _ = detector.detectMarkers(image)
-            if ids is not None:
+            if ids is None:
+                continue
+            if block.target.is_marker:
                 cv2.solvePnP(objects, quads[0] + first.astype(np.float32), block.camera, None,
                              flags=cv2.SOLVEPNP_IPPE_SQUARE)
+                continue
+            if charuco is not None:
+                charuco.detectBoard(image, markerCorners=quads, markerIds=ids)
+            points, pixels = board.matchImagePoints(quads, ids)
+            cv2.solvePnP(points, pixels, block.camera, None, rvec.copy(), tvec.copy())
+
+    return loop
+
+
+def bare_loop(block):
+    """Return the kernel's calls of the renderer and of OpenCV alone."""
+    charuco = charuco_detector(block.target)
+    points, marker = block.corners_m.reshape(-1, 3), block.target.is_marker
+
+    def loop():
+        count = block.bare_calls(charuco)
+        for rvec, tvec, _ in block.posed[: count if marker else None]:
+            pixels = cv2.projectPoints(points, rvec, tvec, block.camera, None)[0]
+            if marker:
+                cv2.solvePnPGeneric(points, pixels, block.camera, None,
+                                    flags=cv2.SOLVEPNP_IPPE_SQUARE)
+            else:
+                cv2.solvePnP(points, pixels, block.camera, None)
 
     return loop
 
@@ -185,69 +221,9 @@ def markers_table():
     header("frame", "naive ms a pose", "cropping ms a pose", "sweep ms a pose", "naive / sweep",
            "cropping / sweep", "sweep / bare calls")
     for width, height in SIZES:
-        block = Block(MARKER, width, height, POSES[width])
-
-        def bare(block=block):
-            for rvec, tvec in block.posed[:block.bare_calls()]:
-                pixels = cv2.projectPoints(square_points(0.04), rvec, tvec, block.camera, None)[0]
-                cv2.solvePnPGeneric(square_points(0.04), pixels, block.camera, None,
-                                    flags=cv2.SOLVEPNP_IPPE_SQUARE)
-
+        block = Block(width, height, POSES[width], **MARKER)
         row(f"{width} x {height}", *compared(
-            block, bare, marker_loop(block), marker_loop(block, margin_px=24)))
-
-
-def naive_board(ours):
-    """Return the board as OpenCV has it, its ChArUco detector or None, its bitmap and the map."""
-    board = cv2.aruco.Board(
-        ours.corners_m.astype(np.float32), DICTIONARY, np.array(ours.marker_ids))
-    low = ours.corners_m.reshape(-1, 3).min(axis=0)[:2] - SQUARE_M
-    high = ours.corners_m.reshape(-1, 3).max(axis=0)[:2] + SQUARE_M
-    size = np.round((high - low) * PX_PER_M).astype(int)
-    # Pixel (0, 0) is the middle of the bitmap's top left pixel; y is up on the board.
-    to_board = np.array([
-        [1 / PX_PER_M, 0, low[0] + 0.5 / PX_PER_M], [0, -1 / PX_PER_M, high[1] - 0.5 / PX_PER_M],
-        [0, 0, 1],
-    ])
-    bitmap = np.full(size[::-1], 255, np.uint8)
-    if ours.chessboard is not None:
-        charuco, squares = charuco_board(ours), ours.chessboard
-        drawn = charuco.generateImage((
-            round(squares.squares_x * SQUARE_M * PX_PER_M),
-            round(squares.squares_y * SQUARE_M * PX_PER_M),
-        ))
-        top, left = (size[1] - drawn.shape[0]) // 2, (size[0] - drawn.shape[1]) // 2
-        bitmap[top:top + drawn.shape[0], left:left + drawn.shape[1]] = drawn
-        return board, cv2.aruco.CharucoDetector(charuco), bitmap, to_board
-    side = round(MARKER_M * PX_PER_M)
-    for number, corners in zip(ours.marker_ids, ours.corners_m, strict=True):
-        left = round((corners[0, 0] - low[0]) * PX_PER_M)
-        top = round((high[1] - corners[0, 1]) * PX_PER_M)
-        bitmap[top:top + side, left:left + side] = cv2.aruco.generateImageMarker(
-            DICTIONARY, number, side)
-    return board, None, bitmap, to_board
-
-
-def board_loop(block, board, charuco, bitmap, to_board):
-    """As :func:`marker_loop`, of a board."""
-    detector = cv2.aruco.ArucoDetector(DICTIONARY)
-    frame = tuple(block.scenes.frame[0].tolist())
-
-    def loop():
-        for k, (rvec, tvec) in zip(block.rows, block.posed, strict=True):
-            rotation = block.scenes.rotation[k]
-            to_frame = block.camera @ np.column_stack([rotation[:, :2], tvec]) @ to_board
-            image = cv2.warpPerspective(
-                bitmap, to_frame, frame, flags=cv2.INTER_LINEAR, borderValue=(255,))
-            corners, ids, _ = detector.detectMarkers(image)
-            if ids is None:
-                continue
-            if charuco is not None:
-                charuco.detectBoard(image, markerCorners=corners, markerIds=ids)
-            objects, pixels = board.matchImagePoints(corners, ids)
-            cv2.solvePnP(objects, pixels, block.camera, None, rvec.copy(), tvec.copy())
-
-    return loop
+            block, bare_loop(block), user_loop(block), user_loop(block, margin_px=24)))
 
 
 def boards_table():
@@ -255,34 +231,20 @@ def boards_table():
            "sweep ms a pose", "naive / sweep", "sweep / bare calls")
     for name, declared in BOARDS.items():
         for (width, height), (near, far) in itertools.product(BOARD_SIZES, DISTANCES):
-            block = Block(BOARD, width, height, BOARD_POSES[width], board=declared, near=near,
-                          far=far)
+            block = Block(width, height, BOARD_POSES[width], board=f"[board]\n{declared}",
+                          near=near, far=far, **BOARD)
             windows = block.cut[block.rows]
             share = np.mean(np.prod(windows[:, 2:] - windows[:, :2], axis=1)) / (width * height)
-            printed = block.values["board"].listed(1)[0]
-            naive = naive_board(printed)
-            decoded = block.bare_calls(naive[1]) / (35 * len(block.rows))
-            points = printed.corners_m.reshape(-1, 3)
-
-            def bare(block=block, charuco=naive[1], points=points):
-                block.bare_calls(charuco)
-                for rvec, tvec in block.posed:
-                    pixels = cv2.projectPoints(points, rvec, tvec, block.camera, None)[0]
-                    cv2.solvePnP(points, pixels, block.camera, None)
-
+            decoded = block.bare_calls() / (35 * len(block.rows))
             row(f"{name}, {near}-{far} m", f"{width} x {height}", f"{share:.2f}", f"{decoded:.2f}",
-                *compared(block, bare, board_loop(block, *naive)))
+                *compared(block, bare_loop(block), user_loop(block)))
 
 
 TABLES = {"markers": markers_table, "boards": boards_table}
 
 
 @single_threaded()
-def main():
-    for name in sys.argv[1:] or TABLES:
+def main(*names):
+    for name in names or TABLES:
         TABLES[name]()
         print()
-
-
-if __name__ == "__main__":
-    main()

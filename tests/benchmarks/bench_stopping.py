@@ -1,19 +1,16 @@
 """Poses and time of runs to a precision, against the fixed number that gives the same worst width.
 
-    python tests/benchmarks/bench_stopping.py [--workers N] [--whole]
+    python -m tests.benchmarks stopping
 
-Of the paper's figure 4 (`pipelines/paper_fig4.toml`, its own renderer) every 16th distance, to
-+-0.02; of `pipelines/tradeoff.toml` noise 2, two of the refinements and of the solvers, in windows,
-to 5 % of the range's root mean square error. About ten minutes on two idle cores. ``--whole``: all
-distances; both noises, three refinements and five solvers. That takes an hour.
+Of the paper's figure 4 (`pipelines/paper_fig4.toml`, its own renderer) to +-0.02; of
+`pipelines/tradeoff.toml` in windows, three refinements and five solvers, to 5 % of the range's root
+mean square error. About an hour on two idle cores.
 
 The fixed number is that at which the widest interval that the analysis gives of fixed trials
 (Wilson's; Student's of the logarithm, 95 %) is as wide as the widest that was reached; its time is
-that of as many poses at the speed of the same run. Of rates it is also said how many times as many
-as those that suffice if each rate is known beforehand.
+that of as many poses at the speed of the same run.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -28,23 +25,19 @@ from sweep.experiment.pipeline import Pipeline
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 CASES = {
     "paper_fig4": (
-        ["distance_m={ linspace = [0.1, 0.5, 11] }", "search.precision={ detection_rate = 0.02 }",
-         'search.per=["tilt_deg", "distance_m"]', "search.max_trials=320"],
+        ["search.precision={ detection_rate = 0.02 }", 'search.per=["tilt_deg", "distance_m"]',
+         "search.max_trials=320"],
         "detection_rate"),
-    "tradeoff": (
-        ["noise_grey=2", 'window="auto"', 'bound="none"',
-         'cornerRefinementMethod=["none", "subpix"]', 'solver=["ippe_square", "sqpnp"]',
-         "search.precision={ range_rmse_percent = 0.05 }", "search.max_trials=6000"],
-        "range_rmse_percent"),
-}
-WHOLE = {
-    "paper_fig4": (CASES["paper_fig4"][0][1:], "detection_rate"),
     "tradeoff": (
         ['window="auto"', 'bound="none"', 'cornerRefinementMethod=["none", "subpix", "contour"]',
          'solver=["ippe_square", "ippe", "iterative", "sqpnp", "ap3p"]',
          "search.precision={ range_rmse_percent = 0.05 }", "search.max_trials=40000"],
         "range_rmse_percent"),
 }
+
+QUICK = {"CASES": {"paper_fig4": (
+    ["distance_m=[0.1, 0.3]", "tilt_deg=[0]", "search.precision={ detection_rate = 0.2 }",
+     "search.max_trials=40"], "detection_rate")}}
 
 
 def fixed_draws(results, table, name, width):
@@ -62,24 +55,13 @@ def fixed_draws(results, table, name, width):
     return int(np.ceil(float((table["run"] * (half / width) ** 2).max())))
 
 
-def known_rates(table, width):
-    """Return the poses that suffice if each rate is known, by Wald's interval."""
-    rates = table["value"].values
-    return max(int((1.96**2 * rates * (1 - rates) / width**2).sum()), 1)
-
-
 def main():
     """Print what the two runs took."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--whole", action="store_true")
-    options = parser.parse_args()
-    workers = options.workers
-    for case, (settings, name) in (WHOLE if options.whole else CASES).items():
+    for case, (settings, name) in CASES.items():
         pipeline = Pipeline.from_toml(PIPELINES / f"{case}.toml", settings)
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
-            results = sweep.run(pipeline, store=f"{folder}/{case}.zarr", workers=workers)
+            results = sweep.run(pipeline, store=f"{folder}/{case}.zarr")
             seconds = time.perf_counter() - begun
             table = precision_reached(results)
             first = dict.fromkeys(table.attrs["configuration_dims"], 0)
@@ -92,9 +74,3 @@ def main():
                   f"{float(table['half_width'].max()):.4f}: {poses:,} poses in {seconds:.0f} s; "
                   f"fixed trials {fixed:,} poses, about {seconds * fixed / poses:.0f} s: "
                   f"{fixed / poses:.2f} times as many")
-            if name == "detection_rate":
-                print(f"  of known rates: {fixed / known_rates(table, width):.2f} times as many")
-
-
-if __name__ == "__main__":
-    main()

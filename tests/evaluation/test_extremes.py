@@ -1,14 +1,14 @@
 """At the extremes nothing untold passes as detected or solved, and each regime does as it says.
 
-The regimes are the files of pipelines/extremes; ``python tests/benchmarks/extremes.py`` prints
-what every refinement and solver does there.
+The regimes are the files of pipelines/extremes; ``python -m tests.benchmarks extremes`` prints
+what every solver does there.
 """
 
 
 import numpy as np
 import pytest
 
-from benchmarks.extremes import (
+from benchmarks.bench_extremes import (
     FILES,
     SOLVERS,
     broken_promises,

@@ -1,25 +1,22 @@
-"""What every refinement and every solver does at the extremes: tables over pipelines/extremes.
+"""What every solver does at the extremes: a table over pipelines/extremes.
 
-    python tests/benchmarks/extremes.py [FILE ...]
+    python -m tests.benchmarks extremes
 
 In this process, on one core, warnings raised as errors. What breaks a promise (see
-:func:`broken_promises`) is told below the tables, and the exit status is 1.
+:func:`broken_promises`) is told below the table, and the exit status is 1.
 """
 
-import argparse
 import contextlib
-import faulthandler
 import os
 import sys
 import tempfile
-import time
 import warnings
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure
 from sweep.experiment.grid import Block
@@ -29,10 +26,11 @@ from sweep.experiment.schema import SCHEMA
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 FILES = sorted((Path(__file__).parents[2] / "pipelines" / "extremes").glob("*.toml"))
-REFINEMENTS = ("none", "subpix", "contour", "apriltag")
 SOLVERS = ("ippe_square", "ippe", "iterative", "sqpnp", "p3p", "ap3p")
 REFINEMENT = "subpix"
 """The refinement on whose corners the table compares solvers."""
+
+QUICK = {"FILES": [path for path in FILES if path.stem == "tilt_zero"]}
 
 
 @dataclass
@@ -47,35 +45,6 @@ class Measured:
     failures: list[Failure] = field(default_factory=list)
     printed: list[str] = field(default_factory=list)
 
-    @property
-    def scenes(self):
-        return len(self.values["true_rvec"])
-
-    def treatments(self):
-        """Yield for each value of the other treatment axes what it is, and who is who.
-
-        (detector's text, estimator's text, {refinement: d}, {solver: e})
-        """
-        def grouped(stage, name, made):
-            others = [axis.name for axis in self.pipeline.axes_of(stage) if axis.name != name]
-            groups = {}
-            for number, setting in enumerate(made):
-                told = ", ".join(f"{other} = {_shown(getattr(setting, other))}" for other in others)
-                groups.setdefault(told, {})[getattr(setting, name)] = number
-            return groups.items()
-
-        for searched, by_refinement in grouped(
-            Stage.detection, "cornerRefinementMethod", self.pipeline.experiment.detectors
-        ):
-            for solved, by_solver in grouped(
-                Stage.estimation, "solver", self.pipeline.experiment.estimators
-            ):
-                yield searched, solved, by_refinement, by_solver
-
-
-def _shown(value):
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
 
 def measured(pipeline, count=None):
     """Run a pipeline's scenes: all, or ``count`` of them, drawn by its seed."""
@@ -88,14 +57,11 @@ def measured(pipeline, count=None):
         warnings.simplefilter("error")
         cells = run_cells(pipeline.experiment, indices)
         columns = {v.name: cells.columns[v.name].astype(v.dtype) for v in SCHEMA}
-    settings = pipeline.size(Stage.detection)
-    leading = {
-        Stage.scene: (),
-        Stage.detection: (settings,),
-        Stage.estimation: (settings, pipeline.size(Stage.estimation)),
-    }
+    settings = (pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    stages = (Stage.scene, Stage.detection, Stage.estimation)
     values = {
-        v.name: columns[v.name].reshape(*leading[v.stage], *columns[v.name].shape[1:])
+        v.name: columns[v.name].reshape(
+            *settings[: stages.index(v.stage)], *columns[v.name].shape[1:])
         for v in SCHEMA
     }
     return Measured(pipeline, values, cells.failures, printed)
@@ -185,21 +151,21 @@ def broken_promises(result):
     return broken
 
 
+def groups(pipeline, stage, name, made):
+    """Return {the other treatment axes' values in words: {value of axis ``name``: number}}."""
+    others = [axis.name for axis in pipeline.axes_of(stage) if axis.name != name]
+    found = {}
+    for number, setting in enumerate(made):
+        words = tuple(f"{other} = {getattr(setting, other)}" for other in others)
+        found.setdefault(words, {})[getattr(setting, name)] = number
+    return found
+
+
 def percent(share):
     """Return a share in words: neither all nor nothing is said where it is not so."""
     if share in (0, 1):
         return f"{share:.0%}"
     return f"{min(max(share, 0.01), 0.99):.0%}"
-
-
-def detection_cell(flags):
-    """Return the share of detected ones, and what became of most others."""
-    counts = Counter(DetectionStatus(flag).name for flag in flags.tolist())
-    cell = percent(counts.pop("detected", 0) / len(flags))
-    if counts:
-        name, count = counts.most_common(1)[0]
-        cell += f", {name} {percent(count / len(flags))}"
-    return cell
 
 
 def solver_cell(detected, estimate, error_deg, flipped):
@@ -209,7 +175,7 @@ def solver_cell(detected, estimate, error_deg, flipped):
     solved = estimate == EstimateStatus.solved
     cell = "-"
     if solved.any():
-        cell = f"{figures(np.median(error_deg[solved]))} / {figures(error_deg[solved].max())}"
+        cell = f"{np.median(error_deg[solved]):.2g} / {error_deg[solved].max():.2g}"
     shares = {"failed": (detected & ~solved).sum(), "flipped": (flipped == Flipped.flipped).sum()}
     for word, count in shares.items():
         if count:
@@ -217,76 +183,35 @@ def solver_cell(detected, estimate, error_deg, flipped):
     return cell
 
 
-def figures(number):
-    """Return an error in degrees to two figures, and at most three decimals."""
-    return "<0.001" if number < 1e-3 else f"{number:.0f}" if number >= 10 else f"{number:.2g}"
-
-
-def markdown(header, rows):
-    """Return lines of a Markdown table whose columns are aligned."""
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))
-            + " |" for line in lines]
-
-
-def tables(results):
-    """Return the two tables over all regimes: (name, Measured) each."""
-    searches, solutions = [], []
-    for name, result in results:
-        values = result.values
-        seen = None
-        for searched, solved, by_refinement, by_solver in result.treatments():
-            regime = ", ".join(filter(None, (name, searched, solved)))
-            if searched != seen:  # once, however many estimators follow
-                searches.append([", ".join(filter(None, (name, searched))), str(result.scenes)] + [
-                    detection_cell(values["detection"][by_refinement[refinement]])
-                    for refinement in REFINEMENTS
-                ])
-                seen = searched
-            d = by_refinement[REFINEMENT]
-            detected = values["detection"][d] == DetectionStatus.detected
-            solutions.append([regime, str(detected.sum())] + [
-                solver_cell(detected, *(values[variable][d, by_solver[solver]] for variable in
-                                        ("estimate", "rotation_error_deg", "flipped")))
-                for solver in SOLVERS
-            ])
-    return (
-        markdown(["regime", "scenes", *REFINEMENTS], searches),
-        markdown(["regime", "detected", *SOLVERS], solutions),
-    )
+def print_rows(name, result):
+    """Print the rows of a regime: one for each value of its other treatment axes."""
+    pipeline, values = result.pipeline, result.values
+    made = pipeline.experiment
+    for searched, of_refinement in groups(
+            pipeline, Stage.detection, "cornerRefinementMethod", made.detectors).items():
+        d = of_refinement[REFINEMENT]
+        detected = values["detection"][d] == DetectionStatus.detected
+        for solved, of_solver in groups(
+                pipeline, Stage.estimation, "solver", made.estimators).items():
+            row(", ".join((name, *searched, *solved)), detected.sum(), *(
+                solver_cell(detected, *(values[variable][d, of_solver[solver]] for variable in (
+                    "estimate", "rotation_error_deg", "flipped")))
+                for solver in SOLVERS))
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("files", nargs="*", type=Path, default=FILES, metavar="FILE")
-    # A crash must be told, though the error output is caught by then.
-    faulthandler.enable(os.dup(sys.stderr.fileno()))
-    results, broken = [], []
-    for path in parser.parse_args().files:
-        print(path.stem, end="", file=sys.stderr, flush=True)
-        start = time.perf_counter()
+    broken, counts = [], np.zeros(3, dtype=int)
+    print(f"Median / worst rotation error in degrees of what is solved from {REFINEMENT} corners,\n"
+          "and the shares of the detected where the solver failed or chose the mirror:\n")
+    header("regime", "detected", *SOLVERS)
+    for path in FILES:
         result = measured(Pipeline.from_toml(path))
-        results.append((path.stem, result))
+        print_rows(path.stem, result)
         broken += [f"{path.stem}: {line}" for line in broken_promises(result)]
-        print(f": {time.perf_counter() - start:.1f} s", file=sys.stderr)
-    found, estimated = tables(results)
-    print("Share detected, and what became of most of the others:\n")
-    print("\n".join(found))
-    print(f"\nMedian / worst rotation error in degrees of what is solved from {REFINEMENT}\n"
-          "corners, and the shares of the detected where the solver failed or chose the mirror:\n")
-    print("\n".join(estimated))
-    counts = np.sum([
-        (result.scenes, result.values["detection"].size,
-         np.count_nonzero(result.values["estimate"] == EstimateStatus.solved))
-        for _, result in results
-    ], axis=0)
+        counts += (len(result.values["true_rvec"]), result.values["detection"].size,
+                   np.count_nonzero(result.values["estimate"] == EstimateStatus.solved))
     print("\n{:,} scenes, {:,} searches, {:,} poses solved: ".format(*counts)
           + (f"{len(broken)} promises broken:" if broken else "all finite, nothing raised, nothing "
              "printed."))
     print("\n".join(broken))
-    return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return int(bool(broken))

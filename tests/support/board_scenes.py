@@ -6,9 +6,8 @@ import numpy as np
 
 from support.exact_image import values
 from sweep.model.effects import NEUTRAL
-from sweep.model.exposure import marker_boxes, marker_exposure
+from sweep.model.exposure import marker_exposure
 from sweep.model.pose import angles_of_rotation
-from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
 
 
@@ -43,9 +42,3 @@ def levels_of(scenes, background, black, white):
     from the levels of the areas."""
     box = (0, 0, *scenes.frame[0].tolist())
     return marker_exposure(scenes, 0, box, np.array([background, black, white, 0.0]))
-
-
-def image_of_board(scenes):
-    """Return the image (height, width), with all effects."""
-    window = np.array([[0, 0, *scenes.frame[0].tolist()]])
-    return render_all(scenes, np.array([0]), marker_boxes(scenes), window)[0]

@@ -4,14 +4,10 @@ Which flag governs which number is declared with the variables (``Variable.prese
 beside which flags numbers exist with the flags (``Flag.present``).
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+import xarray as xr
 
-from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LOST, UNSEEN, VARIABLES, Variable
+from sweep.experiment.schema import LOST, UNSEEN, VARIABLES
 from sweep.measure.flags import (
     BoundStatus,
     DetectionStatus,
@@ -20,9 +16,6 @@ from sweep.measure.flags import (
     present_values,
 )
 from sweep.store.blocks import region
-from sweep.typing import Masks
-
-Values = Mapping[str, NDArray[Any]]
 
 
 def contradictions(store):
@@ -37,120 +30,66 @@ def contradictions(store):
     return [each for each in found if each]
 
 
-def contradiction(
-    pipeline: Pipeline, variables: Sequence[Variable], values: Values
-) -> str:
-    """Return the first contradiction within a block; empty if there is none.
+def contradiction(pipeline, variables, values):
+    """Return the first contradiction within a block's values by variable; empty for none."""
+    data = {v.name: xr.DataArray(values[v.name], dims=v.dimensions(pipeline)) for v in variables}
+    return next((f"{name}: {fault}" for name, fault in faults(pipeline, variables, data)), "")
 
-    Parameters
-    ----------
-    pipeline
-        The store's.
-    variables
-        The variables that the store has.
-    values
-        Those of a block by variable.
-    """
+
+def in_any(truth, dims):
+    """Return where ``truth`` holds in any configuration beyond ``dims``."""
+    return truth.any([dim for dim in truth.dims if dim not in dims])
+
+
+def faults(pipeline, variables, data):
+    """Yield names of variables, and how they contradict others."""
     for variable in variables:
         if variable.flags is not None:
-            unknown = ~np.isin(values[variable.name], [int(flag) for flag in variable.flags])
+            flags = data[variable.name].values
+            unknown = ~np.isin(flags, [int(flag) for flag in variable.flags])
             if unknown.any():
-                return f"{variable.name}: unknown flag {values[variable.name][unknown][0]}"
-    unneeded = values["detection"] == DetectionStatus.not_needed
-    if unneeded.any() and (fault := _not_needed_fault(pipeline, variables, values, unneeded)):
-        return fault
-    for variable in variables:
-        if fault := _number_fault(pipeline, variable, values):
-            return f"{variable.name}: {fault}"
-    return _flag_contradiction(pipeline, values)
-
-
-def _number_fault(pipeline: Pipeline, variable: Variable, values: Values) -> str:
-    """Return how a variable's numbers contradict the flag that governs them."""
-    rule = variable.present_when
-    if rule is None:
-        return ""
-    governing = VARIABLES[rule.flag]
-    if governing.flags is None:
-        raise AssertionError(rule)
-    numbers, flags = values[variable.name], values[rule.flag]
-    if rule.number in ("unless_lost", "if_seen"):
-        without = LOST if rule.number == "unless_lost" else UNSEEN
-        computed = _any_configuration(pipeline, governing, variable, ~np.isin(flags, without))
-        computed = computed.reshape(computed.shape + (1,) * len(variable.inner))
-        missing = ~np.isfinite(numbers) & computed
-        return "no number" if missing.any() else ""
-    present = _spread(
-        pipeline, governing, np.isin(flags, present_values(governing.flags)), variable
-    )
-    if rule.number == "always" and (~np.isfinite(numbers) & present).any():
-        return f"no number although {rule.flag} says that there is one"
-    if (~np.isnan(numbers) & ~present).any():
-        return f"a number although {rule.flag} says that there is none"
-    return ""
-
-
-def _not_needed_fault(
-    pipeline: Pipeline, variables: Sequence[Variable], values: Values, unneeded: Masks
-) -> str:
-    """Return what contradicts that scenes were not needed: nothing of them may be there."""
-    detection = VARIABLES["detection"]
-    scenes = _any_configuration(pipeline, detection, VARIABLES["bound"], unneeded)
-    for variable in variables:
-        found = _spread(pipeline, VARIABLES["bound"], scenes, variable)
+                yield variable.name, f"unknown flag {flags[unknown][0]}"
+    scene = data["bound"].dims
+    detection, estimate, flipped = (data[name] for name in ("detection", "estimate", "flipped"))
+    unneeded = in_any(detection == DetectionStatus.not_needed, scene)
+    for variable in variables if unneeded.any() else ():
         if variable.flags is None:
-            if (found & ~np.isnan(values[variable.name])).any():
-                return f"{variable.name}: a number of a scene that was not needed"
-        elif ((values[variable.name] == variable.not_needed) != found).any():
-            return f"{variable.name}: contradicts that scenes were not needed"
-    return ""
-
-
-def _flag_contradiction(pipeline: Pipeline, values: Values) -> str:
-    """Return how the flags of different stages contradict each other."""
-    detection, estimate = VARIABLES["detection"], VARIABLES["estimate"]
-    needed = values["estimate"] != EstimateStatus.not_needed
-    solved = values["estimate"] == EstimateStatus.solved
-    flipped_exists = np.isin(values["flipped"], present_values(Flipped))
-    no_estimate = values["flipped"] == Flipped.no_estimate
-    if ((flipped_exists != solved) | (needed & (no_estimate == solved))).any():
-        return "flipped: contradicts estimate"
-    detected = _spread(
-        pipeline, detection,
-        np.isin(values["detection"], present_values(DetectionStatus)), estimate,
-    )
-    if (np.isin(values["estimate"], present_values(EstimateStatus)) & ~detected).any():
-        return "estimate: a pose although nothing was detected"
-    if (needed & ((values["estimate"] == EstimateStatus.no_detection) == detected)).any():
-        return "estimate: contradicts detection"
-    if (values["detection"] == DetectionStatus.not_run).any():
-        return "detection: not run"
-    computed = _any_configuration(
-        pipeline, detection, VARIABLES["bound"], ~np.isin(values["detection"], LOST)
-    )
+            if (unneeded & data[variable.name].notnull()).any():
+                yield variable.name, "a number of a scene that was not needed"
+        elif ((data[variable.name] == variable.not_needed) != unneeded).any():
+            yield variable.name, "contradicts that scenes were not needed"
+    for variable in variables:
+        if variable.present_when is not None:
+            yield from number_faults(variable, data)
+    needed, solved = estimate != EstimateStatus.not_needed, estimate == EstimateStatus.solved
+    no_estimate = flipped == Flipped.no_estimate
+    if ((flipped.isin(present_values(Flipped)) != solved)
+            | (needed & (no_estimate == solved))).any():
+        yield "flipped", "contradicts estimate"
+    detected = detection.isin(present_values(DetectionStatus))
+    if (estimate.isin(present_values(EstimateStatus)) & ~detected).any():
+        yield "estimate", "a pose although nothing was detected"
+    if (needed & ((estimate == EstimateStatus.no_detection) == detected)).any():
+        yield "estimate", "contradicts detection"
+    if (detection == DetectionStatus.not_run).any():
+        yield "detection", "not run"
+    computed = in_any(~detection.isin(LOST), scene)
     demanded = pipeline.fixed.get("bound", "none") != "none"
-    if demanded and ((values["bound"] == BoundStatus.not_run) & computed).any():
-        return "bound: not run"
-    return ""
+    if demanded and ((data["bound"] == BoundStatus.not_run) & computed).any():
+        yield "bound", "not run"
 
 
-def _spread(
-    pipeline: Pipeline, variable: Variable, values: NDArray[Any], wanted: Variable
-) -> NDArray[Any]:
-    """Return values of one variable's dimensions, shaped to broadcast to those of another."""
-    names = variable.dimensions(pipeline)
-    return values.reshape([
-        values.shape[names.index(name)] if name in names else 1
-        for name in wanted.dimensions(pipeline)
-    ])
-
-
-def _any_configuration(
-    pipeline: Pipeline, variable: Variable, wanted: Variable, truth: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Return for each scene whether ``truth`` holds in any configuration."""
-    kept = wanted.dimensions(pipeline)
-    others = tuple(
-        k for k, name in enumerate(variable.dimensions(pipeline)) if name not in kept
-    )
-    return np.asarray(truth.any(axis=others))
+def number_faults(variable, data):
+    """Yield how a variable's numbers contradict the flag that governs them."""
+    rule, numbers = variable.present_when, data[variable.name]
+    flags, finite = data[rule.flag], np.isfinite(numbers)
+    if rule.number in ("unless_lost", "if_seen"):
+        lost = flags.isin(LOST if rule.number == "unless_lost" else UNSEEN)
+        if (~finite & in_any(~lost, numbers.dims)).any():
+            yield variable.name, "no number"
+        return
+    present = flags.isin(present_values(VARIABLES[rule.flag].flags))
+    if rule.number == "always" and (~finite & present).any():
+        yield variable.name, f"no number although {rule.flag} says that there is one"
+    if (numbers.notnull() & ~present).any():
+        yield variable.name, f"a number although {rule.flag} says that there is none"

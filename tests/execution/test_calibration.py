@@ -1,7 +1,6 @@
 """What scenes cost is measured within a limit, whatever they cost."""
 
 import math
-import time
 from unittest import mock
 
 import pytest
@@ -11,47 +10,29 @@ from sweep.execution.forecast import (
     BLOCK_S,
     BLOCKS_PER_S,
     MAX_BLOCKS,
+    UNMEASURED_S,
+    Timing,
     block_time_limit_s,
     blocks_of,
     demand_of,
-    measure,
     measured_or_assumed,
 )
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError
+from sweep.isolation.child_process import ChildDiedError
 
-HUGE = """
-[camera]
-width_px = 20000
-height_px = 20000
-fx_px = 20000
-[scene]
-renderer = "supersample-16"
-window = "full"
-noise_grey = 3
-[pose]
-jitter_px = 0.5
-[axes]
-side_px = [6000, 12000]
-trial = 50
-"""
+PIPELINE = Pipeline.from_text("[pose]\nside_px = 20\njitter_px = 0.5\n[axes]\ntrial = 50\n")
 
 
-@pytest.mark.evidence
-def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
-    pipeline = Pipeline.from_text(HUGE)
-    with Child("sweep.execution.forecast") as child:
-        began = time.monotonic()
-        timing = measure(child, pipeline, 0.2)
-    assert timing.over
-    assert time.monotonic() - began < 30  # half of it if the machine is idle
-    assert timing.scene_s >= 0.2
-    assert math.prod(blocks_of(pipeline, timing.scene_s, 2).extents) <= max(
-        BLOCK_S / timing.scene_s, 1)
-    dying = Here()
-    dying.call = mock.Mock(side_effect=ChildDiedError("SIGSEGV"))
-    assumed = measured_or_assumed(dying, pipeline, 1.0)
-    assert (assumed.sampled, assumed.over) == (0, False)
+@pytest.mark.parametrize(("error", "timing"), [
+    (ChildDiedError("time limit", timed_out=True), Timing(3.0, 1, over=True)),
+    (ChildDiedError("SIGSEGV"), Timing(UNMEASURED_S, 0)),
+])
+def test_scenes_that_take_too_long_or_crash_are_taken_for_slow_ones(error, timing):
+    child = Here()
+    child.call = mock.Mock(side_effect=error)
+    assert measured_or_assumed(child, PIPELINE, 3.0) == timing
+    blocks = blocks_of(PIPELINE, timing.scene_s, 2)
+    assert math.prod(blocks.extents) <= max(BLOCK_S / timing.scene_s, 1)
 
 
 @pytest.mark.parametrize(

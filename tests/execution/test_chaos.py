@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from support.clusters import CLIENT, Cluster, workers_below
-from support.commands import command, started
+from support.commands import command, pieces, started
 from support.here import calls_here
 from support.stores import by_hand, same
 from sweep.errors import StoreError
@@ -27,8 +27,6 @@ from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store
 
 SEED = 20_261
-
-INSTANTS = Path(__file__).parents[1] / "support" / "poisoned" / "instants.py"
 
 GRID = """
 title = "A grid of many small blocks"
@@ -191,19 +189,6 @@ def test_kills_at_random_instants_change_no_bit_and_lose_no_block(text, kills, c
 
 SMALL = (GRID % 10).replace("[0.2, 0.3, 0.4]", "[0.2, 0.3, 0.4, 0.5]")
 """80 scenes: as blocks of one scene they are more than the instants within a block."""
-
-
-@contextlib.contextmanager
-def pieces(work, url, file, signal_name="SIGKILL", step=1):
-    """Run pieces of work that each meet a signal an instant later; give how many met it."""
-    with started(
-        ["-W", "ignore", INSTANTS, work, url, file, signal_name, step],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as running:
-        line = running.stdout.readline()
-        assert line, running.stderr.read()
-        assert int(line) > 2
-        yield running, int(line)
 
 
 @pytest.fixture(scope="module")

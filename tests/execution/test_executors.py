@@ -1,15 +1,23 @@
 """Processes that compute blocks: children of this machine, and workers of the caller's cluster."""
 
+import copy
+import logging
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from unittest import mock
 
+import cv2
+import dask
+import numba
+import numpy as np
 import psutil
 import pytest
-from distributed import Client
+import zarr
+from distributed import Client, default_client
 
 from support.clusters import local_cluster
 from support.commands import started
@@ -225,3 +233,46 @@ def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_
     assert (len(counts), sum(counts.values())) == (2, len(open_store(store.url).blocks))
     assert sum("no IPP" in name for name in counts) == 1
     assert any(warning.startswith("processors with 2") for warning in summary.warnings)
+
+
+def settings():
+    """Return what a caller may have set up in its process and its libraries."""
+    loggers = {name: logger for name, logger in logging.Logger.manager.loggerDict.items()
+               if isinstance(logger, logging.Logger)}
+    return {
+        "dask": copy.deepcopy(dask.config.config),
+        "zarr": copy.deepcopy(zarr.config.config),
+        "opencv": {"threads": cv2.getNumThreads()},
+        "numba": {name: str(getattr(numba.config, name))
+                  for name in dir(numba.config) if name.isupper()},
+        "numpy": np.geterr(),
+        "logging": {name: (logger.level, logger.disabled, logger.propagate, list(logger.handlers))
+                    for name, logger in loggers.items()},
+        "signals": {number: signal.getsignal(number) for number in signal.valid_signals()},
+        # Dask notes the process that started workers in a variable of its own.
+        "environment": {key: value for key, value in os.environ.items()
+                        if key != "__DASK_PARENT_PID"},
+        "path": dict(enumerate(sys.path)),
+    }
+
+
+@pytest.mark.evidence
+def test_settings_of_the_caller_are_as_before_and_its_client_still_computes(tmp_path):
+    with (
+        dask.config.set({"distributed.admin.tick.interval": "700ms", "array.chunk-size": "7MiB"}),
+        zarr.config.set({"async.concurrency": 7}), np.errstate(under="warn"),
+        local_cluster() as cluster, Client(cluster) as client,
+    ):
+        for number, options in enumerate((
+            {"workers": 1}, {"client": client},
+            {"client": cluster}, {"scheduler": cluster.scheduler_address},
+        )):
+            before = settings()
+            summary = execute(PIPELINE, tmp_path / f"{number}.zarr", **options)
+            assert summary.computed_scenes == 12
+            after = settings()  # of what was imported since, there is more
+            for name, values in before.items():
+                assert {key: after[name].get(key) for key in values} == values, (options, name)
+        assert client.submit(sum, [1, 2, 3]).result(timeout=30) == 6
+        assert default_client() is client
+        assert len(cluster.workers) == 1

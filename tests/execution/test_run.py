@@ -14,14 +14,18 @@ import zarr
 import sweep
 from support.commands import started
 from support.stores import by_hand, same
-from sweep.errors import ArgumentError, MachineFaultError, StoreError
+from sweep.analysis import compare, detection_rate
+from sweep.errors import ArgumentError, DatasetError, MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
+from sweep.execution.reuse import match
 from sweep.execution.runner import execute
 from sweep.execution.status import status
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
+from sweep.store import provenance
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
+from sweep.store.provenance import builds
 
 TEXT = """
 title = "A small grid with every kind of axis"
@@ -113,41 +117,64 @@ def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
     assert open_store(url).pipeline.seed == 6
 
 
+ZIPPED = """[axes]
+distance_m = { geom = [0.2, 1.5, 4] }
+cornerRefinementMethod = ["none", "subpix"]
+how = { zip = { solver = ["iterative", "ippe_square"], guarded = [true, false] } }
+trial = 3
+[axes.view.zip]
+dictionary = ["DICT_5X5_50", "DICT_6X6_50", "DICT_4X4_50"]
+tilt_deg = [50, 0, 0]
+"""
+
 GROWN = {
-    "front": ["distance_m={values = [0.1, 0.2, 1.5]}"],
-    "trial": ["trial=5"],
-    "solver": ['solver=["p3p", "iterative", "ippe_square"]'],
-    "fixed": ["solver=iterative", "dictionary=DICT_5X5_50"],
-    "new axis": ["background=[128, 60]"],
+    "front": (TEXT, ["distance_m={values = [0.1, 0.2, 1.5]}"], 96),
+    "trial": (TEXT, ["trial=5"], 192),
+    "solver": (TEXT, ['solver=["p3p", "iterative", "ippe_square"]'], 192),
+    "fixed": (TEXT, ["solver=iterative", "dictionary=DICT_5X5_50"], 48),
+    "new axis": (TEXT, ["background=[128, 60]"], 192),
+    "zipped": (TEXT.partition("[axes]")[0] + ZIPPED, [], 48),
 }
-
-GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}
-"""Extents of blocks that cut each axis that grows."""
+"""Text of a pipeline, settings, and how many estimates it shares with the undisturbed store."""
 
 
-@pytest.mark.parametrize("settings", GROWN.values(), ids=GROWN)
-def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
-    grown = Pipeline.from_text(TEXT, settings, name="grown")
-    fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
-    extents = tuple(GROWN_EXTENTS[axis.name] for axis in grown.experiment.scene_axes)
+@pytest.mark.parametrize(("text", "settings", "shared"), GROWN.values(), ids=GROWN)
+def test_grown_grid_reuses_what_there_is_bit_for_bit(
+    text, settings, shared, pipeline, undisturbed, tmp_path
+):
+    grown = Pipeline.from_text(text, settings, name="grown")
+    fresh, reusing, back = (str(tmp_path / f"{name}.zarr") for name in ("fresh", "reusing", "back"))
+    cuts = {"distance_m": 3, "background": 1}
+    extents = tuple(min(len(axis), cuts.get(axis.name, 2))
+                    for axis in grown.experiment.scene_axes)
     by_hand(fresh, grown, extents)
     store = create_store(reusing, grown, extents)
-    computed = [
-        compute_block(reusing, store.run_id, block, (undisturbed,)).computed
-        for block in store.blocks
-    ]
+    computed = sum(compute_block(reusing, store.run_id, block, (undisturbed,)).computed["estimates"]
+                   for block in store.blocks)
     assert same(fresh, reusing)
-    with xr.open_zarr(undisturbed, consolidated=False) as old, xr.open_zarr(
-        reusing, consolidated=False
-    ) as new:
-        shared = 1
-        for name, size in new.estimate.sizes.items():
-            if name in old.estimate.dims:
-                shared *= int(np.isin(new[name].to_numpy(), old[name].to_numpy()).sum())
-            else:
-                shared *= min(size, 1)
-        total = new.estimate.size
-    assert sum(part["estimates"] for part in computed) == total - shared
+    total = int(np.prod([len(axis) for axis in grown.axes]))
+    assert computed == total - shared
+    store = create_store(back, pipeline, (2, 4, 2, 3))
+    receipt = compute_block(back, store.run_id, store.blocks[0], (fresh,))
+    assert receipt.computed["estimates"] == 192 - shared
+    assert same(back, undisturbed)
+
+
+def test_parameters_that_go_together_are_coordinates_and_pairs_are_not_mixed(tmp_path):
+    url = str(tmp_path / "zipped.zarr")
+    document = {"pose": {"jitter_px": 0.5, "distance_m": 0.4}, "axes": {
+        "lens": {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}}, "trial": 3}}
+    store = by_hand(url, Pipeline.from_dict(document))
+    results = sweep.open(url)
+    assert results["lens"].values.tolist() == ["600, 600", "800, 805"]
+    assert results["fy_px"].dims == ("lens",)
+    # Lenses are other scenes with draws of their own.
+    assert detection_rate(results).draws.item() == 2 * 3
+    with pytest.raises(DatasetError, match="not the same scenes"):
+        compare(results.isel(lens=0), results.isel(lens=1))
+    document["axes"]["lens"]["zip"]["fy_px"].reverse()
+    with pytest.raises(StoreError, match="lens: no values of fx_px, fy_px go together in both"):
+        match(Pipeline.from_dict(document), store)
 
 
 def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
@@ -219,6 +246,24 @@ def test_blocks_cover_the_grid_once():
         seen[block.starts[0] : block.stops[0], block.starts[1] : block.stops[1]] += 1
     assert (seen == 1).all()
     assert len(blocks) == 9
+
+
+def test_another_build_of_the_same_version_is_refused_by_run_reuse_and_workers(
+    pipeline, undisturbed, monkeypatch
+):
+    there = builds()
+    assert set(there) == {"opencv", "numpy", "numba", "llvmlite"}
+    assert there["opencv"].startswith(f"{cv2.__version__} ")
+    here = f"{cv2.__version__} 000000000000"
+    monkeypatch.setattr(provenance, "builds", lambda: {**there, "opencv": here})
+    store = open_store(undisturbed)
+    line = f"builds.opencv: the store has .?{there['opencv']}.?, this run .?{here}"
+    for refused in (lambda: execute(pipeline, undisturbed), lambda: match(pipeline, store)):
+        with pytest.raises(StoreError, match=line):
+            refused()
+    with pytest.raises(MachineFaultError, match=f"on a worker builds.opencv is {here}") as raised:
+        compute_block(undisturbed, store.run_id, store.blocks[0])
+    assert len(str(raised.value).splitlines()) == 1
 
 
 def test_nothing_is_overwritten_by_a_run_that_cannot_be(pipeline, tmp_path):

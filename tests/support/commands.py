@@ -5,6 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
+
+INSTANTS = Path(__file__).parent / "poisoned" / "instants.py"
 
 
 @contextlib.contextmanager
@@ -33,3 +36,16 @@ def command(*arguments, timeout=300, **options):
 def complaints(ran):
     """Return the lines of a run's standard error that are not progress, told on slow machines."""
     return [line for line in ran.stderr.splitlines() if not line.endswith(" poses")]
+
+
+@contextlib.contextmanager
+def pieces(work, url, file, signal_name="SIGKILL", step=1):
+    """Run pieces of work that each meet a signal an instant later; give how many met it."""
+    with started(
+        ["-W", "ignore", INSTANTS, work, url, file, signal_name, step],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as running:
+        line = running.stdout.readline()
+        assert line, running.stderr.read()
+        assert int(line) > 2
+        yield running, int(line)

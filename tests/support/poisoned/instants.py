@@ -22,8 +22,7 @@ import zarr.storage._local as local
 
 from sweep.evaluation.block import run_cells
 from sweep.execution.block_task import compute_block
-from sweep.execution.status import close
-from sweep.experiment.grid import Block
+from sweep.execution.status import close, drop_failed
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.provenance import fingerprint
@@ -40,6 +39,12 @@ def block(url, _, number):
 def closing(folder, _, number):
     """Close a copy of a complete store, as a run does."""
     close(open_store(shutil.copytree(f"{folder}/complete.zarr", f"{folder}/{number}.zarr"), "r+"))
+
+
+def dropping(folder, _, number):
+    """Drop the blocks with failed cells of a copy of a complete store."""
+    drop_failed(open_store(
+        shutil.copytree(f"{folder}/complete.zarr", f"{folder}/{number}.zarr"), "r+"))
 
 
 def creating(folder, file, number):
@@ -78,13 +83,13 @@ def fork(work, number, at, met):
 def main():
     name, url, file, met, step = sys.argv[1:]
     signal.alarm(PATIENCE_S)
-    work = {"block": block, "closing": closing, "creating": creating}[name]
+    work = {"block": block, "closing": closing, "creating": creating, "dropping": dropping}[name]
     # What a process does once is done here: compiled code is loaded, libraries are digested.
     pipeline = Pipeline.from_toml(file)
     fingerprint(pipeline)
     assert pipeline.facts.notes is not None
     xr.Dataset({"any": ("one", np.zeros(1, dtype="U1"))})
-    run_cells(pipeline.experiment, Block((0, 0, 0), (1, 1, 1)).indices())
+    run_cells(pipeline.experiment, pipeline.experiment.all_scenes.indices(np.arange(1)))
     stopped = []
     for number in itertools.count():
         pid = fork(lambda number: work(url, file, number), number, number * int(step),

@@ -11,6 +11,8 @@ from sweep.errors import SweepError
 from sweep.execution.forecast import Demand, FreeDisk, objections
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
+from sweep.store.lifecycle import open_store
+from sweep.store.lock import writing
 
 TEXT = """
 pose = { jitter_px = 0.5 }
@@ -72,6 +74,7 @@ def told(capsys, line):
         ("repro small.toml", "`sweep run small.toml` makes its store"),
         ("status small", "did you mean runs/small.zarr?"),
         ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
+        ("report runs/unfinished.zarr", "unfinished: 1 of 1 blocks; `sweep run` continues it"),
         ("verify small.toml", "not a sweep store, but a pipeline file"),
         ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
         ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
@@ -116,6 +119,16 @@ def test_every_command_ends_with_what_to_do_next(line, command, capsys):
     last = out.splitlines()[-1]
     assert last.partition("  #")[0] == f"next: {command}"
     assert cli.parser.build_parser()[0].parse_args(shlex.split(command)[1:]).command is not None
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_store_that_is_being_written_is_not_said_to_need_a_run(capsys):
+    url = "runs/unfinished.zarr"
+    with writing(url, open_store(url, "r+").storage):
+        _, out, _ = told(capsys, f"verify {url} --sample 0")
+        _, _, err = told(capsys, f"report {url}")
+    assert out.splitlines()[-1] == f"next: sweep status {url}"
+    assert err.endswith("it is being written: wait until it is finished\n")
 
 
 @pytest.mark.usefixtures("folder")

@@ -1,8 +1,8 @@
 """Poison: a scene that ends or stalls the process that computes it costs itself and no other."""
 
+import functools
 import json
 import re
-import time
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ import xarray as xr
 from support.commands import command, complaints
 from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
+from sweep.cli import main
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.pipeline import cell as cell_at
@@ -36,14 +37,8 @@ distance_m = [0.2, 0.3, 0.4]
 cornerRefinementMethod = ["none", "subpix"]
 tilt_deg = [10, 45]
 solver = ["ippe_square", "iterative"]
-trial = 20
+trial = 8
 """
-
-LIMIT_S = 40
-"""Time limit of the evidence: parts of it must do for a start on a busy machine."""
-
-EXTENTS = (1, 1, 20)
-"""Blocks of the short grid: block k has the scenes 20 k to 20 k + 19."""
 
 SUBPIX = (("cornerRefinementMethod", "subpix"),)
 ITERATIVE = (("solver", "iterative"),)
@@ -131,125 +126,87 @@ def numbers(reference, pipeline, poisons):
     }
 
 
-def see_status(url, pipeline, poisons):
+def see_status(url, pipeline, poisons, capsys):
     """Assert that ``sweep status`` names every crashed scene so that other commands take it."""
-    plain = command("status", url)
-    assert (plain.returncode, plain.stderr) == (0, "")
-    lines = [line for line in plain.stdout.splitlines() if line.split()[0] == "crashed"]
+    assert main(["status", url]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.split()[0] == "crashed"]
     told = [cell_at(pipeline, re.search(r"--at (\S+)", line)[1]) for line in lines]
     scenes = {tuple(one.axes[0].values[0] if axis.name == "trial" else one.fixed[axis.name]
                     for axis in pipeline.experiment.scene_axes) for one in told}
-    indices = [scene_index(pipeline, poison.cell) for poison in poisons if poison.deadly]
+    deadly = [poison for poison in poisons if poison.deadly]
+    indices = [scene_index(pipeline, poison.cell) for poison in deadly]
     assert scenes == {tuple(axis.values[index[axis.name]]
                             for axis in pipeline.experiment.scene_axes) for index in indices}
     ways = {"segv": "SIGSEGV", "abort": "SIGABRT", "ill": "SIGILL", "hold": "time limit"}
-    for poison in poisons:
-        if poison.deadly:
-            assert ways.get(poison.how, "") in "".join(lines)
+    assert all(ways.get(poison.how, "") in "".join(lines) for poison in deadly)
+
+
+POISONS = [
+    # First of a block; last of one; one that does not end anything between.
+    Poison(8, "scene", "segv"),
+    Poison(23, "detection", "abort", SUBPIX),
+    Poison(20, "detection", "raise", SUBPIX),
+    Poison(28, "estimation", "segv", (), ITERATIVE),
+]
+
+THOUSANDS = TEXT.replace("distance_m = [0.2, 0.3, 0.4]", "distance_m = { linspace = [0.2, 0.4, 5] }"
+                         ).replace("trial = 8", "trial = 1000")
+
+CASES = {
+    "end": (TEXT, POISONS, ()),
+    # It keeps the interpreter's lock, so that no other thread of its process can act.
+    "stall": (TEXT, [Poison(18, "detection", "hold", SUBPIX)], ("--time-limit", 16)),
+    "three of 10,000 in three ways": (THOUSANDS, [
+        Poison(123, "scene", "segv"), Poison(4_567, "detection", "abort", SUBPIX),
+        Poison(8_901, "estimation", "ill", (), ITERATIVE),
+    ], ()),
+    "first, middle and last of a block of 250": (THOUSANDS, [
+        Poison(2_000, "scene", "abort"), Poison(2_125, "scene", "exit"),
+        Poison(2_249, "estimation", "segv", (), ITERATIVE),
+    ], ()),
+    "an endless one of 10,000 beside a deadly one": (THOUSANDS, [
+        Poison(6_000, "scene", "hold"), Poison(6_001, "scene", "segv"),
+    ], ("--time-limit", 40)),
+}
+"""Name -> text of the pipeline, poisons, and options of the run."""
 
 
 @pytest.fixture(scope="module")
-def pipeline():
-    return Pipeline.from_text(TEXT, name="poisoned")
-
-
-@pytest.fixture(scope="module")
-def clean(pipeline, tmp_path_factory):
-    """The short grid's results without poison."""
-    url = str(tmp_path_factory.mktemp("clean") / "clean.zarr")
-    by_hand(url, pipeline)
-    with xr.open_zarr(url, consolidated=False) as opened:
-        loaded = opened.load()
-        assert (loaded.estimate == EstimateStatus.solved).all()
+def clean(tmp_path_factory):
+    """Return a function that gives the results of a text without poison, computed once."""
+    @functools.cache
+    def results(text):
+        url = str(tmp_path_factory.mktemp("clean") / "clean.zarr")
+        by_hand(url, Pipeline.from_text(text))
+        with xr.open_zarr(url, consolidated=False) as opened:
+            loaded = opened.load()
+        assert (loaded.estimate == EstimateStatus.solved).mean() > 0.99
         return loaded
 
+    return results
 
-def run_poisoned(tmp_path, text, poisons, *options, extents=EXTENTS):
-    """Run a pipeline, poisoned, in blocks; return the store, the answer, seconds and the notes."""
+
+@pytest.mark.parametrize("name", [
+    name if name == "end" else pytest.param(name, marks=pytest.mark.evidence) for name in CASES])
+def test_scenes_that_end_or_stall_their_process_are_found_and_no_other_is_touched(
+    name, clean, claim, tmp_path, capsys
+):
+    text, poisons, options = CASES[name]
+    pipeline, reference = Pipeline.from_text(text, name="poisoned"), clean(text)
     path, log, url = (tmp_path / name for name in ("poisoned.toml", "notes", "poisoned.zarr"))
     path.write_text(text)
-    create_store(str(url), Pipeline.from_text(text, name="poisoned"), extents)
-    begun = time.monotonic()
+    create_store(str(url), pipeline, (1, 1, 8 if text == TEXT else 250))
     ran = command("run", path, "--store", url, "--workers", 2, "--json", *options,
                   env=poisoned(poisons, log), cwd=tmp_path, timeout=900)
     assert (ran.returncode, complaints(ran)) == (0, [])
-    return str(url), json.loads(ran.stdout), time.monotonic() - begun, log
-
-
-def see_isolated(found, poisons, pipeline, reference):
-    """Assert that poisons acted, cost themselves alone, and ended children or workers alone."""
-    url, told, _, log = found
+    assert committed(open_store(str(url))) == set(range(len(open_store(str(url)).blocks)))
     assert differing(url, reference, pipeline, poisons) == {}
+    told = json.loads(ran.stdout)
     assert {flag: told[flag] for flag in ("crashed", "failed")} == numbers(
         reference, pipeline, poisons)
     asked, kinds = acted(log)
     assert asked == {(poison.cell, poison.stage) for poison in poisons}
     assert kinds <= {"child", "worker"}
-    see_status(url, pipeline, poisons)
-
-
-POISONS = [
-    # First of a block; last of one; one that does not end anything between.
-    Poison(20, "scene", "segv"),
-    Poison(59, "detection", "abort", SUBPIX),
-    Poison(50, "detection", "raise", SUBPIX),
-    Poison(70, "estimation", "segv", (), ITERATIVE),
-]
-
-# It keeps the interpreter's lock, so that no other thread of its process can act.
-ENDLESS = [Poison(47, "detection", "hold", SUBPIX)]
-
-
-@pytest.mark.parametrize(("poisons", "options"), [
-    (POISONS, ()),
-    pytest.param(ENDLESS, ("--time-limit", 16), marks=pytest.mark.evidence)], ids=["end", "stall"])
-def test_scenes_that_end_or_stall_their_process_are_found_and_no_other_is_touched(
-    poisons, options, pipeline, clean, tmp_path
-):
-    found = run_poisoned(tmp_path, TEXT, poisons, *options)
-    see_isolated(found, poisons, pipeline, clean)
-    assert committed(open_store(found[0])) == set(range(6))
-
-
-THOUSANDS = TEXT.replace("distance_m = [0.2, 0.3, 0.4]", "distance_m = { linspace = [0.2, 0.4, 5] }"
-                         ).replace("trial = 20", "trial = 1000")
-
-AMONG_THOUSANDS = {
-    "three in three ways": [
-        Poison(123, "scene", "segv"), Poison(4_567, "detection", "abort", SUBPIX),
-        Poison(8_901, "estimation", "ill", (), ITERATIVE),
-    ],
-    "first, middle and last of a block": [
-        Poison(2_000, "scene", "abort"), Poison(2_125, "scene", "exit"),
-        Poison(2_249, "estimation", "segv", (), ITERATIVE),
-    ],
-    "an endless one beside a deadly one": [
-        Poison(6_000, "scene", "hold"), Poison(6_001, "scene", "segv"),
-    ],
-}
-
-
-@pytest.fixture(scope="module")
-def thousands(tmp_path_factory):
-    """Ten thousand scenes without poison: pipeline, results, and seconds of the command."""
-    folder = tmp_path_factory.mktemp("thousands")
-    url, _, seconds, _ = run_poisoned(folder, THOUSANDS, [], extents=(1, 1, 250))
-    pipeline = Pipeline.from_text(THOUSANDS, name="poisoned")
-    assert pipeline.size(Stage.scene) == 10_000
-    with xr.open_zarr(url, consolidated=False) as opened:
-        return pipeline, opened.load(), seconds
-
-
-@pytest.mark.evidence
-@pytest.mark.parametrize("poisons", AMONG_THOUSANDS.values(), ids=AMONG_THOUSANDS)
-def test_poison_among_ten_thousand_scenes_costs_itself_alone(poisons, thousands, claim, tmp_path):
-    pipeline, reference, undisturbed_s = thousands
-    endless = any(poison.how == "hold" for poison in poisons)
-    limit = ("--time-limit", LIMIT_S) if endless else ()
-    found = run_poisoned(tmp_path, THOUSANDS, poisons, *limit, extents=(1, 1, 250))
-    see_isolated(found, poisons, pipeline, reference)
-    claim("other results of 10,000 scenes of which two or three end or stall their process",
+    see_status(str(url), pipeline, poisons, capsys)
+    claim("other results of 48 to 10,000 scenes of which some end or stall their process",
           "a run without them", 0.0, "bits differ")
-    if endless:
-        # Half as much again, and the start of a few processes: seconds are noisy here.
-        assert found[2] < undisturbed_s + 1.5 * LIMIT_S + 30.0

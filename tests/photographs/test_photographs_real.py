@@ -45,15 +45,20 @@ PUBLISHED = {
 }
 
 
+def results_of(name, folder, settings):
+    board = folder / "board.toml"
+    board.write_text(PUBLISHED[name][0])
+    return sweep.photos(
+        Path(FOLDER, name), camera="calibrate", board=board, store=folder / f"{name}.zarr",
+        settings=settings,
+    ).load()
+
+
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_opencvs_errors_are_those_that_were_published(name, tmp_path):
-    text, published = PUBLISHED[name]
-    board = tmp_path / "board.toml"
-    board.write_text(text)
-    results = sweep.photos(
-        Path(FOLDER, name), camera="calibrate", board=board, store=tmp_path / f"{name}.zarr",
-        settings=[f"cornerRefinementMethod={REFINEMENTS}".replace("'", '"')],
-    ).load()
+    published = PUBLISHED[name][1]
+    results = results_of(
+        name, tmp_path, [f"cornerRefinementMethod={REFINEMENTS}".replace("'", '"')])
     for refinement, (rotation_deg, flips, range_percent) in published.items():
         each = results.sel(cornerRefinementMethod=refinement)
         solved = (each.estimate == EstimateStatus.solved).values
@@ -73,12 +78,7 @@ PIXELS = ['solver=["ippe_square", "photometric_real"]', 'cornerRefinementMethod=
     ("charuco_480", 0.55, 12.0), ("charuco_1280_legacy", 0.7, 40.0),
 ])
 def test_poses_from_pixels_are_better_than_those_of_subpix(name, most, nees, tmp_path):
-    board = tmp_path / "board.toml"
-    board.write_text(PUBLISHED[name][0])
-    results = sweep.photos(
-        Path(FOLDER, name), camera="calibrate", board=board, store=tmp_path / f"{name}.zarr",
-        settings=PIXELS,
-    ).load()
+    results = results_of(name, tmp_path, PIXELS)
     results["range_error"] = (results.translation_error_m / results.true_tvec_m).isel(xyz=2)
     ours, theirs = (results.sel(solver=each) for each in ("photometric_real", "ippe_square"))
     solved = (ours.estimate == EstimateStatus.solved).values
@@ -86,11 +86,16 @@ def test_poses_from_pixels_are_better_than_those_of_subpix(name, most, nees, tmp
     errors = np.concatenate([ours.rotation_error_rad, ours.translation_error_m], axis=-1)
     near = solved & (turned < 10)
     std = np.hypot(ours.predicted_std.values[near], results.truth_std.values[near])
+    squares = ((errors[near] / std) ** 2).mean(axis=0)
+    rotation = np.median(turned[solved]) / np.median(theirs.rotation_error_deg.values[solved])
+    distance = np.sqrt((ours.range_error.values[solved] ** 2).mean()
+                       / (theirs.range_error.values[solved] ** 2).mean())
+    print(f"{name}: solved {solved.sum()}, rotation {rotation:.3f}, range {distance:.3f} of "
+          f"subpix's, squared errors over variances {np.round(squares, 1)}")
     assert solved.sum() >= 0.9 * (results.detection == DetectionStatus.detected).sum()
-    assert np.median(turned[solved]) <= most * np.median(theirs.rotation_error_deg.values[solved])
-    assert (ours.range_error.values[solved] ** 2).mean() <= 0.25 * (
-        theirs.range_error.values[solved] ** 2).mean()
-    assert ((errors[near] / std) ** 2).mean(axis=0).sum() < nees
+    assert rotation <= most
+    assert distance <= 0.5
+    assert squares.sum() < nees
 
 
 def test_poses_from_pixels_agree_between_both_cameras(tmp_path):
@@ -128,6 +133,8 @@ def test_poses_from_pixels_agree_between_both_cameras(tmp_path):
         ranges[solver] = np.sqrt(((shift[:, 2] / positions[1][:, 2]) ** 2).mean())
         if solver == "photometric_real":  # the cameras are almost parallel
             squares = (np.hstack([turned, shift]) ** 2 / sum(variances)).mean(axis=0)
+    print(f"grid: solved {solved.sum()}, left against right {medians}, largest {largest}, range "
+          f"{ranges}, squared differences over variances {np.round(squares, 1)}")
     assert solved.sum() >= 0.9 * detected.sum()
     assert medians["photometric_real"] <= 0.3 * medians["ippe_square"]
     assert largest["photometric_real"] < 10

@@ -1,6 +1,5 @@
 """The notebooks run, show their figures, and are stored with the outputs of their sources."""
 
-import asyncio
 import os
 import runpy
 from pathlib import Path
@@ -24,29 +23,6 @@ def read(name):
 
 def code_cells(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
-
-
-async def executed(notebook, runs, turn):
-    """Return a notebook after it ran in its folder, its stores in ``runs``."""
-    client = NotebookClient(notebook, timeout=TIMEOUT_S, kernel_name="python3",
-                            resources={"metadata": {"path": str(NOTEBOOKS)}})
-    async with turn:
-        return await client.async_execute(env=os.environ | {"SWEEP_RUNS": str(runs)})
-
-
-async def all_executed(folders):
-    """Run the notebooks two at a time: what starts up leaves processors idle."""
-    turn = asyncio.Semaphore(2)
-    running = [executed(read(name), runs, turn) for name, runs in folders.items()]
-    return await asyncio.gather(*running, return_exceptions=True)
-
-
-@pytest.fixture(scope="module")
-def outcomes(tmp_path_factory):
-    """Each notebook as it ran, or what it raised, and the folder of its stores."""
-    folders = {name: tmp_path_factory.mktemp(name) for name in FIGURES}
-    ended = asyncio.run(all_executed(folders))
-    return dict(zip(folders, zip(ended, folders.values(), strict=True), strict=True))
 
 
 def test_all_notebooks_are_known():
@@ -100,18 +76,13 @@ def printed(notebook, until):
 
 @pytest.mark.evidence
 @pytest.mark.parametrize("name", FIGURES)
-def test_notebook_runs_and_shows_its_figures(name, outcomes):
-    outcome, folder = outcomes[name]
-    if isinstance(outcome, Exception):
-        raise outcome
-    assert figures_of(outcome) == FIGURES[name]
-    assert list(folder.glob("*.zarr")), "stores go where SWEEP_RUNS says"
-
-
-@pytest.mark.evidence
-@pytest.mark.parametrize("name", FIGURES)
-def test_notebook_prints_again_what_is_stored(name, outcomes):
+def test_notebook_runs_shows_its_figures_and_prints_again_what_is_stored(name, tmp_path):
     """With the same versions and processor features; times are left out."""
-    outcome, _ = outcomes[name]
+    notebook = read(name)
+    client = NotebookClient(notebook, timeout=TIMEOUT_S, kernel_name="python3",
+                            resources={"metadata": {"path": str(NOTEBOOKS)}})
+    client.execute(env=os.environ | {"SWEEP_RUNS": str(tmp_path)})
+    assert figures_of(notebook) == FIGURES[name]
+    assert list(tmp_path.glob("*.zarr")), "stores go where SWEEP_RUNS says"
     until = COSTS.get(name)
-    assert printed(outcome, until) == printed(read(name), until)
+    assert printed(notebook, until) == printed(read(name), until)

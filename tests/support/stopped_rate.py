@@ -12,11 +12,6 @@ whether the others flip, so that given these numbers it is such a rate at other 
 holds for any ends holds for it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +19,6 @@ from scipy import signal, stats
 
 from sweep.analysis.estimator import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
-from sweep.typing import Floats, Integers, Masks
 
 NEGLIGIBLE = 1e-18
 """Probability of a point that is left out."""
@@ -33,65 +27,32 @@ FEW = 300
 """Terms up to which a sum of products is quicker than a Fourier transform."""
 
 
-class StoppedAt(NamedTuple):
-    """Points of the lattice at which sampling stops after one wave, and their probabilities."""
-
-    wave: int
-    successes: Integers
-    probability: Floats
-
-
 class RateProperties(NamedTuple):
-    """Properties of the estimate of a rate."""
+    """The probability that the interval holds the rate, the expectation of successes over draws
+    minus the rate, and the expected number of draws."""
 
     coverage: float
-    """Probability that the interval holds the rate."""
     bias: float
-    """Expectation of successes over draws, minus the rate."""
     draws: float
-    """Expected number of draws."""
 
 
-@dataclass(frozen=True)
 class StoppedRate:
-    """A rule of stopping: the wanted half-width, and the numbers of draws at the ends of waves.
+    """A rule of stopping: the wanted half-width, draws at the ends of waves, the promised level.
 
-    Attributes
-    ----------
-    half_width
-        Of the interval.
-    ends
-        Draws at the ends of waves, increasing.
-    level
-        That is promised; the interval's is `stopped_level` of it.
-
-    Examples
-    --------
-    >>> rule = StoppedRate(0.1, (50, 100))
-    >>> coverage, bias, draws = rule.at(0.5)
-    >>> round(coverage, 3), abs(bias) < 1e-9, round(draws)
-    (0.979, True, 100)
+    ``intervals``: low and high ends (n + 1,) of the interval of each number of successes, by wave;
+    ``stops``: masks (n + 1,) of the numbers at which sampling stops, by wave.
     """
 
-    half_width: float
-    ends: Sequence[int]
-    level: float = LEVEL
+    def __init__(self, half_width, ends, level=LEVEL):
+        def intervals(level):
+            return [clopper_pearson(np.arange(n + 1), n, stopped_level(level)) for n in ends]
 
-    @cached_property
-    def intervals(self) -> list[tuple[Floats, Floats]]:
-        """Low and high ends (n + 1,) of the interval of each number of successes, by wave."""
-        return [clopper_pearson(np.arange(n + 1), n, stopped_level(self.level))
-                for n in self.ends]
+        self.half_width, self.ends = half_width, ends
+        self.intervals = intervals(level)
+        self.stops = [(high - low) / 2.0 <= half_width for low, high in intervals(LEVEL)]
+        self.stops[-1] = np.ones_like(self.stops[-1])
 
-    @cached_property
-    def stops(self) -> list[Masks]:
-        """Numbers of successes (n + 1,) at which sampling stops, by wave."""
-        rule = [clopper_pearson(np.arange(n + 1), n, stopped_level(LEVEL)) for n in self.ends]
-        stops = [(high - low) / 2.0 <= self.half_width for low, high in rule]
-        stops[-1] = np.ones_like(stops[-1])
-        return stops
-
-    def critical_rates(self) -> Floats:
+    def critical_rates(self):
         """Return the ends of all intervals with which sampling can stop, inside (0, 1).
 
         Between two of them the coverage is a polynomial of the rate; it jumps at them, so that its
@@ -102,8 +63,8 @@ class StoppedRate:
             for end in interval])
         return np.unique(edges[(edges > 0.0) & (edges < 1.0)])
 
-    def stopped(self, rate: float) -> Iterator[StoppedAt]:
-        """Yield the points at which sampling stops, wave by wave, for a true rate."""
+    def stopped(self, rate):
+        """Yield (wave, successes, probabilities) of the points at which sampling stops."""
         probability, first, before = np.ones(1), 0, 0
         for wave, n in enumerate(self.ends):
             step, before = n - before, n
@@ -117,14 +78,14 @@ class StoppedRate:
             first += low
             successes = first + np.arange(len(probability))
             stop = self.stops[wave][successes]
-            yield StoppedAt(wave, successes[stop], probability[stop])
+            yield wave, successes[stop], probability[stop]
             going = np.nonzero(~stop & (probability > NEGLIGIBLE))[0]
             if not len(going):
                 return
             probability = np.where(stop, 0.0, probability)[going[0] : going[-1] + 1]
             first += int(going[0])
 
-    def at(self, rate: float) -> RateProperties:
+    def at(self, rate):
         """Return the properties at a true rate, from 0 to 1."""
         coverage = mean = draws = 0.0
         for wave, successes, probability in self.stopped(rate):

@@ -1,6 +1,5 @@
 """JPEG, demosaicing, and all effects of the camera's processing together: windows, extremes."""
 
-import itertools
 from functools import cache
 
 import cv2
@@ -38,7 +37,7 @@ def exact_levels():
 
 # JPEG.
 
-@pytest.mark.parametrize("quality", [1, 10, 50, 95, 100])
+@pytest.mark.parametrize("quality", [1, 50, 100])
 def test_jpeg_is_opencvs_encoder_on_the_whole_frame(quality):
     plain = image_of(["noise_grey=5"])
     done, code = cv2.imencode(".jpg", plain, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -89,35 +88,6 @@ def mosaic_of(levels, pattern, gains):
     return raw
 
 
-def bilinear_grey(raw, pattern):
-    """Mean of the nearest neighbours of each colour, inside the border; then grey."""
-    height, width = raw.shape
-    grey = np.full(raw.shape, np.nan)
-    for v, u in itertools.product(range(1, height - 1), range(1, width - 1)):
-        colours = {}
-        for colour in "RGB":
-            for reach in ([(0, 0)], [(0, 1), (0, -1), (1, 0), (-1, 0)],
-                          [(1, 1), (1, -1), (-1, 1), (-1, -1)]):
-                same = [
-                    float(raw[v + dv, u + du]) for dv, du in reach
-                    if pattern[2 * ((v + dv) % 2) + (u + du) % 2] == colour
-                ]
-                if same:
-                    colours[colour] = sum(same) / len(same)
-                    break
-        grey[v, u] = 0.299 * colours["R"] + 0.587 * colours["G"] + 0.114 * colours["B"]
-    return grey / 257
-
-
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_bilinear_demosaicing_is_the_mean_of_neighbours(pattern):
-    gains = {"R": 0.8, "G": 1.0, "B": 1.1}
-    expected = bilinear_grey(mosaic_of(exact_levels(), pattern, gains), pattern)[1:-1, 1:-1]
-    image = image_of([f"bayer={pattern}", "bayer_red=0.8", "bayer_blue=1.1"])
-    # Half a level of quantisation, and roundings of 16 bits.
-    assert np.abs(image[1:-1, 1:-1] - expected).max() <= 0.5 + 0.01
-
-
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("method", ["bilinear", "edge_aware"])
 def test_demosaicing_is_opencvs_on_the_whole_frame(pattern, method):
@@ -151,7 +121,7 @@ COMBINATIONS = {
 
 
 @pytest.mark.parametrize("name", COMBINATIONS)
-@lengths(2, 60)
+@lengths(2, 20)
 def test_window_has_the_pixels_of_the_whole_frame(count, name):
     rng = np.random.default_rng(12)
     for trial in range(count):
@@ -180,21 +150,14 @@ noise_grey = 2
 tone_toe = { uniform = [0.1, 0.5] }
 [axes]
 jpeg_quality = [0, 40]
-bayer = ["none", "RGGB"]
 noise_table = [[], [0, 2, 255, 1]]
-sharpening = [0, 0.5]
-trial = 2
 """
     pipeline = Pipeline.from_text(text)
-    indices = [index.ravel() for index in np.indices((2, 2, 2, 2, 2))]
-    cells = run_cells(pipeline, indices)
-    status = np.asarray(cells.columns["bound"][0])
-    assert (status == BoundStatus.not_in_model).all()
+    cells = run_cells(pipeline, [index.ravel() for index in np.indices((2, 2))])
+    assert (np.asarray(cells.columns["bound"][0]) == BoundStatus.not_in_model).all()
     reasons = {part.name: part.reason for part in pipeline.facts.parts if part.active}
     assert reasons["JPEG"] == "jpeg_quality is 40"
-    assert reasons["demosaicing"] == "bayer is RGGB"
     assert reasons["noise by level"] == "noise_table is [0.0, 2.0, 255.0, 1.0]"
-    assert reasons["sharpening"] == "sharpening is 0.5"
     assert "tone_toe is drawn" in reasons["toe"]
     assert "random draws" in reasons
 

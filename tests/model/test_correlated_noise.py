@@ -85,34 +85,13 @@ def corner(settings, background=120):
     return image[:, :190]
 
 
-def test_image_has_the_noise_and_its_correlation():
-    noise = corner(["noise_grey=12", "noise_correlation=0.6"]) - 120
-    # About 1 / sum of r² independent pixels each: 57,000 / 8 of them, by FAR standard deviations.
-    assert noise.std() == pytest.approx(math.sqrt(144 + 1 / 12), rel=FAR / math.sqrt(2 * 57000 / 8))
-    right = (noise[:, 1:] * noise[:, :-1]).mean() / noise.var()
-    down = (noise[1:] * noise[:-1]).mean() / noise.var()
-    # Rounding adds 1/12 of variance that is not correlated.
-    expected = 0.6 * 144 / (144 + 1 / 12)
-    assert right == pytest.approx(expected, abs=0.04)
-    assert down == pytest.approx(expected, abs=0.04)
-
-
 @pytest.mark.parametrize("table", [(0, 2.0, 255, 10.0), (60, 8.0, 120, 3.0, 200, 5.0), (9, 4.0)])
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
 def test_noise_over_the_level_is_the_table(table, correlation):
     settings = [f"noise_table={list(table)}", f"noise_correlation={correlation}"]
     for level in (45, 90, 120, 190, 230):
         noise = corner(settings if correlation else settings[:1], level) - level
-        levels, spreads = table[::2], table[1::2]
-        # Straight lines between the rows, written as the point that lies between them.
-        if level <= levels[0]:
-            spread = spreads[0]
-        elif level >= levels[-1]:
-            spread = spreads[-1]
-        else:
-            i = max(k for k in range(len(levels)) if levels[k] <= level)
-            t = (level - levels[i]) / (levels[i + 1] - levels[i])
-            spread = (1 - t) * spreads[i] + t * spreads[i + 1]
+        spread = np.interp(level, table[::2], table[1::2])
         pixels = noise.size / (6 if correlation else 1)
         # Clipping takes less than 1e-4 of a normal number's variance beyond 4 deviations.
         theory = math.sqrt(spread**2 + 1 / 12)

@@ -1,7 +1,6 @@
 """Blur, motion, rolling shutter, occlusion and light, against references written anew here.
 
-With ``-s`` each test prints a row: effect | reference | cases | worst error | tolerance, errors
-in grey levels before quantisation, over all pixels of the frame.
+Errors are grey levels before quantisation, over all pixels of the frame.
 """
 
 import dataclasses
@@ -15,10 +14,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
-from support.blocks import run_cells
 from support.exact_image import (
     LENSES,
-    add_part,
     modules_of,
     plane_of,
     values,
@@ -41,11 +38,6 @@ from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0
-
-
-def row(effect, reference, cases, worst, tolerance):
-    print(f"\n| {effect} | {reference} | {cases} | {worst:.2g} | {tolerance:g} |")
-    assert worst <= tolerance
 
 
 # Scenes, and the levels of a whole frame from the code under test.
@@ -191,17 +183,18 @@ in a pixel, and 6e-7 of the point spread lies beyond its reach; few pixels hold 
 worst errors. Measured 0.011 over the long form."""
 
 
-@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.7, 1.5, 5.0])
+@pytest.mark.parametrize("sigma", [0.1, 0.7, 5.0])
 @lengths(3, 40)
-def test_blur_is_the_gaussian_of_the_exact_marker(count, sigma):
+def test_blur_is_the_gaussian_of_the_exact_marker(count, sigma, claim):
     worst = max(
         np.abs(frame_of(value) - blurred(value, sigma)).max()
         for value in poses(count, 1, blur_px=sigma)
     )
-    row(f"blur {sigma} px", "scan lines by quadrature", count, worst, BLUR_TOLERANCE)
+    claim("blur of 0.1 to 5 px", "scan lines of the cells by quadrature", worst, "grey levels")
+    assert worst < BLUR_TOLERANCE
 
 
-def binned_gaussian(value, sigma, s):
+def binned_gaussian(value, sigma, s=16):
     """Blur the exact image at ``s`` times the resolution with SciPy; mean over s x s pixels."""
     width, height = value["width_px"], value["height_px"]
     pad = math.ceil(6 * sigma) + 1
@@ -215,19 +208,14 @@ def binned_gaussian(value, sigma, s):
     return inner.reshape(height, s, width, s).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("lens", first_of([None, *range(len(LENSES))], 2))
-@lengths(1, 5)
-def test_blur_is_scipys_filter_of_a_finer_image_also_through_a_lens(count, lens):
+@pytest.mark.parametrize("lens", first_of(LENSES, 1))
+def test_blur_through_a_lens_is_scipys_filter_of_a_finer_image(lens):
     # The finer image holds mean levels of its pixels, so an edge in one is off by up to half of
     # it: the reference converges as 1/s², and is off by a third of the 0.24 levels that s = 8 and
-    # 16 differ by. Measured, long form: 0.06 from the code.
-    given = {} if lens is None else {"distortion": LENSES[lens]}
-    worst = max(
-        np.abs(frame_of(value) - binned_gaussian(value, sigma, 16)).max()
-        for sigma in (0.3, 0.8, 2.0)
-        for value in poses(count, 3, max_tilt=60, blur_px=sigma, **given)
-    )
-    row(f"blur, lens {lens}", "gaussian_filter at s = 16", 3 * count, worst, 0.3)
+    # 16 differ by. Measured over five poses: 0.06 from the code.
+    for sigma in (0.3, 2.0):
+        (value,) = poses(1, 3, max_tilt=60, blur_px=sigma, distortion=lens)
+        assert np.abs(frame_of(value) - binned_gaussian(value, sigma)).max() < 0.3
 
 
 # Defocus: each pixel at the point spread of the marker's depth in its direction.
@@ -272,7 +260,7 @@ interpolation between spreads and 0.025 for each edge."""
 
 
 @lengths(4, 60)
-def test_defocus_is_each_pixels_own_gaussian(count):
+def test_defocus_is_each_pixels_own_gaussian(count, claim):
     rng = np.random.default_rng(5)
     worst = spread_error = 0.0
     for value in focused_poses(count, 5):
@@ -289,8 +277,9 @@ def test_defocus_is_each_pixels_own_gaussian(count):
             expected = through_spread(cells, value["background"], sharp, *at)[0, 0]
             worst = max(worst, abs(frame[v, u] - expected))
     # Double precision of numbers up to 100 px.
-    row("defocus: point spread, px", "image distances of a thin lens", count, spread_error, 1e-9)
-    row("defocus", "scan lines by quadrature", 12 * count, worst, DEFOCUS_TOLERANCE)
+    assert spread_error < 1e-9
+    claim("defocus", "scan lines by quadrature", worst, "grey levels")
+    assert worst < DEFOCUS_TOLERANCE
 
 
 # Motion: the mean of exact frames of a marker that is moved here.
@@ -359,57 +348,47 @@ def blurred_of(value, box, plane):
 
 MOVING = {
     # seed, kind, path, frames of the mean, then what else the poses have
-    "4 px": (6, "both", 4.0, 256, {}),
-    "12 px, linear": (6, "linear", 12.0, 256, {}),
     "through a lens": (8, "both", 6.0, 256, {"distortion": LENSES[0]}),
-    "blur of 0.3 px": (9, "both", 6.0, 256, {"blur_px": 0.3}),
-    "blur of 1.5 px": (9, "both", 6.0, 256, {"blur_px": 1.5}),
-    "rows of one instant, linear": (10, "linear", 15.0, 1, {"exposure_s": 0.0, "row_time_s": 1e-3}),
+    "blur of 0.3 px, a sheet": (9, "both", 6.0, 256, {"blur_px": 0.3, "occlusion": 0.3}),
     "rows of one instant": (10, "both", 15.0, 1, {"exposure_s": 0.0, "row_time_s": 1e-3}),
+    "rows and exposure": (11, "both", 6.0, 48, {"exposure_s": 0.02, "row_time_s": 1e-3}),
     "0.5 px, angular": (6, "angular", 0.5, 256, {}),
     "100 px": (7, "linear", 100.0, 2048, {}),
-    "rows and exposure": (11, "both", 6.0, 48, {"exposure_s": 0.02, "row_time_s": 1e-3}),
 }
 
 
-@pytest.mark.parametrize("name", first_of(MOVING, 7))
-@lengths(1, 10)
-def test_motion_is_the_mean_of_exact_frames(count, name):
+@pytest.mark.parametrize("name", first_of(MOVING, 3))
+@lengths(1, 4)
+def test_motion_is_the_mean_of_exact_frames(count, name, claim):
     seed, kind, path_px, frames, given = MOVING[name]
     frame = blurred_of if "blur_px" in given else sharp_of
     worst = max(
         np.abs(frame_of(value) - mean_of_frames(value, frames, frame)).max()
         for value in moving_poses(count, seed, kind, path_px, **given)
     )
+    claim("motion blur, 0.5 to 100 px", "mean of 48 to 2,048 exact frames", worst, "grey levels")
     # Of one instant both are exact images of the same planes, built two ways: rounding only.
-    row(f"motion, {name}", f"mean of {frames} exact frames", count, worst,
-        1e-9 if frames == 1 else MOTION_TOLERANCE)
+    assert worst < (1e-9 if frames == 1 else MOTION_TOLERANCE)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("turns", [0.25, 1, 8, 32, 64, 1000])
+@pytest.mark.parametrize("turns", first_of([8, 1000], 1))
 def test_marker_that_spins_is_the_mean_of_its_frames_however_fast(turns):
     # Over whole turns the mean does not depend on how many. 720 frames a turn: a corner at 21 px
     # moves 0.19 px between two, as above.
     value = scene(roll_deg=20.0, exposure_s=1.0, rotation_z_deg_s=360.0 * turns, side_px=30.0)
-    once = value | {"rotation_z_deg_s": 360.0 * min(turns, 1)}
-    worst = np.abs(frame_of(value) - mean_of_frames(once, 720)).max()
-    row(f"motion, {turns} turns", "mean of 720 exact frames", 1, worst, MOTION_TOLERANCE)
+    once = value | {"rotation_z_deg_s": 360.0}
+    assert np.abs(frame_of(value) - mean_of_frames(once, 720)).max() < MOTION_TOLERANCE
 
 
 # What a marker touches lies in its box.
 
 BOXED = {
-    "blur": {"blur_px": 3.0},
-    "fast": {"velocity_x_m_s": 2.0, "velocity_y_m_s": 0.7, "exposure_s": 0.1},
-    "coming nearer": {"velocity_z_m_s": -2.0, "exposure_s": 0.1},
+    "blurred and coming nearer": {"blur_px": 3.0, "velocity_z_m_s": -2.0, "exposure_s": 0.1},
     "spinning": {"rotation_z_deg_s": 720.0, "rotation_y_deg_s": 300.0, "exposure_s": 0.3},
-    "rolling": {"velocity_x_m_s": 3.0, "velocity_y_m_s": -1.0, "row_time_s": 1e-3},
     "rolling and blurred": {
         "velocity_x_m_s": 3.0, "rotation_z_deg_s": 2000.0, "row_time_s": 1e-3,
         "exposure_s": 0.02, "blur_px": 1.0,
     },
-    "out of focus": {"aperture_mm": 30.0, "focus_distance_m": 0.5},
     "far out of focus": {"aperture_mm": 30.0, "focus_distance_m": 0.1},
     "a wide opening before a steep marker": {
         "aperture_mm": 100.0, "focus_distance_m": 0.3, "tilt_deg": 75.0, "side_px": 24.0,
@@ -425,9 +404,8 @@ BOXED = {
 
 @pytest.mark.parametrize("name", BOXED)
 @pytest.mark.parametrize("lens", [(), LENSES[0]])
-@lengths(2, 20)
+@lengths(2, 12)
 def test_all_that_an_exposed_marker_touches_lies_in_its_box(count, name, lens):
-    worst = 0.0
     given = {"distortion": lens, "max_tilt": 70} | BOXED[name]
     for value in poses(count, 12, sides=(8, 24), **given):
         if not_modelled(build_scenes(value, 1))[0]:
@@ -435,159 +413,47 @@ def test_all_that_an_exposed_marker_touches_lies_in_its_box(count, name, lens):
         left, top, right, bottom = marker_boxes(build_scenes(value, 1))[0].tolist()
         beyond = np.abs(exposure_of(value, whole(value)) - value["background"])
         beyond[top:bottom, left:right] = 0
-        worst = max(worst, beyond.max())
-    # 6e-7 of the point spread lie beyond its reach: 1.5e-4 levels. Right of a blurred marker the
-    # errors of its edges' quadratures add up, in the whole frame as in the box.
-    row(f"box, {name}", "whole frame", count, worst, BLUR_TOLERANCE)
+        # 6e-7 of the point spread lie beyond its reach: 1.5e-4 levels. Right of a blurred marker
+        # the errors of its edges' quadratures add up, in the whole frame as in the box.
+        assert beyond.max() < BLUR_TOLERANCE
 
 
 @pytest.mark.parametrize("given", [
     {"velocity_z_m_s": -1.0, "exposure_s": 1.0},  # it comes behind the camera
-    {"velocity_z_m_s": -100.0, "row_time_s": 1e-3},
-    {"velocity_z_m_s": 1.0, "exposure_s": 1.0},
-    {"rotation_x_deg_s": 180.0, "exposure_s": 1.0, "side_px": 150.0},
     {"rotation_x_deg_s": 360.0, "exposure_s": 1.0},  # it shows its back, which would take light
-    {"rotation_y_deg_s": 100.0, "exposure_s": 1.0, "tilt_deg": 60.0, "azimuth_deg": 90.0},
     {"rotation_x_deg_s": 20_000.0, "row_time_s": 1e-3},
     {"rotation_y_deg_s": 1e9, "exposure_s": 1e6},
-    *({"distortion": (-0.3, 0.0, 0.0, 0.0), "velocity_x_m_s": velocity, "exposure_s": 1.0}
-      for velocity in (3.0, 1e3)),  # it goes where the lens folds
+    # It goes where the lens folds.
+    {"distortion": (-0.3, 0.0, 0.0, 0.0), "velocity_x_m_s": 3.0, "exposure_s": 1.0},
 ], ids=str)
 def test_motion_that_has_no_image_is_not_modelled(given):
     scenes = build_scenes(scene(background=100.0, **given), 1)
     assert not_modelled(scenes)[0]
     assert visibility_flags(scenes).tolist() == [DetectionStatus.not_modelled]
-
-
-def test_slow_motion_is_modelled():
-    assert not not_modelled(build_scenes(scene(velocity_z_m_s=-0.1, exposure_s=1.0), 1))[0]
-
-
-# Occlusion: the cells and the sheet clipped in the marker's own plane.
-
-def half_plane(polygon, inside):
-    """Clip a polygon (M, 2) to where ``inside`` (a linear function of a point) is not negative."""
-    found = []
-    for i, point in enumerate(polygon):
-        before = polygon[i - 1]
-        a, b = inside(before), inside(point)
-        if (a >= 0) != (b >= 0):
-            found.append(before + a / (a - b) * (point - before))
-        if b >= 0:
-            found.append(point)
-    return found
-
-
-def occluded_image(value):
-    """Levels of the whole frame, each part of a cell and the sheet clipped to every pixel."""
-    width, height = value["width_px"], value["height_px"]
-    white = modules_of(value)
-    n, quiet = len(white) - 2, value["quiet_zone_modules"]
-    lines = [-quiet, *range(n + 1), n + quiet]
-    angle = math.radians(value["occlusion_deg"])
-    right, up = math.cos(angle), math.sin(angle)
-    extent = n * (abs(right) + abs(up))
-
-    def covered(point):
-        return (point[0] - n / 2) * right - (point[1] - n / 2) * up - extent * (
-            0.5 - value["occlusion"]
-        )
-
-    def rectangle(a, b, c, d):
-        return [np.array(point, dtype=float) for point in ((a, b), (c, b), (c, d), (a, d))]
-
-    parts = [
-        (half_plane(rectangle(lines[j], lines[i], lines[j + 1], lines[i + 1]),
-                    lambda p: -covered(p)),
-         value["white" if white[i, j] else "black"])
-        for i, j in np.ndindex(white.shape)
-    ]
-    sheet = half_plane(rectangle(lines[0], lines[0], lines[-1], lines[-1]), covered)
-    parts.append((sheet, value["occluder"]))
-
-    levels, share = np.zeros((height, width)), np.zeros((height, width))
-    view = np.array([
-        [value["fx_px"], 0, (width - 1) / 2], [0, value["fx_px"], (height - 1) / 2], [0, 0, 1],
-    ])
-    plane = view @ plane_of(value).astype(np.float64)
-    for part, level in parts:
-        add_part(levels, share, [plane @ [*point, 1.0] for point in part], level)
-    return levels + (1 - share) * value["background"]
-
-
-def occluded_poses(count, seed, **given):
-    rng = np.random.default_rng(seed)
-    return [
-        value | {
-            "occlusion": float(rng.choice([1e-12, 1e-3, 0.1, 0.5, 0.9, 1.0])),
-            "occlusion_deg": float(rng.choice([0, 90, 45, -135, rng.uniform(-360, 360)])),
-            "occluder": float(rng.integers(256)),
-        } for value in poses(count, seed, **given)
-    ]
-
-
-@lengths(20, 400)
-def test_occluded_marker_is_its_clipped_parts_and_the_sheet(count):
-    worst = max(
-        np.abs(frame_of(value) - occluded_image(value)).max()
-        for value in occluded_poses(count, 13)
-    )
-    # As the exact image without a sheet: sums of few terms, each off by about 1e-13 px.
-    row("occlusion", "polygon clipping", count, worst, 255e-9)
-
-
-@lengths(3, 40)
-def test_occluded_marker_is_blurred_and_moved_with_its_sheet(count):
-    worst = 0.0
-    for value in occluded_poses(count, 14, blur_px=1.0):
-        scenes = build_scenes(value, 1)
-        s, pad = 8, 7
-        fine = value | {
-            "width_px": s * (WIDTH + 2 * pad), "height_px": s * (HEIGHT + 2 * pad),
-            "fx_px": s * FOCAL,
-        }
-        image = gaussian_filter(occluded_image(fine), s, mode="nearest", truncate=6.0)
-        inner = image[s * pad : -s * pad, s * pad : -s * pad]
-        expected = inner.reshape(HEIGHT, s, WIDTH, s).mean(axis=(1, 3))
-        assert scenes.effects.active[0]
-        worst = max(worst, np.abs(frame_of(value) - expected).max())
-    # An edge within a finer pixel is off by up to half of it, as above.
-    row("occlusion and blur", "gaussian_filter of clipped polygons, s = 8", count, worst, 0.6)
-    values_ = moving_poses(count, 15, "both", 6.0)
-    worst = 0.0
-    for value in values_:
-        hidden = value | {"occlusion": 1.0, "occluder": value["black"]}
-        square = value | {"white": value["black"]}
-        if value["quiet_zone_modules"] == 0:
-            # A sheet over all of a marker that has no quiet zone is a square of one level.
-            worst = max(worst, np.abs(frame_of(hidden) - mean_of_frames(square, 256)).max())
-    row("occlusion and motion", "mean of 256 exact frames", count, worst, MOTION_TOLERANCE)
+    slow = build_scenes(scene(velocity_z_m_s=-0.1, exposure_s=1.0), 1)
+    assert not not_modelled(slow)[0]
 
 
 # Light.
 
-def test_uneven_light_and_vignetting_are_their_closed_forms():
+@pytest.mark.parametrize(("gradient", "degrees", "power"), [
+    (0.5, 0, 0), (-1.5, 30, 0), (2, 200, 0), (0, 0, 4), (0, 0, 100), (0.3, 70, 4),
+])
+def test_uneven_light_and_vignetting_are_their_closed_forms(gradient, degrees, power):
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(float)
-    worst = cases = 0
-    for gradient, degrees, power in (
-        (0.5, 0, 0), (0.5, 90, 0), (-1.5, 30, 0), (2, 200, 0), (0, 0, 4), (0, 0, 100), (0.3, 70, 4),
-    ):
-        value = scene(
-            illumination_gradient=float(gradient), illumination_deg=float(degrees), gain=0.9,
-            vignetting=float(power), background=120.0, cx_px=20.0, cy_px=30.5, fy_px=95.0,
-        )
-        sharp = sharp_of(value, whole(value))
-        angle = math.radians(degrees)
-        x, y = (u - (WIDTH - 1) / 2) / WIDTH, (v - (HEIGHT - 1) / 2) / WIDTH
-        light = np.maximum(1 + gradient * (x * math.cos(angle) + y * math.sin(angle)), 0)
-        ray = np.stack([(u - 20.0) / FOCAL, (v - 30.5) / 95.0, np.ones_like(u)])
-        light *= (1 / np.linalg.norm(ray, axis=0)) ** power
-        expected = np.clip(np.floor(0.9 * light * sharp + 0.5), 0, 255)
-        found = image_of(value).astype(float)
-        undecided = np.abs(0.9 * light * sharp % 1 - 0.5) < 1e-6
-        worst = max(worst, np.abs(found - expected)[~undecided].max())
-        cases += 1
-    row("light and vignetting", "closed form, quantised", cases, worst, 0)
+    value = scene(
+        illumination_gradient=float(gradient), illumination_deg=float(degrees), gain=0.9,
+        vignetting=float(power), background=120.0, cx_px=20.0, cy_px=30.5, fy_px=95.0,
+    )
+    angle = math.radians(degrees)
+    x, y = (u - (WIDTH - 1) / 2) / WIDTH, (v - (HEIGHT - 1) / 2) / WIDTH
+    light = np.maximum(1 + gradient * (x * math.cos(angle) + y * math.sin(angle)), 0)
+    ray = np.stack([(u - 20.0) / FOCAL, (v - 30.5) / 95.0, np.ones_like(u)])
+    light *= (1 / np.linalg.norm(ray, axis=0)) ** power
+    levels = 0.9 * light * sharp_of(value, whole(value))
+    decided = np.abs(levels % 1 - 0.5) > 1e-6
+    expected = np.clip(np.floor(levels + 0.5), 0, 255)
+    assert np.array_equal(image_of(value)[decided], expected[decided])
 
 
 # Absent effects.
@@ -644,30 +510,22 @@ def test_neutral_entry_of_an_axis_is_the_image_without_it_bit_for_bit(axis, neut
 
 EXTREMES = {
     "blur of 1000 px": {"blur_px": 1000.0},
-    "blur of 1e-9 px": {"blur_px": 1e-9},
     "blur of a marker far larger than the frame": {"blur_px": 0.01, "side_px": 1e5},
     "velocity of 1e9 m/s": {"velocity_x_m_s": 1e9, "exposure_s": 1.0},
-    "exposure of 1e6 s": {"velocity_x_m_s": 1e-3, "exposure_s": 1e6},
     "spin of 1e9 degrees a second for 1e6 s": {"rotation_z_deg_s": 1e9, "exposure_s": 1e6},
     "all velocities, slow rows": {
         "velocity_x_m_s": 1e9, "rotation_z_deg_s": 1e9, "row_time_s": 1e6, "exposure_s": 1e6,
     },
     "an opening of 1 km, focused at 1 nm": {"aperture_mm": 1e6, "focus_distance_m": 1e-9},
-    "an opening of 1 km, tilted": {"aperture_mm": 1e6, "focus_distance_m": 0.3, "tilt_deg": 80.0},
     "an opening of 1e-6 mm, focused far off": {
         "aperture_mm": 1e-6, "focus_distance_m": 1e299, "tilt_deg": 80.0,
     },
-    "vignetting of 100": {"vignetting": 100.0, "fx_px": 0.1},
-    "light that falls twice across the frame": {"illumination_gradient": -2.0},
-    "a sheet over all of it": {"occlusion": 1.0, "blur_px": 2.0},
+    "light that falls twice across the frame": {"illumination_gradient": -2.0, "vignetting": 100.0},
     "a sheet of 1e-15 of it": {"occlusion": 1e-15, "blur_px": 2.0},
     "a marker of 0.01 px, moving": {"side_px": 0.01, "velocity_x_m_s": 1.0, "exposure_s": 1.0},
     "a frame of one pixel, moving": {
         "width_px": 1, "height_px": 1, "velocity_y_m_s": 1.0, "exposure_s": 0.1, "row_time_s": 1.0,
-    },
-    "a frame of 8 x 8 pixels": {
-        "width_px": 8, "height_px": 8, "blur_px": 1000.0, "velocity_x_m_s": 1.0,
-        "exposure_s": 1.0, "row_time_s": 1.0,
+        "blur_px": 100.0,
     },
 }
 
@@ -683,29 +541,3 @@ def test_extreme_ends_within_seconds_without_a_warning(name):
     assert min(levels) - 0.1 < frame.min() <= frame.max() < max(levels) + 0.1
     # Two images; "within seconds", on a slow core.
     assert time.process_time() - begun < 5
-
-
-def test_scene_does_not_depend_on_the_others_of_its_block():
-    """Also where a sheet is on the marker in some: the quiet zone is drawn for those alone."""
-    text = """
-seed = 3
-[marker]
-size_m = 0.02
-quiet_zone_modules = 4
-[pose]
-distance_m = 0.02
-[scene]
-background = 255
-[axes]
-tilt_deg = [0, 70, 80]
-occlusion = [0, 0.3]
-noise_grey = [0, 2]
-blur_px = [0, 0.8]
-"""
-    pipeline = Pipeline.from_text(text)
-    indices = [grid.ravel() for grid in np.indices([3, 2, 2, 2])]
-    together = run_cells(pipeline, indices).columns
-    for k in range(len(indices[0])):
-        alone = run_cells(pipeline, [index[k : k + 1] for index in indices]).columns
-        for name, (column,) in alone.items():
-            np.testing.assert_array_equal(column[0], together[name][0][k], err_msg=name)

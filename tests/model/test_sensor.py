@@ -1,8 +1,10 @@
 """Noise, its statistics and what it depends on; quantisation.
 
 Every draw is seeded. Statistical tests pass a correct sensor with a probability of 1 - 1e-6 or
-more each. With ``-s`` a row: effect | reference | cases | worst error | tolerance.
+more each.
 """
+
+import itertools
 
 import numba
 import numpy as np
@@ -19,11 +21,6 @@ from sweep.model.scene import build_scenes
 UNLIKELY = 1e-6
 FAR = 5.5
 """Standard deviations that a normal number exceeds with a probability of 4e-8."""
-
-
-def row(effect, reference, cases, worst, tolerance):
-    print(f"\n| {effect} | {reference} | {cases} | {worst:.2g} | {tolerance:g} |")
-    assert worst <= tolerance
 
 
 # A frame of one level: its marker is 8 px in the middle, and left out.
@@ -80,9 +77,9 @@ def chi_square(counts, probabilities, total):
 # What a pixel of a level is: the distribution, and the settings that make it.
 LEVELS = [
     *((mean, f"noise_grey={noise}", stats.norm(mean, noise)) for mean, noise in (
-        (128, 1), (100.25, 5), (127.5, 40), (3, 20), (200, 90))),
+        (100.25, 5), (3, 20), (200, 90))),
     *((mean, "full_well_e=255", stats.poisson(mean)) for mean in (
-        0.1, 1.0, 5.0, 9.99, 10.0, 30.0, 100.0, 200.0)),  # an electron is a level
+        0.1, 1.0, 9.99, 10.0, 200.0)),  # an electron is a level
 ]
 
 
@@ -92,45 +89,31 @@ def test_noise_is_normal_or_poisson_rounded_and_clipped(mean, noise, distributio
     upper = distribution.cdf(np.arange(256) + 0.5)
     upper[255] = 1.0
     counts = np.bincount(image.ravel(), minlength=256)
-    p = chi_square(counts, np.diff(upper, prepend=0.0), image.size)
-    print(f"\n| {noise} at {mean} | binned distribution | {image.size} | p = {p:.2g} |")
-    assert p > UNLIKELY
+    assert chi_square(counts, np.diff(upper, prepend=0.0), image.size) > UNLIKELY
 
 
 @numba.njit
-def many(kind, mean, start, count):
-    """Draw numbers of ``count`` pixel keys: a Poisson number, or normal ones of two draws."""
+def many(mean, start, count):
+    """Draw Poisson numbers of ``count`` pixel keys."""
     drawn = np.empty(count)
     for i in range(count):
         pixel = sensor.mixed(np.uint64(start) + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
-        drawn[i] = sensor._poisson(mean, pixel, 4) if kind < 0 else sensor._normal(pixel, kind)
+        drawn[i] = sensor._poisson(mean, pixel, 4)
     return drawn
 
 
-@pytest.mark.parametrize("mean", [0.1, 1.0, 5.0, 9.99, 10.0, 11.3, 30.0, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("mean", [5.0, 11.3, 1e3, 1e9])
 @lengths(200_000, 4_000_000)
 def test_poisson_numbers_are_exactly_distributed(count, mean):
-    drawn = many(-1, mean, 7, count)
+    drawn = many(mean, 7, count)
     # At most 200 cells of about the same probability.
     edges = np.unique(stats.poisson.ppf(np.linspace(0.001, 0.999, 200), mean))
     upper = np.append(stats.poisson.cdf(edges, mean), 1.0)
     counts = np.bincount(np.searchsorted(edges, drawn), minlength=len(upper))
-    p = chi_square(counts, np.diff(upper, prepend=0.0), count)
-    print(f"\n| Poisson, mean {mean:g} | scipy.stats.poisson, chi-square | {count} | p = {p:.2g} |")
-    assert p > UNLIKELY
+    assert chi_square(counts, np.diff(upper, prepend=0.0), count) > UNLIKELY
     assert abs(drawn.mean() - mean) < FAR * np.sqrt(mean / count)
     # The variance of a sample variance of Poisson numbers: (2 mean² + mean) / n.
     assert abs(drawn.var() - mean) < FAR * np.sqrt((2 * mean**2 + mean) / count)
-
-
-@lengths(200_000, 2_000_000)
-def test_normal_numbers_are_normal_and_independent(count):
-    read, grey, electrons = many(0, 0.0, 7, count), many(2, 0.0, 7, count), many(-1, 50.0, 7, count)
-    for drawn in (read, grey):
-        assert stats.kstest(drawn, "norm").pvalue > UNLIKELY
-        assert abs(stats.kurtosis(drawn)) < FAR * np.sqrt(24 / count)
-    for a, b in ((read, grey), (read, electrons), (grey, electrons), (read[1:], read[:-1])):
-        assert abs(stats.spearmanr(a, b).statistic) * np.sqrt(count) < FAR
 
 
 def correlation(a, b):
@@ -141,24 +124,16 @@ def correlation(a, b):
 @pytest.mark.parametrize("noise", ["noise_grey=20", "full_well_e=300"])
 def test_noise_of_pixels_scenes_trials_and_seeds_is_independent(noise):
     image = flat(128, noise).astype(float)
-    worst = 0.0
-    for down, right in ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0), (0, 32), (64, 0), (5, 7)):
-        worst = max(worst, correlation(
-            image[down:, right:], image[: 700 - down, : 1000 - right]
-        ))
-        absolute = np.abs(image - image.mean())
-        worst = max(worst, correlation(
-            absolute[down:, right:], absolute[: 700 - down, : 1000 - right]
-        ))
-    others = [
-        flat(128, noise, trial=1), flat(128, noise, trial=2), flat(128, noise, seed=2),
-        flat(128, noise, tilt_deg=1), flat(128, noise, "marker_id=3"),
-        flat(128, noise, "size_m=0.02"), flat(128, noise, "focal_length_mm=4.5"),
-    ]
-    for other in others:
+    for down, right in ((0, 1), (1, 0), (1, 1), (0, 32), (64, 0), (5, 7)):
+        for field in (image, np.abs(image - image.mean())):
+            moved = field[down:, right:], field[: 700 - down, : 1000 - right]
+            assert correlation(*moved) < FAR
+    for other in (
+        flat(128, noise, trial=1), flat(128, noise, seed=2), flat(128, noise, tilt_deg=1),
+        flat(128, noise, "marker_id=3"), flat(128, noise, "focal_length_mm=4.5"),
+    ):
         assert (other != image).mean() > 0.9
-        worst = max(worst, correlation(image, other.astype(float)))
-    row(f"independence, {noise}", "correlation, standard deviations", 16 + len(others), worst, FAR)
+        assert correlation(image, other.astype(float)) < FAR
 
 
 @pytest.mark.parametrize("noise", [["noise_grey=20"], ["full_well_e=300", "read_noise_e=4"]])
@@ -172,31 +147,23 @@ def test_noise_is_that_of_the_scene_whatever_renderer_window_and_levels(noise):
 
 # Photon transfer.
 
-def test_photon_transfer_is_within_one_percent_of_theory():
+@pytest.mark.parametrize(("full_well", "read", "gain", "grey"), [
+    (500, 2, 1, 0), (20_000, 0, 1, 0), (500, 2, 0.5, 0), (1000, 20, 1, 0), (1000, 5, 1.5, 3),
+])
+def test_photon_transfer_is_within_one_percent_of_theory(full_well, read, gain, grey):
     """Variance against mean: gain² · (mean · 255 / full well + (read · 255 / full well)²) + grey²
     + 1/12 of quantisation, which holds where steps of an electron are smoothed over the levels: by
     many electrons a level, or by read noise. Of 700,000 pixels the variance has a standard
     deviation of 0.17 %."""
-    worst_mean = worst = cases = 0
-    for full_well, read, gain, grey in (
-        (500, 2, 1, 0), (5000, 0, 1, 0), (20_000, 0, 1, 0), (500, 2, 0.5, 0), (2000, 2, 2, 0),
-        (1000, 20, 1, 0), (1000, 5, 1.5, 3),
-    ):
-        for level in (40, 120, 200):
-            if level * gain > 220:
-                continue
-            image = flat(
-                level, f"full_well_e={full_well}", f"read_noise_e={read}", f"gain={gain}",
-                f"noise_grey={grey}",
-            ).astype(float)
-            a_level = 255 / full_well
-            theory = gain**2 * (level * a_level + (read * a_level) ** 2) + grey**2 + 1 / 12
-            worst = max(worst, abs(image.var() / theory - 1))
-            deviation = abs(image.mean() - gain * level) / np.sqrt(theory / image.size)
-            worst_mean = max(worst_mean, deviation)
-            cases += 1
-    row("photon transfer: variance", "theory, relative", cases, worst, 0.01)
-    row("photon transfer: mean", "theory, standard deviations", cases, worst_mean, FAR)
+    for level in (40, 120):
+        image = flat(
+            level, f"full_well_e={full_well}", f"read_noise_e={read}", f"gain={gain}",
+            f"noise_grey={grey}",
+        ).astype(float)
+        a_level = 255 / full_well
+        theory = gain**2 * (level * a_level + (read * a_level) ** 2) + grey**2 + 1 / 12
+        assert abs(image.var() / theory - 1) < 0.01
+        assert abs(image.mean() - gain * level) < FAR * np.sqrt(theory / image.size)
 
 
 def test_full_well_and_saturation_clip():
@@ -226,19 +193,12 @@ black = 30.3
 white = 201.7
 background = 90.4
 """
-    worst = cases = 0
-    for gain in (0.01, 0.7, 1.0, 1.3, 5.0, 1e6):
-        for bits in range(8, 17):
-            pipeline = Pipeline.from_text(text, [f"gain={gain}", f"bit_depth={bits}", "side_px=20"])
-            scenes = scenes_of(pipeline)
-            mean, share = marker_levels(scenes, 0, (0, 0, 64, 48))
-            levels = gain * (mean + (1 - share) * 90.4)
-            most = 2**bits - 1
-            scaled = levels * most / 255
-            counts = np.clip(np.floor(scaled + 0.5), 0, most).astype(np.int64)
-            expected = (2 * 255 * counts + most) // (2 * most)
-            decided = np.abs(scaled % 1 - 0.5) > 1e-6
-            found = image_of(pipeline).astype(int)
-            worst = max(worst, np.abs(found - expected)[decided].max())
-            cases += 1
-    row("gain, 8-16 bits, clipping", "integers of NumPy", cases, worst, 0)
+    for gain, bits in itertools.product((0.01, 0.7, 1.0, 5.0, 1e6), range(8, 17)):
+        pipeline = Pipeline.from_text(text, [f"gain={gain}", f"bit_depth={bits}", "side_px=20"])
+        mean, share = marker_levels(scenes_of(pipeline), 0, (0, 0, 64, 48))
+        most = 2**bits - 1
+        scaled = gain * (mean + (1 - share) * 90.4) * most / 255
+        counts = np.clip(np.floor(scaled + 0.5), 0, most).astype(np.int64)
+        expected = (2 * 255 * counts + most) // (2 * most)
+        decided = np.abs(scaled % 1 - 0.5) > 1e-6
+        assert np.array_equal(image_of(pipeline)[decided], expected[decided])

@@ -1,13 +1,12 @@
 """Lenses, bent sheets, printed sizes, shifted images: against rays and sums written here."""
 
-import itertools
 
 import numpy as np
 import pytest
 
 from support.bent_sheets import flat_points
 from support.exact_image import LENSES, modules_of, plane_of, values
-from support.lengths import lengths
+from support.lengths import first_of
 from sweep.model import lens
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import (
@@ -35,7 +34,7 @@ def exact_frame(scenes, value):
     """Levels of the whole frame before the sensor."""
     box = marker_boxes(scenes)[0]
     frame = np.full((value["height_px"], value["width_px"]), value["background"])
-    areas = np.array([value["background"], value["black"], value["white"], 0.0])
+    areas = np.array([value[name] for name in ("background", "black", "white", "occluder")])
     if box[2] > box[0]:
         if not scenes.effects.active[0]:
             mean, share = marker_levels(scenes, 0, tuple(box.tolist()))
@@ -92,6 +91,12 @@ def sampled_frame(value, per_side, shifted=None):
     on = (np.minimum(column, row) > -quiet) & (np.maximum(column, row) < n + quiet)
     i, j = (np.clip(np.floor(at[on]) + 1, 0, n + 1).astype(int) for at in (row, column))
     level[on] = np.where(white[i, j], value["white"], value["black"])
+    # A sheet hides a share of the black square's extent along a direction, and all beyond.
+    angle = np.radians(value["occlusion_deg"])
+    right, up = np.cos(angle), np.sin(angle)
+    edge = n * (abs(right) + abs(up)) * (0.5 - value["occlusion"])
+    behind = on & ((column - n / 2) * right - (row - n / 2) * up > edge)
+    level[behind & (value["occlusion"] > 0)] = value["occluder"]
     return level.reshape(value["height_px"], per_side, -1, per_side).mean(axis=(1, 3))
 
 
@@ -104,75 +109,32 @@ def assert_sampled(found, expected, per_side):
     assert abs(np.mean(found - expected)) < 0.03 * deviation + 0.01
 
 
-@pytest.mark.parametrize("distortion", LENSES)
-@lengths(16, 32)
-def test_an_image_under_a_lens_is_that_of_samples_traced_back(count, distortion):
+@pytest.mark.parametrize(("distortion", "hidden_share", "hidden_deg"), [
+    *((lens, 0.0, 0.0) for lens in LENSES),
+    ((), 0.3, 30.0), ((), 0.9, -100.0), (LENSES[0], 0.5, 200.0),
+])
+def test_an_image_under_a_lens_or_a_sheet_is_that_of_samples_traced_back(
+    distortion, hidden_share, hidden_deg
+):
     value, scenes = scenes_of(
         distortion=distortion, tilt_deg=35.0, azimuth_deg=70.0, roll_deg=25.0, bearing_x_deg=8.0,
-        quiet_zone_modules=1.5,
+        quiet_zone_modules=1.5, occlusion=hidden_share, occlusion_deg=hidden_deg, occluder=170.0,
     )
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, count), count)
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 16), 16)
 
 
-CURVES = [
-    ("cylinder", 4.0, 0.0, 0.0), ("cylinder", -6.0, 30.0, 0.0), ("cylinder", 10.0, -100.0, 20.0),
-    ("cylinder", 1e-6, 10.0, 40.0), ("saddle", 5.0, 20.0, 25.0), ("saddle", -3.0, 0.0, 50.0),
-]
-
-
-@pytest.mark.parametrize(("bend", "curvature", "bend_deg", "tilt_deg"), [
-    CURVES[1], CURVES[4],
-    *(pytest.param(*curve, marks=pytest.mark.long) for curve in CURVES),
-])
-def test_bent_marker_is_what_rays_meet(bend, curvature, bend_deg, tilt_deg):
+@pytest.mark.parametrize("curve", first_of([
+    ("cylinder", -6.0, 30.0, 0.0), ("saddle", 5.0, 20.0, 25.0), ("cylinder", 1e-6, 10.0, 40.0),
+    ("cylinder", 10.0, -100.0, 20.0), ("saddle", -3.0, 0.0, 50.0),
+], 3))
+def test_bent_marker_is_what_rays_meet(curve):
+    bend, curvature, bend_deg, tilt_deg = curve
     value, scenes = scenes_of(
         bend=bend, curvature_per_m=curvature, bend_deg=bend_deg, tilt_deg=tilt_deg,
         azimuth_deg=40.0, roll_deg=15.0,
     )
     assert not not_modelled(scenes)[0]
     assert_sampled(exact_frame(scenes, value), sampled_frame(value, 16), 16)
-
-
-@pytest.mark.parametrize("bend", ["cylinder", "saddle"])
-@pytest.mark.parametrize("curvature", [-8.0, 1e-3, 8.0])
-@pytest.mark.parametrize("distortion", [(), LENSES[1]])
-def test_area_of_a_bent_marker_is_that_of_its_curved_outline(bend, curvature, distortion):
-    # Chords are within 1e-4 px of an outline of 100 px; the outline of 40,000 points is exact.
-    value, scenes = scenes_of(
-        bend=bend, curvature_per_m=curvature, bend_deg=25.0, tilt_deg=20.0, roll_deg=33.0,
-        distortion=distortion, width_px=80, height_px=80,
-    )
-    value = value | {"black": 1.0, "white": 1.0, "background": 0.0}
-    found = exact_frame(scenes, value).sum()
-    plane, n = plane_of(value).astype(np.float64), len(modules_of(value)) - 2
-    module = np.linalg.norm(plane[:, 0])
-    t = np.arange(10_000) / 10_000
-    ends = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * (n + 2) - 1
-    flat = np.concatenate([a + t[:, None] * (b - a) for a, b in itertools.pairwise(ends)])
-    turn = np.radians(25.0)
-    x, y = ((flat - n / 2) * [1, -1]).T * module
-    a, b = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
-    if bend == "cylinder":
-        a, z = np.sin(curvature * a) / curvature, (np.cos(curvature * a) - 1) / curvature
-    else:
-        z = -curvature * (a * a - b * b) / 2
-    x, y = a * np.cos(turn) - b * np.sin(turn), a * np.sin(turn) + b * np.cos(turn)
-    right, up = plane[:, 0] / module, -plane[:, 1] / module
-    points = plane @ [n / 2, n / 2, 1] + np.outer(x, right) + np.outer(y, up)
-    points += np.outer(z, np.cross(right, up))
-    flat = points[:, :2] / points[:, 2:]
-    if distortion:
-        k1, k2, p1, p2, k3, k4, k5, k6 = distortion
-        x, y = flat.T
-        r2 = x * x + y * y
-        radial = (1 + ((k3 * r2 + k2) * r2 + k1) * r2) / (1 + ((k6 * r2 + k5) * r2 + k4) * r2)
-        flat = np.column_stack([
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ])
-    u, v = (flat * value["fx_px"]).T
-    area = abs(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))) / 2
-    assert abs(found - area) < 100 * 1e-4
 
 
 def test_true_pose_and_corners_are_those_of_the_tangent_plane():
@@ -235,29 +197,22 @@ def shift_of(waves):
     return shift
 
 
-@pytest.mark.parametrize(("geometry_px", "length_px"), [
-    (0.4, 20.0), pytest.param(1.5, 15.0, marks=pytest.mark.long),
-    pytest.param(8.0, 400.0, marks=pytest.mark.long),
-])
-def test_shifted_image_is_that_of_shifted_samples(geometry_px, length_px):
+@pytest.mark.parametrize("fields", first_of([
+    {"geometry": (0.4, 20.0)}, {"geometry": (0.4, 30.0), "edge": (0.3, 4.0)},
+    {"geometry": (1.5, 15.0)}, {"geometry": (8.0, 400.0)},
+], 2))
+def test_shifted_image_is_that_of_samples_shifted_by_each_field(fields):
+    given = {}
+    for name, (spread_px, length_px) in fields.items():
+        given |= {f"{name}_px": spread_px, f"{name}_length_px": length_px}
     value, scenes = scenes_of(
-        geometry_px=geometry_px, geometry_length_px=length_px, noise_key=77, tilt_deg=30.0,
-        roll_deg=15.0, width_px=28, height_px=26, side_px=14.0,
+        noise_key=77, tilt_deg=30.0, roll_deg=15.0, width_px=28, height_px=26, side_px=14.0, **given
     )
     assert not not_modelled(scenes)[0]
-    shifted = shift_of(shift_waves(geometry_px, length_px, np.uint64(77)))
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 6, shifted), 6)
-
-
-def test_ragged_edges_are_a_second_field_of_shifts_beside_the_first():
-    value, scenes = scenes_of(
-        geometry_px=0.4, geometry_length_px=30.0, edge_px=0.3, edge_length_px=4.0, noise_key=77,
-        tilt_deg=30.0, width_px=28, height_px=26, side_px=14.0,
-    )
-    fields = [shift_of(shift_waves(*field)) for field in (
-        (0.4, 30.0, np.uint64(77)), (0.3, 4.0, np.uint64(77), "edge"))]
-    shifted = lambda points: fields[0](points) + fields[1](points)  # noqa: E731
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 6, shifted), 6)
+    waves = [shift_of(shift_waves(*field, np.uint64(77), *([name] if name == "edge" else [])))
+             for name, field in fields.items()]
+    expected = sampled_frame(value, 6, lambda points: sum(wave(points) for wave in waves))
+    assert_sampled(exact_frame(scenes, value), expected, 6)
 
 
 @pytest.mark.long

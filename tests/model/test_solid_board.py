@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr
 
 from support.blocks import run_cells
 from sweep.errors import PipelineError
@@ -69,13 +68,12 @@ def turned(each):
     return (tilt * Rotation.from_euler("z", each["roll_deg"], degrees=True)).as_matrix()
 
 
-def traced(markers, camera, pose, per_side, ground=None, only=None):
+def traced(markers, camera, pose, per_side, ground=None):
     """The mean levels (height, width) of ``per_side``² rays a pixel.
 
     Each ray takes the nearest sheet. ``markers`` have quiet zones of one module; ``camera``: width,
     height, f, cx, cy; ``pose``: rotation and translation of the target. ``ground``: returns the
-    level of points (n, 2) of the target's plane, NaN where nothing is printed. ``only``: the number
-    of a marker (-1: the ground) beside which all is black, and rays are not averaged.
+    level of points (n, 2) of the target's plane, NaN where nothing is printed.
     """
     width, height, focal, cx, cy = camera
     rotation, translation = pose
@@ -84,14 +82,13 @@ def traced(markers, camera, pose, per_side, ground=None, only=None):
     x, y = np.meshgrid((u - cx) / focal, (v - cy) / focal)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     nearest, level = np.full(x.shape, np.inf), np.full(x.shape, LEVELS[0])
-    owner = np.full(x.shape, -2)
     if ground is not None:
         depth = rotation[:, 2] @ translation / (rays @ rotation[:, 2])
         points = (rays * depth[..., None] - translation) @ rotation[:, :2]
         seen = ground(points.reshape(-1, 2)).reshape(x.shape)
         hit = np.isfinite(seen) & (depth > 0)
-        nearest[hit], level[hit], owner[hit] = depth[hit], seen[hit], -1
-    for number, each in enumerate(markers):
+        nearest[hit], level[hit] = depth[hit], seen[hit]
+    for each in markers:
         centre, size = [each[f"{axis}_m"] for axis in "xyz"], each["size_m"]
         axes, middle = rotation @ turned(each), rotation @ centre + translation
         if axes[:, 2] @ middle >= 0:
@@ -109,9 +106,7 @@ def traced(markers, camera, pose, per_side, ground=None, only=None):
         index = [np.clip(along, 0, count - 1).astype(int) for along in (line, column)]
         white = ~within | bits[tuple(index)]
         nearest[hit] = depth[hit]
-        level[hit], owner[hit] = np.where(white, LEVELS[2], LEVELS[1])[hit], number
-    if only is not None:
-        return np.where(owner == only, level - LEVELS[0], 0.0), x, y
+        level[hit] = np.where(white, LEVELS[2], LEVELS[1])[hit]
     return level.reshape(height, per_side, width, per_side).mean(axis=(1, 3))
 
 
@@ -132,8 +127,7 @@ BOARDS = {
 @pytest.mark.parametrize(("name", "tilt_deg"), [
     ("field", 60.0), ("distractors", 60.0),
     *(pytest.param(name, tilt, marks=pytest.mark.long)
-      for name in BOARDS for tilt in (0.0, 30.0, 75.0)),
-    pytest.param("field", 150.0, marks=pytest.mark.long),
+      for name, tilt in (("cube", 30.0), ("charuco", 0.0), ("charuco", 75.0), ("field", 150.0))),
 ])
 def test_an_image_is_that_of_rays(name, tilt_deg):
     """Errors of the rays fall with the power 1.5 of their number along a side, those of the image
@@ -159,9 +153,8 @@ MOTION = {"velocity_x_m_s": 0.5, "velocity_y_m_s": -0.3, "velocity_z_m_s": 0.4,
 
 @pytest.mark.parametrize(("name", "shutter"), [
     ("cube", {"exposure_s": 0.006, "row_time_s": 1e-4}),
-    pytest.param("field", {"exposure_s": 0.02}, marks=pytest.mark.long),
     pytest.param("field", {"row_time_s": 3e-4}, marks=pytest.mark.long),
-    pytest.param("distractors", {"exposure_s": 0.006, "row_time_s": 1e-4}, marks=pytest.mark.long),
+    pytest.param("distractors", {"exposure_s": 0.006}, marks=pytest.mark.long),
 ])
 def test_a_moving_target_in_several_planes_is_the_mean_of_rays(name, shutter):
     """Each row's mean over instants of its exposure, of rays to the target where it is then."""
@@ -192,54 +185,6 @@ def test_a_moving_target_in_several_planes_is_the_mean_of_rays(name, shutter):
     assert np.sqrt((off**2).mean()) < 0.8
     still = image_of(scenes_of(pipeline([], 60.0, board=declared)))
     assert np.sqrt(((still - expected) ** 2).mean()) > 10  # it does move
-
-
-def occluded_charuco(points):
-    """As :func:`charuco_level`, under a sheet that hides 0.3 of its squares from the right."""
-    level = charuco_level(points)
-    return np.where(np.isfinite(level) & (points[:, 0] > 0.045 - 0.3 * 0.09), 128.0, level)
-
-
-@pytest.mark.parametrize("name", ["cube", "charuco"])
-def test_each_sheet_is_out_of_focus_at_its_own_depth(name):
-    """What rays see of each sheet, through the Gaussian of a thin lens at each pixel."""
-    flat = name == "charuco"
-    shown = [] if flat else CUBE
-    declared = {k: v for k, v in BOARDS[name].items() if k != "distractors"}
-    chosen = pipeline([], 40.0, board=declared, marker={
-        "dictionary": "DICT_4X4_50", "size_m": 0.02 if flat else 0.04},
-        scene={"aperture_mm": 20.0, "focus_distance_m": 0.16, "occlusion": 0.3 * flat})
-    scenes = scenes_of(chosen)
-    pose = rotation, position = scenes.rotation[0], scenes.translation[0]
-    image, rng = image_of(scenes), np.random.default_rng(1)
-    pixels = rng.permutation(np.argwhere(np.abs(np.gradient(image)).max(axis=0) > 3))[:40]
-    expected = np.full(len(pixels), LEVELS[0])
-    for number in [-1] if flat else range(len(CUBE)):
-        level, x, y = traced(
-            shown, (160, 120, 150.0, 79.5, 59.5), pose, 9,
-            occluded_charuco if flat else None, only=number)
-        normal, point = rotation[:, 2], position
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (0.045 + 0.02 / 6)
-        if not flat:
-            axes = rotation @ turned(CUBE[number])
-            normal = axes[:, 2]
-            point = rotation @ [CUBE[number][f"{c}_m"] for c in "xyz"] + position
-            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.02 * 8 / 6
-            depths = (corners @ axes[:, :2].T + point)[:, 2]
-        else:
-            depths = (corners @ rotation[:, :2].T + point)[:, 2]
-        for k, (v, u) in enumerate(pixels):
-            ray = np.array([(u - 79.5) / 150, (v - 59.5) / 150, 1.0])
-            inverse = (normal @ ray) / (normal @ point)
-            inverse = np.clip(inverse, 1 / depths.max(), 1 / depths.min())
-            sigma = 150 * 0.020 * abs(1 / 0.16 - inverse) / 4
-            across, down = (  # the shares of the spread of each ray in the pixel
-                ndtr((at + 0.5) / sigma) - ndtr((at - 0.5) / sigma)
-                for at in (x[0] * 150 + 79.5 - u, y[:, 0] * 150 + 59.5 - v)
-            )
-            expected[k] += down @ level @ across / 81
-    off = np.abs(image[tuple(pixels.T)] - expected)
-    assert np.sqrt((off**2).mean()) < 1  # of the rays: a sharp edge along their rows is off by 12
 
 
 EXPOSED = {"exposure_s": 0.01, "row_time_s": 1e-4, "velocity_x_m_s": 0.6, "velocity_z_m_s": -0.5,
@@ -276,24 +221,21 @@ def charuco_level(points):
     return level
 
 
-def test_sheets_behind_others_and_backs_are_not_visible():
-    hidden = [marker(0, 0, 0, 0, size=0.01), marker(1, 0, 0, 0.05), marker(2, 0.05, 0, 0),
-              marker(3, -0.05, 0, 0, tilt=180)]
-    chosen = pipeline(hidden, tilt_deg=0.0)
+@pytest.mark.parametrize(("board", "seen"), [
+    ({"kind": "markers", "markers": [
+        marker(0, 0, 0, 0, size=0.01), marker(1, 0, 0, 0.05), marker(2, 0.05, 0, 0),
+        marker(3, -0.05, 0, 0, tilt=180),
+    ]}, [False, True, True, False]),
+    ({"kind": "grid", "rows": 1, "columns": 2, "gap_m": 0.02,
+      "distractors": [marker(9, 0.03, 0.0, 0.05)]}, [True, False]),
+])
+def test_markers_behind_other_sheets_and_from_behind_are_not_visible(board, seen):
+    chosen = pipeline([], tilt_deg=0.0, board=board)
     scenes, values = scenes_of(chosen), chosen.experiment.scene_values([])
-    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (4, 0))
-    not_visible = DetectionStatus.not_visible
-    assert boards.flags[0].tolist() == [
-        not_visible, DetectionStatus.not_run, DetectionStatus.not_run, not_visible
-    ]
-
-
-def test_a_marker_of_a_sheet_that_a_distractor_hides_is_not_visible():
-    boards = {"kind": "grid", "rows": 1, "columns": 2, "gap_m": 0.02}
-    chosen = pipeline([], 0.0, board={**boards, "distractors": [marker(9, 0.03, 0.0, 0.05)]})
-    scenes, values = scenes_of(chosen), chosen.experiment.scene_values([])
-    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (2, 0))
-    assert boards.flags[0].tolist() == [DetectionStatus.not_run, DetectionStatus.not_visible]
+    size = len(seen), 0
+    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), size)
+    assert (boards.flags[0] == DetectionStatus.not_run).tolist() == seen
+    assert (boards.flags[0] == DetectionStatus.not_visible).tolist() == np.invert(seen).tolist()
 
 
 @pytest.mark.parametrize("solver", ["iterative", "sqpnp", "epnp"])
@@ -324,8 +266,6 @@ def test_markers_around_the_camera_leave_the_image_of_those_before_it():
     assert result.columns["marker_detection"][0].tolist() == [
         [DetectionStatus.detected, *[DetectionStatus.not_visible] * 3]
     ]
-    behind = visibility_flags(scenes_of(pipeline(around[-1:])))
-    assert behind.tolist() == [DetectionStatus.not_visible]
 
 
 @pytest.mark.parametrize(("change", "fault"), [

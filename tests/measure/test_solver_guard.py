@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.lengths import first_of, lengths
+from support.lengths import lengths
 from support.solving import estimate
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import EstimateStatus
@@ -84,9 +84,9 @@ def wrong(view, estimates):
     return ~(right | (mirror & exact)) | (estimates.status != EstimateStatus.solved)
 
 
-@lengths(45, 15)
+@lengths(45, 30)
 @pytest.mark.parametrize("bearing", [(0.0, 0.0), (12.0, -9.0)], ids=["on-axis", "off-axis"])
-@pytest.mark.parametrize("size_m", first_of([0.001, 10.0, 0.01, 1.0], 2))
+@pytest.mark.parametrize("size_m", [0.001, 10.0])
 def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m):
     view = View(count, bearing, size_m)
     failures = {
@@ -94,8 +94,6 @@ def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m
         for solver in RELIABLE
         for guarded in (True, False)
     }
-    print(f"\nside {size_m} m, bearing {bearing}: failures in {len(view)} poses, guarded / plain: "
-          + ", ".join(f"{s} {failures[s, True]} / {failures[s, False]}" for s in RELIABLE))
     assert not any(failures[solver, True] for solver in RELIABLE)
     # The guard's reason to exist.
     assert failures["ippe", False] > 0
@@ -107,9 +105,9 @@ def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m
 class FarView:
     """Poses (N,) so far away that the perspective across the marker is 1e-3 to 1e-6 px."""
 
-    def __init__(self, count, focal_px, seed, smallest_px=20):
+    def __init__(self, count, focal_px, seed):
         rng = np.random.default_rng(seed)
-        side_px = np.geomspace(smallest_px, 100, count)
+        side_px = np.geomspace(20, 100, count)
         # To 33 degrees off the axis at the shortest focal length: none is seen from behind.
         steepest = 85 if focal_px > 1e3 else 50
         tilt, azimuth, roll = rng.uniform(0, [[steepest], [360], [360]], (3, count))
@@ -131,22 +129,18 @@ class FarView:
         self.cameras = Cameras(view, lenses, np.zeros(count, dtype=bool))
         self.corners = self.cameras.project(in_space(self.rotation, self.translation, 0.05))
 
-    def estimates(self, solver, noise_px=0.0):
-        noise = np.random.default_rng(9).normal(size=self.corners.shape)
-        return estimate(self.corners + noise_px * noise, self.cameras, self.size_m, solver,
-                        guarded=True, limit=0.25)
+    def estimates(self, solver):
+        return estimate(self.corners, self.cameras, self.size_m, solver, guarded=True, limit=0.25)
 
 
-@pytest.mark.long
-@lengths(200, 10_000)
-@pytest.mark.parametrize("focal_px", [3e2, 1e4, 1e5, 1e6, 1e7, 1e8])
+@pytest.mark.parametrize("focal_px", [3e2, 1e4, 1e6, 1e8])
+@lengths(60, 2000)
 def test_guarded_solvers_are_right_at_any_focal_length(count, focal_px):
     view = FarView(count, focal_px, seed=3)
     for solver in RELIABLE:
         estimates = view.estimates(solver)
         assert (estimates.status == EstimateStatus.solved).all(), solver
         error = degrees_between(estimates.rotation, view.rotation).max()
-        print(f"\n{solver}: {error:.1e} degrees", end="")
         # Not even the mirror is right: the corners tell them apart. AP3P alone loses digits of
         # frontal markers before they are far.
         assert error < (0.2 if (solver, focal_px) == ("ap3p", 1e4) else 0.01), solver
@@ -171,41 +165,6 @@ def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
         np.testing.assert_allclose(estimates.translation / size, middle.translation, atol=1e-6)
         np.testing.assert_allclose(estimates.rotation, middle.rotation, atol=1e-6)
         np.testing.assert_allclose(estimates.reprojection_px, middle.reprojection_px, atol=1e-6)
-
-
-def least_errors_px(view, corners):
-    """Return the least RMS reprojection errors (N,): from the truth and from its mirror."""
-    matrix = np.array([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1.0]])
-    least = np.full(len(corners), np.inf)
-    for i, (pixels, position) in enumerate(zip(corners, view.translation, strict=True)):
-        sight = position / np.linalg.norm(position)
-        mirror = np.eye(3) - 2 * np.outer(sight, sight)
-        objects = view.size_m[i] * SQUARE
-        for start in (view.rotation[i], mirror @ view.rotation[i] @ np.diag([1, 1, -1])):
-            _, rvec, tvec = cv2.solvePnP(
-                objects, pixels, matrix, None, Rotation.from_matrix(start).as_rotvec()[:, None],
-                position[:, None].copy(), useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
-            )
-            off = cv2.projectPoints(objects, rvec, tvec, matrix, None)[0][:, 0] - pixels
-            least[i] = min(least[i], np.sqrt((off**2).sum(axis=1).mean()))
-    return least
-
-
-@lengths(400, 4000)
-@pytest.mark.parametrize("solver", RELIABLE)
-def test_guarded_solvers_find_the_least_error_of_coarse_corners(count, solver):
-    """Before it was compared, iterative ended at up to 26 times the least error in 1-3 %."""
-    view = FarView(count, FOCAL_PX, seed=1, smallest_px=12)
-    for corners in (np.round(view.corners), view.corners + np.random.default_rng(2).normal(
-            0, 0.3, view.corners.shape)):
-        estimates = estimate(corners, view.cameras, view.size_m, solver, True, 0.25)
-        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
-        ratio = estimates.reprojection_px / np.maximum(least_errors_px(view, corners), 1e-3 * side)
-        print(f"\n{solver}: {(ratio > 1.1).sum()} of {count} above 1.1, worst {ratio.max():.1f}")
-        # iterative minimises the error; ippe does not; p3p and ap3p fit three corners of four, and
-        # give way to ippe at 4 times its error.
-        most = {"iterative": 1.1, "p3p": 10, "ap3p": 10}.get(solver, 2.5)
-        assert (ratio <= most).all()
 
 
 @pytest.mark.parametrize("solver", OPENCV_SOLVERS)

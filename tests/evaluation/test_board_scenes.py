@@ -1,4 +1,4 @@
-"""Boards of pipelines have the images of their parts, each clipped to each pixel or sampled."""
+"""Boards of pipelines have the images of their parts, each clipped to each pixel."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,6 @@ from support.board_pictures import (
     SIZE_M,
     board_toml,
     clipped_frame,
-    painted,
     parts,
 )
 from support.lengths import first_of, lengths
@@ -143,67 +142,6 @@ ROUND = [f"{key}={round(level)}" for key, level in LEVELS.items()]
 LENS = "distortion=[-0.25, 0.08, 0.001, -0.0008]"
 
 
-def sampled(name, scenes, size, points, blur_px=0.0):
-    """Levels (h, w) of the frame's first columns and rows, ``size``, by 12 x 12 samples a pixel.
-
-    Each is at random in its cell. ``points`` takes normalised coordinates (n, 2) of the image to
-    points (n, 2) on the board.
-    """
-    fine, pad = 12, 5 if blur_px else 0  # pad: pixels around the image
-    rng = np.random.default_rng(5)
-    shape = (size[1] + 2 * pad) * fine, (size[0] + 2 * pad) * fine
-    v, u = (np.indices(shape) + rng.random((2, *shape))) / fine - 0.5 - pad
-    fx, fy, cx, cy = scenes.cameras.view[0]
-    seen = points(np.column_stack([((u - cx) / fx).ravel(), ((v - cy) / fy).ravel()]))
-    levels = painted(name, {key: round(level) for key, level in LEVELS.items()}, seen)
-    levels = levels.reshape(shape)
-    if blur_px:
-        levels = cv2.GaussianBlur(levels, (0, 0), blur_px * fine)
-    mean = levels.reshape(shape[0] // fine, fine, -1, fine).mean(axis=(1, 3))
-    return mean[pad : pad + size[1], pad : pad + size[0]]
-
-
-def agrees_with_samples(off):
-    print(f"mean {off.mean():.2f}, RMS {np.sqrt(np.mean(off**2)):.2f} grey levels off samples")
-    # 210 sqrt(24 / 6) / 144 = 2.9 levels of standard deviation; 5 of them, and the rounding.
-    assert np.abs(off).max() < 15
-    assert np.sqrt(np.mean(off**2)) < 1.7
-    assert abs(off.mean()) < 0.15
-
-
-def before_lens(distorted, k1, k2, p1, p2):
-    """Normalised coordinates (n, 2) without the lens, by iterating OpenCV's published formula."""
-    xd, yd = distorted.T
-    x, y = xd, yd
-    for _ in range(30):
-        r2, before = x * x + y * y, x
-        radial = 1 / (1 + (k2 * r2 + k1) * r2)
-        x = (xd - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) * radial
-        y = (yd - 2 * p2 * before * y - p1 * (r2 + 2 * y * y)) * radial
-    assert np.abs(x - before).max() < 1e-9
-    return np.column_stack([x, y])
-
-
-@pytest.mark.parametrize("case", first_of(
-    [(size, name, blur_px) for size in ((56, 40), SIZE) for blur_px in (0.8, 0.0)
-     for name in ("charuco", "markers", "april")], 1
-))
-def test_a_board_behind_a_lens_is_what_rays_meet(case):
-    size, name, blur_px = case
-    settings = ["distance_m=0.2", "tilt_deg=35", "azimuth_deg=50", "roll_deg=25", LENS, *ROUND,
-                f"blur_px={blur_px}"]
-    scenes = scenes_of(settings, board_text(name))
-    plane = np.column_stack([scenes.rotation[0, :, :2], scenes.translation[0]])
-
-    def points(distorted):
-        flat = before_lens(distorted, -0.25, 0.08, 0.001, -0.0008)
-        met = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(plane).T
-        return met[:, :2] / met[:, 2:]
-
-    found = image_of(settings, text=board_text(name))[: size[1], : size[0]]
-    agrees_with_samples(found - sampled(name, scenes, size, points, blur_px))
-
-
 def test_an_image_behind_a_board_shows_beside_it_and_alone_where_there_is_none(tmp_path):
     noise = np.random.default_rng(5).integers(0, 256, (SIZE[1], SIZE[0])).astype(np.uint8)
     path = tmp_path / "behind.png"
@@ -226,15 +164,14 @@ SINGLE = {
     "markers": {"kind": "markers", "markers": [{"marker_id": 0, "x_m": 0, "y_m": 0}]},
 }
 WITH = (
-    [], ["blur_px=0.7", "noise_grey=3"], [LENS], ["renderer='warp'"],
-    ["renderer='supersample-4'"], ["curvature_per_m=6", "bend_deg=30"],
+    ["blur_px=0.7", "noise_grey=3"], [LENS], ["renderer='warp'"], ["renderer='supersample-4'"],
     ["curvature_per_m=6", LENS, "blur_px=0.5", "occlusion=0.2"], ["background=230.1"],
     ["curvature_per_m=5", "bend_deg=30", "geometry_px=0.8", "geometry_length_px=40"],
-    ["velocity_x_m_s=0.3", "exposure_s=0.01"], ["marker_scale=1.02", "jpeg_quality=70"],
+    ["velocity_x_m_s=0.3", "exposure_s=0.01", "marker_scale=1.02", "jpeg_quality=70"],
 )
 
 
-@pytest.mark.parametrize("settings", first_of(WITH, 8))
+@pytest.mark.parametrize("settings", WITH)
 @pytest.mark.parametrize("kind", SINGLE)
 def test_a_board_of_one_marker_is_that_marker_to_the_bit(settings, kind):
     poses = [["distance_m=0.06", "tilt_deg=40", "azimuth_deg=70", "roll_deg=200"],
@@ -246,12 +183,9 @@ def test_a_board_of_one_marker_is_that_marker_to_the_bit(settings, kind):
         np.testing.assert_array_equal(board, single)
 
 
-@pytest.mark.parametrize("case", first_of(
-    [(name, more) for more in ([], ["noise_grey=0.1"]) for name in reversed(KINDS)], 1
-))
-def test_a_warped_board_has_the_levels_of_its_exact_image(case, tmp_path):
-    name, more = case
-    pose = ["distance_m=0.3", "tilt_deg=30", "azimuth_deg=70", "roll_deg=30", *more]
+@pytest.mark.parametrize("name", first_of(reversed(KINDS), 1))
+def test_a_warped_board_has_the_levels_of_its_exact_image(name, tmp_path):
+    pose = ["distance_m=0.3", "tilt_deg=30", "azimuth_deg=70", "roll_deg=30"]
     path = tmp_path / "behind.png"
     cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8))
     for behind in ([], [f"background='{path}'"]):
@@ -273,7 +207,7 @@ z_m = {z}
 """
 
 
-@pytest.mark.parametrize("settings", [[], ["blur_px=0.8", "bayer=RGGB"], ["tilt_deg=60"]])
+@pytest.mark.parametrize("settings", [["blur_px=0.8", "bayer=RGGB"], ["tilt_deg=60"]])
 @pytest.mark.parametrize("z", [0.0, 0.004])
 def test_markers_outside_the_frame_widen_no_window(settings, z):
     """The image is that of the frame's marker alone, and so is the box, up to 3 px."""

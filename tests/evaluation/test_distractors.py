@@ -60,7 +60,7 @@ def searched(chosen, count, window):
         scenes, DetectorSetting(), full=full, wanted=visible, boards=boards).found
 
 
-@lengths(4, 80)
+@lengths(4, 40)
 def test_what_is_found_in_windows_is_what_a_plain_loop_finds_in_frames(count):
     """Also where the frame cuts distractors; the one with an ID of the board gets to solvers."""
     chosen = pipeline({**GRID, "distractors": BESIDE}, axes={"trial": count}, pose={

@@ -97,22 +97,16 @@ def test_marker_misread_with_much_error_correction_is_a_wrong_id():
         "side_px={linspace=[10, 13, 7]}", "tilt_deg=[40, 60]", "azimuth_deg=[20, 75]",
         "roll_deg={linspace=[0, 80, 9]}",
     )
-    counts = np.bincount(found, minlength=6)[1:5]
-    print(f"\ndetected, wrong_id, rejected, no_candidate: {counts}")
-    assert (counts > 0).all()
-
-
-def marker_image(dictionary, marker_id, side):
-    known = cv2.aruco.getPredefinedDictionary(dictionary)
-    return cv2.aruco.generateImageMarker(known, marker_id, side)
+    assert (np.bincount(found, minlength=6)[1:5] > 0).all()
 
 
 def written(folder, *markers):
     """Write a white frame with markers (ID, side, left, top) of DICT_5X5_50 as "clutter.png"."""
     image = np.full((480, 640), 255, dtype=np.uint8)
+    known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
     for marker_id, side, left, top in markers:
-        image[top : top + side, left : left + side] = marker_image(
-            cv2.aruco.DICT_5X5_50, marker_id, side
+        image[top : top + side, left : left + side] = cv2.aruco.generateImageMarker(
+            known, marker_id, side
         )
     cv2.imwrite(str(folder / "clutter.png"), image)
     return "background=clutter.png"
@@ -210,39 +204,26 @@ SQUARE = np.array([[100.0, 100.0], [140.0, 100.0], [140.0, 140.0], [100.0, 140.0
 
 
 REJECTED_ID = None
-ORIGIN = np.array([[8.0, 16.0], [0.0, 0.0], [4.0, 400.0]])
-"""Top left pixels of windows; what is found is relative to them."""
+ORIGIN = np.array([[8.0, 16.0]])
+"""Top left pixel of the window; what is found is relative to it."""
 
 
-def search_result(row, *found):
-    """Return what a search of scene ``row`` gives, from (ID, corners in the frame) each."""
+def classified(*found, truth=SQUARE):
+    """Classify what was found, (ID or none, corners in the frame) each, in a scene of ID 7."""
     def quads(wanted):
         return tuple(
-            np.float32(quad - ORIGIN[row])[None]
-            for found_id, quad in found if (found_id is not None) == wanted
+            np.float32(quad - ORIGIN)[None] for each, quad in found if (each is not None) == wanted
         )
 
     ids = [found_id for found_id, _ in found if found_id is not None]
-    return row, SearchOutput(
-        quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False)
+    output = SearchOutput(
+        quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False))
+    scene = TargetScenes(
+        Targets.of([single_marker("DICT_4X4_50", 7, 1.0)]), np.array([[7]]), truth[None, None],
+        np.empty((1, 0, 2)), np.zeros((1, 1), dtype=np.uint8),
     )
-
-
-def markers(truth, marker_id):
-    """N visible markers with corners (N, 4, 2) and IDs (N,)."""
-    return TargetScenes(
-        Targets.of([single_marker("DICT_4X4_50", each, 1.0) for each in marker_id]),
-        np.array(marker_id)[:, None],
-        truth[:, None], np.empty((len(truth), 0, 2)), np.zeros((len(truth), 1), dtype=np.uint8),
-    )
-
-
-def classified(*found, truth=SQUARE, marker_id=7):
-    """Classify what was found, (ID, corners) each, in one scene."""
-    found = classify(
-        markers(truth[None], [marker_id]), dict([search_result(0, *found)]), ORIGIN[:1]
-    )
-    return DetectionStatus(found.flags[0]), found.marker_corners[0, 0]
+    result = classify(scene, {0: output}, ORIGIN)
+    return DetectionStatus(result.flags[0]), result.marker_corners[0, 0]
 
 
 TILTED = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
@@ -275,18 +256,3 @@ def test_truth_may_be_seen_turned_and_tilted():
     # In the bounding box, but not in the quadrilateral.
     beside = classified((7, TILTED * 0.1 + [85, 82]), truth=TILTED)
     assert beside[0] == DetectionStatus.no_candidate
-
-
-def test_scenes_are_told_apart():
-    truth = np.stack([SQUARE, SQUARE, SQUARE + 200])
-    found = [
-        search_result(2, (3, SQUARE + 200)), search_result(0, (2, SQUARE), (REJECTED_ID, SQUARE)),
-    ]
-    result = classify(markers(truth, [1, 2, 3]), dict(found), ORIGIN)
-    assert result.flags.tolist() == [
-        DetectionStatus.wrong_id,
-        DetectionStatus.no_candidate,
-        DetectionStatus.detected,
-    ]
-    missing = np.isnan(result.marker_corners).all(axis=(1, 2, 3))
-    np.testing.assert_array_equal(missing, [True, True, False])

@@ -19,13 +19,8 @@ DICTIONARIES = {"DICT_4X4_50": cv2.aruco.DICT_4X4_50, "DICT_6X6_250": cv2.aruco.
 IDS = (0, 7, 42)
 REFINEMENTS = {"none": 0, "subpix": 1, "contour": 2, "apriltag": 3}
 SOLVERS = {
-    "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
-    "iterative": cv2.SOLVEPNP_ITERATIVE,
-    "sqpnp": cv2.SOLVEPNP_SQPNP,
-    "p3p": cv2.SOLVEPNP_P3P,
-    "ap3p": cv2.SOLVEPNP_AP3P,
-    "epnp": cv2.SOLVEPNP_EPNP,
-    "ippe": cv2.SOLVEPNP_IPPE,
+    name: getattr(cv2, f"SOLVEPNP_{name.upper()}")
+    for name in ("ippe_square", "iterative", "sqpnp", "p3p", "ap3p", "epnp", "ippe")
 }
 SIZE_M = 0.05
 CAMERA = np.array([[4.0 / 4.8 * 640, 0, 319.5], [0, 4.0 / 3.6 * 480, 239.5], [0, 0, 1]])
@@ -174,7 +169,7 @@ def whole(pipeline):
     return Block((0,) * len(shape), shape)
 
 
-@lengths(1, 28)
+@lengths(1, 12)
 @pytest.mark.parametrize("window", ["full", "auto"])
 def test_kernel_gives_what_a_plain_opencv_loop_gives(count, window, claim):
     flags, corners, statuses, poses = plain_loop(count)
@@ -187,8 +182,6 @@ def test_kernel_gives_what_a_plain_opencv_loop_gives(count, window, claim):
         for name, column in result.values.items()
     }
     numbers = np.bincount(flags.ravel(), minlength=6)[1:]
-    print(f"\n{window}: {len(block)} poses, flags {numbers.tolist()}, "
-          f"{(statuses == SOLVED).sum()} estimates")
     assert numbers[DETECTED - 1] > numbers.sum() / 3
     assert (numbers[[REJECTED - 1, NO_CANDIDATE - 1, NOT_VISIBLE - 1]] > 0).all()
     np.testing.assert_array_equal(values["detection"], flags)

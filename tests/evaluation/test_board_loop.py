@@ -21,7 +21,7 @@ METHODS = {
     "epnp": cv2.SOLVEPNP_EPNP,
 }
 DETECTED, NOT_VISIBLE = 1, 5
-SOLVED, SOLVER_FAILED, TOO_FEW = 1, 3, "too_few_points"
+SOLVED, SOLVER_FAILED = 1, 3
 
 
 def text(name, trials):

@@ -155,24 +155,6 @@ def marker_parts(corners, bits, quiet, levels):
             yield cell(j, i, j + 1, i + 1), black, white
 
 
-def painted(name, levels, points):
-    """Return the levels (n,) of points (n, 2), right and up in m; NaN is beside the board."""
-    found = np.full(len(points), float(levels["background"]))
-    order = np.argsort(points[:, 0])
-    x, y = points[order].T
-    for corners, level, _ in parts(name, levels):
-        first = np.searchsorted(x, corners[:, 0].min())
-        last = np.searchsorted(x, corners[:, 0].max(), side="right")
-        inside = np.ones(last - first, dtype=bool)
-        for start, stop in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            along = stop - start
-            inside &= (
-                along[0] * (y[first:last] - start[1]) - along[1] * (x[first:last] - start[0]) <= 0
-            )
-        found[order[first:last][inside]] = level
-    return found
-
-
 def clipped_frame(name, levels, view, rotation, translation, size, hides=None):
     """Return the levels (height, width) of a frame: each part clipped to each pixel.
 

@@ -1,21 +1,16 @@
 """What the estimator believes: a calibration error moves the pose as the closed forms say.
 
 Of the true camera K (f, c), size s and pose the corners are x = K·p; an estimator that believes K'
-and s' solves for K'⁻¹·x, the normalised coordinates as it sees them. Written with primes, what it
-then finds:
+and s' solves for K'⁻¹·x. What it then finds:
 
 1. *Size.* Scaling the square and the translation by the same number changes no image, so s' gives
    t' = t·s'/s, R' = R: exactly, for any pose and any corners.
-2. *Marker parallel to the image plane, fx'/fx = fy'/fy.* Its image is a square; as seen by K' it
-   is scaled by f/f' and shifted by (c - c')/f', still a square parallel to the plane. So exactly
-   R' = R, z' = z·(f'/f)(s'/s), x' = x·s'/s + z'·(c - c')/f'. With one error at a time: the
-   distance grows as the focal length, and a principal point that is d px off moves the marker
-   sideways by -z·d/f.
-3. *Radial lens, same marker, centred on the axis.* All corners lie at one radius r = s/(z·√2),
-   which a lens turns into r·L(r²); the believed lens L' turns that into r' with r'·L'(r'²) =
-   r·L(r²). The image stays a square: z' = z·r/r', which is z/L(r²) where no lens is believed.
+2. *Marker parallel to the image plane, fx'/fx = fy'/fy.* As seen by K' its image is scaled by f/f'
+   and shifted by (c - c')/f', still a square parallel to the plane. So exactly R' = R,
+   z' = z·(f'/f)(s'/s), x' = x·s'/s + z'·(c - c')/f'.
+3. *Radial lens, same marker, centred on the axis, none believed.* All corners lie at one radius
+   r = s/(z·√2), which the lens turns into r·L(r²): z' = z/L(r²).
 """
-
 
 import numpy as np
 import pytest

@@ -78,44 +78,6 @@ def test_worked_example_is_lost_at_4_samples_a_cell_and_found_at_8():
         assert ([] if found is None else found.ravel().tolist()) == ids
 
 
-@pytest.mark.parametrize("samples", [4, 8])
-@pytest.mark.parametrize("dictionary", ["DICT_4X4_50", DICTIONARY, "DICT_7X7_50"])
-def test_cells_read_what_opencv_reads_of_a_square_with_the_same_corners(dictionary, samples):
-    rng = np.random.default_rng(11)
-    read = reading(dictionary, perspectiveRemovePixelPerCell=samples,
-                   perspectiveRemoveIgnoredMarginPerCell=0.0)
-    for _ in range(60):
-        bits = modules(dictionary, int(rng.integers(50)))
-        n = len(bits)
-        side, (left, top) = rng.uniform(1.2 * n, 5 * n), rng.uniform(10, 11, 2)
-        # The image: a pixel is white where its centre lies in a white module or outside.
-        at_y, at_x = (np.floor((np.arange(64) - edge) * n / side).astype(int)
-                      for edge in (top, left))
-        framed = np.pad(bits, 1, constant_values=True)
-        image = framed[np.clip(at_y, -1, n)[:, None] + 1, np.clip(at_x, -1, n) + 1]
-        first = np.ceil([left, top])
-        last = np.ceil(np.array([left, top]) + side) - 1
-        quad = (first + (last - first) * UNIT).astype(np.float32)
-        expected = opencv_cells(image, quad, n, samples)
-        (along_x, along_y), _ = model.cell_mixing(side, n, np.array([left, top]) - first, read)
-        np.testing.assert_allclose(
-            along_y @ bits @ along_x.T, expected,
-            atol=1e-12, err_msg=f"side {side}, left {left}, top {top}")
-        corners = np.array([left, top]) + side * UNIT.astype(float)
-        mixing = model.quadrilateral_mixing(quad[None].astype(float), corners[None], n, read)[0]
-        np.testing.assert_allclose(
-            (mixing @ np.append(bits.ravel(), True)).reshape(n, n), expected, atol=1e-12)
-
-
-def opencv_cells(image, quad, n, samples):
-    """Return the share of white (n, n) in the cells of a quadrilateral, through OpenCV's warp."""
-    size = n * samples
-    onto = cv2.getPerspectiveTransform(np.float32(quad), np.float32(size - 1) * UNIT)
-    canonical = cv2.warpPerspective(image.astype(np.uint8), onto, (size, size),
-                                    flags=cv2.INTER_NEAREST)
-    return canonical.reshape(n, samples, n, samples).mean(axis=(1, 3))
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("number", [0, 7])
 def test_dips_of_sweeps_held_back_are_where_and_as_deep_as_was_written_down(number, tmp_path):

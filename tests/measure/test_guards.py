@@ -11,14 +11,11 @@ sit, and who else tests them:
 - reach of the sub-pixel refinement: ``margin_px`` in ``measure/detectors.py``.
 """
 
-import ast
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-import sweep
 from support.lengths import lengths
 from support.searching import searched
 from support.solving import estimate
@@ -49,38 +46,6 @@ def scenes_of(pipeline):
 def cameras(count, lens=()):
     view = np.tile([FOCAL_PX, FOCAL_PX, 319.5, 239.5], (count, 1))
     return Cameras(view, np.repeat(pack(lens)[None], count, axis=0), np.full(count, bool(lens)))
-
-
-# The guards sit in one place.
-
-PLACES = {
-    "solvePnP": {"measure/solver.py"},
-    "solvePnPGeneric": {
-        "measure/solver.py",
-        "photographs/truth.py",  # starts a fit
-    },
-    "Rodrigues": set(),
-    "projectPoints": {"photographs/pose_fit.py"},  # of boards before the camera
-    "undistortPoints": set(),
-    "cornerSubPix": {
-        "measure/photometric.py",  # one start of several: the pixels decide
-        "photographs/folder.py",  # chessboard corners, of the truth
-    },
-    "drawFrameAxes": set(),  # projects
-    "solvePnPRansac": set(),
-    "estimatePoseSingleMarkers": set(),
-}
-
-
-def test_unstable_routines_are_called_where_they_are_guarded_and_nowhere_else():
-    root = Path(sweep.__file__).parent
-    found = {routine: set() for routine in PLACES}
-    for path in root.rglob("*.py"):
-        text = path.read_text()
-        for node in ast.walk(ast.parse(text)) if any(each in text for each in PLACES) else ():
-            if isinstance(node, ast.Attribute) and node.attr in PLACES:
-                found[node.attr].add(path.relative_to(root).as_posix())
-    assert found == PLACES
 
 
 # Rotation vectors.

@@ -14,27 +14,16 @@ import math
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, norm
 
 import sweep.evaluation.block
 from support.blocks import run_cells
 from support.lengths import first_of
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.estimation import Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
-from sweep.measure.likelihood import (
-    SETTLED,
-    Pixels,
-    descend,
-    marker_view,
-    noise_variance,
-    squares,
-    state_of,
-)
-from sweep.measure.photometric import Photometric, explains, found_targets, window_of
+from sweep.measure.photometric import Photometric, explains
 from sweep.model.board import single_marker
-from sweep.model.coverage import LEVELS, POSE, work_space
 from sweep.model.scene import Targets
 
 ALARM = 1e-8
@@ -134,98 +123,33 @@ def same(some, others):
     )
 
 
-class Kept:
-    """An estimator that keeps what it gets and gives, of another one."""
-
-    def __init__(self, inner):
-        self.inner, self.seen, self.given = inner, [], []
-        self.needs_images = inner.needs_images
-
-    def __call__(self, sightings):
-        estimates = self.inner(sightings)
-        self.seen.append(sightings)
-        self.given.append(estimates)
-        return estimates
-
-    @property
-    def sightings(self):
-        """Iterate over single sightings, in the order of rows."""
-        for seen in self.seen:
-            for i in range(len(seen.corners)):
-                yield seen.take(np.array([i]))
-
-
-def kept(monkeypatch, inner):
-    """Put an estimator in the place of those that pipelines ask for; return it, recording."""
-    keeper = Kept(inner)
-    monkeypatch.setattr(sweep.evaluation.block, "build", lambda _: keeper)
-    return keeper
-
-
-def chi_square_from(seen, rotation, translation):
-    """Return the chi-square of one sighting's pixels after a fit that starts from a pose."""
-    found, = found_targets(seen)
-    left, top, right, bottom = window_of(found, [])
-    image = seen.images[0][top:bottom, left:right].astype(np.float64)
-    view = marker_view(
-        seen.targets[0], seen.size_m[0], seen.cameras.optics(0), seen.origins[0] + (left, top),
-        noise_variance(float(seen.noise_grey[0])),
-    )
-    square_sum, _ = descend(
-        Pixels(image, squares(image), view),
-        state_of(rotation, translation, seen.blur_px[0], np.zeros(LEVELS)),
-        work_space(*image.shape), 1, 100, SETTLED, math.inf, np.empty((POSE, POSE)),
-    )
-    return square_sum / view.variance, image.size - POSE - LEVELS
-
-
-def above_that_from_truth(cell, keeper):
-    """Return by how much chi-square is above that of a fit from the truth, of what is solved."""
-    columns = cell.columns
-    away = []
-    for row, seen in zip(np.flatnonzero(cell.detected), keeper.sightings, strict=True):
-        if not cell.solved[row]:
-            continue
-        ratio = columns["residual_variance_ratio"][row]
-        rotation = Rotation.from_rotvec(columns["true_rvec"][row]).as_matrix()
-        chi_square, freedom = chi_square_from(seen, rotation, columns["true_tvec_m"][row])
-        away.append(ratio * freedom - chi_square)
-    return np.array(away)
-
-
 # What it attains.
 
-CELLS = {
-    "small": ("side_px=20", "tilt_deg=45", "noise_grey=2"),
-    "noisy": ("side_px=30", "tilt_deg=30", "noise_grey=8"),
-    "oblique": ("side_px=50", "tilt_deg=70", "noise_grey=4"),
-    "large": ("side_px=70", "tilt_deg=15", "noise_grey=1"),
-}
+CELLS = (
+    ("side_px=20", "tilt_deg=45", "noise_grey=2"), ("side_px=30", "tilt_deg=30", "noise_grey=8"),
+    ("side_px=50", "tilt_deg=70", "noise_grey=4"), ("side_px=70", "tilt_deg=15", "noise_grey=1"),
+)
 
 
 @pytest.fixture(scope="module")
 def regular():
-    """Return 150 trials of a few regular cells."""
-    return {name: Cell(150, *settings, seed=3) for name, settings in CELLS.items()}
+    """Return 100 trials of a few regular cells."""
+    return [Cell(100, *settings, seed=3) for settings in CELLS]
 
 
-def test_errors_are_as_large_as_the_bound(regular):
-    assert_gaussian(regular.values())
-
-
-def test_fits_converge_and_explain_the_pixels(regular):
-    cells = regular.values()
-    assert_converged(cells)
+def test_fits_converge_attain_the_bound_and_explain_the_pixels(regular):
+    assert_gaussian(regular)
+    assert_converged(regular)
     # Five standard deviations: 6e-7 a Gaussian, 1e-4 with the skewness of small images' variance.
-    estimate = np.concatenate([cell.estimate for cell in cells])
+    estimate = np.concatenate([cell.estimate for cell in regular])
     assert np.count_nonzero(estimate == EstimateStatus.not_explained) <= binom.isf(
         ALARM, len(estimate), 1e-4
     )
-    assert not any(cell.grossly_wrong.any() for cell in cells)
+    assert not any(cell.grossly_wrong.any() for cell in regular)
 
 
 def test_predicted_deviations_are_the_bound_s(regular):
-    for cell in regular.values():
+    for cell in regular:
         ratio = (cell.columns["predicted_std"] / cell.columns["bound_std"])[cell.solved]
         # The curvature is that at the estimate: it scatters by a few per cent with the pose.
         assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.03)
@@ -245,20 +169,15 @@ def test_the_bound_is_attained(trials, settings):
     assert_converged([cell])
 
 
-@pytest.mark.parametrize(("settings", "trials", "seed"), [
-    (("side_px=30", "noise_grey=8"), 100, 10),
-    # Scenes of 2,000 whose mirror, 60 to 170 above in chi-square, was once returned: a start whose
-    # coarse fit goes astray must not hide the best minimum.
-    (("side_px=15", "tilt_deg=15", "noise_grey=8"), [893], 101),
-    (("side_px=15", "tilt_deg=8", "noise_grey=4"), [455, 630, 1060], 101),
-])
-def test_estimates_are_the_lowest_minima(settings, trials, seed, monkeypatch):
-    keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
-    cell = Cell(trials if isinstance(trials, int) else np.array(trials), *settings, seed=seed)
-    away = above_that_from_truth(cell, keeper)
-    assert np.count_nonzero(away > 1) <= binom.isf(ALARM, len(away), 0.001) * (len(away) > 3)
-    # Elsewhere both fits end in one minimum, but for the last step.
-    assert np.median(np.abs(away)) < 1e-3
+@pytest.mark.parametrize(("settings", "trials"), [
+    (("tilt_deg=30", "noise_grey=8"), [712]), (("tilt_deg=15", "noise_grey=8"), [893]),
+    (("tilt_deg=8", "noise_grey=4"), [455, 630, 1060]),
+], ids=str)
+def test_a_start_whose_coarse_fit_went_astray_does_not_hide_the_best_minimum(settings, trials):
+    # The five of 2,000 scenes each whose mirror, 60 to 170 above in chi-square, was once returned.
+    cell = Cell(np.array(trials), "side_px=15", *settings, seed=101)
+    assert cell.solved.all()
+    assert not cell.flipped.any()
 
 
 def test_without_noise_the_corners_are_far_surpassed():
@@ -380,93 +299,67 @@ def test_scenes_do_not_depend_on_which_others_are_needed(kept_px, monkeypatch):
 
 # Estimators of one's own.
 
-class Nothing:
-    """An estimator that estimates nothing."""
-
-    def __init__(self, needs_images):
-        self.needs_images = needs_images
-
-    def __call__(self, sightings):
-        return Estimates.none(len(sightings.corners), EstimateStatus.solver_failed)
-
-
-BELIEFS = (
-    "believed_noise_grey=3", "believed_blur_px=0.4", "believed_size_m=0.06", "believed_fx_px=500",
-    "blur_px=0.6", "distortion=[-0.1, 0.01, 0, 0]", "side_px=40", "marker_id=7",
-)
-
-
-def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
-    keeper = kept(monkeypatch, Nothing(needs_images=True))
-    columns = run(12, *BELIEFS, seed=22).columns
-    found = columns["detection"][0] == DetectionStatus.detected
-    assert found.sum() >= 10
-    assert (columns["estimate"][0] == np.where(
-        found, EstimateStatus.solver_failed, EstimateStatus.no_detection
-    )).all()
-    assert np.isnan(columns["nees"][0]).all()
-    seen, = keeper.seen
-    assert isinstance(seen, Detections)
-    n = found.sum()
-    assert seen.corners.shape == (n, 4, 2)
-    assert (seen.noise_grey == np.full(n, 3.0)).all()
-    assert (seen.blur_px == np.full(n, 0.4)).all()
-    assert (seen.size_m == np.full(n, 0.06)).all()
-    assert (seen.cameras.view == [500.0, 4 / 3.6 * 480, 319.5, 239.5]).all()
-    assert seen.cameras.lenses[:, :2] == pytest.approx(np.tile([-0.1, 0.01], (n, 1)))
-    assert seen.cameras.distorted.all()
-    assert list(seen.targets) == [single_marker("DICT_5X5_50", 7, 1.0)] * n
-    assert len(seen.images) == len(seen.origins) == n
-
-    for corners, (x, y), image in zip(seen.corners, seen.origins, seen.images, strict=True):
-        inside = (corners - (x, y) > 0) & (corners - (x, y) < image.shape[::-1])
-        assert inside.all()
-
-
-class Superstitious:
-    """Photometric, but that it raises where a corner is at one abscissa."""
+class Recorder:
+    """An estimator that keeps the detections it gets, and fails where a row is asked for."""
 
     needs_images = True
 
-    def __init__(self, abscissa):
-        self.abscissa = abscissa
+    def __init__(self, victim=None):
+        self.seen, self.victim = [], victim
 
-    def __call__(self, sightings):
-        if (sightings.corners[:, 0, 0] == self.abscissa).any():
+    def __call__(self, detections):
+        self.seen.append(detections)
+        if self.victim is not None and (detections.corners[:, 0, 0] == self.victim).any():
             raise RuntimeError("not this one")
-        return Photometric(refined=False, spread_free=False)(sightings)
+        return Estimates.none(len(detections.corners), EstimateStatus.solver_failed)
+
+
+def recorded(monkeypatch, trials, *settings, seed=27, victim=None):
+    """Return the detections of some trials, and the result of the run."""
+    recorder = Recorder(victim)
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep.evaluation.block, "build", lambda _: recorder)
+        result = run_cells(pipeline(*settings, seed=seed), [np.arange(trials)])
+    return recorder.seen[0], result
+
+
+def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
+    seen, result = recorded(
+        monkeypatch, 12, "believed_noise_grey=3", "believed_blur_px=0.4", "believed_size_m=0.06",
+        "believed_fx_px=500", "blur_px=0.6", "distortion=[-0.1, 0.01, 0, 0]", "side_px=40",
+        "marker_id=7", seed=22,
+    )
+    found = result.columns["detection"][0] == DetectionStatus.detected
+    n = found.sum()
+    assert n >= 10
+    assert (result.columns["estimate"][0] == np.where(
+        found, EstimateStatus.solver_failed, EstimateStatus.no_detection
+    )).all()
+    assert seen.corners.shape == (n, 4, 2)
+    for given, believed in ((seen.noise_grey, 3.0), (seen.blur_px, 0.4), (seen.size_m, 0.06)):
+        assert (given == np.full(n, believed)).all()
+    assert (seen.cameras.view == [500.0, 4 / 3.6 * 480, 319.5, 239.5]).all()
+    assert seen.cameras.lenses[:, :2] == pytest.approx(np.tile([-0.1, 0.01], (n, 1)))
+    assert list(seen.targets) == [single_marker("DICT_5X5_50", 7, 1.0)] * n
+    for corners, origin, image in zip(seen.corners, seen.origins, seen.images, strict=True):
+        assert ((corners > origin) & (corners - origin < image.shape[::-1])).all()
 
 
 def test_an_estimator_that_raises_costs_one_scene_only(monkeypatch):
     monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", 4 * 640 * 480)
-    settings = ("side_px=25",)
-    keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
-    healthy = run(15, *settings, seed=26).columns
-    abscissae = np.concatenate([seen.corners[:, 0, 0] for seen in keeper.seen])
-    rows = np.flatnonzero(healthy["detection"][0] == DetectionStatus.detected)
-    victim = rows[9]
-    monkeypatch.setattr(sweep.evaluation.block, "build", lambda _: Superstitious(abscissae[9]))
-    result = run_cells(pipeline(*settings, seed=26), [np.arange(15)])
+    seen, healthy = recorded(monkeypatch, 15, "side_px=25")
+    victim = np.flatnonzero(healthy.columns["detection"][0] == DetectionStatus.detected)[2]
+    _, result = recorded(monkeypatch, 15, "side_px=25", victim=seen.corners[2, 0, 0])
     failure, = result.failures
     assert (failure.scene, failure.stage) == (victim, "estimation")
     assert "not this one" in failure.text
     assert result.columns["estimate"][0][victim] == EstimateStatus.failed
-    assert np.isnan(result.columns["nees"][0][victim])
     others = np.arange(15) != victim
-    for name in ("estimate", "translation_error_m", "nees", "predicted_std"):
-        assert same(result.columns[name][0][others], healthy[name][0][others])
-
-
-def sightings_of(monkeypatch, trials, *settings, seed=27):
-    """Return the sightings of some trials."""
-    with monkeypatch.context() as patch:
-        keeper = kept(patch, Nothing(needs_images=True))
-        run(trials, *settings, seed=seed)
-    return keeper.seen[0]
+    assert same(result.columns["estimate"][0][others], healthy.columns["estimate"][0][others])
 
 
 def test_a_sighting_does_not_depend_on_its_window(monkeypatch):
-    seen = sightings_of(monkeypatch, 6)
+    seen, _ = recorded(monkeypatch, 6)
     estimator = Photometric(refined=True, spread_free=False)
     whole = estimator(seen)
     one_by_one = Estimates.concatenate([estimator(seen.take(np.array([i]))) for i in range(6)])
@@ -475,14 +368,14 @@ def test_a_sighting_does_not_depend_on_its_window(monkeypatch):
         for field in dataclasses.fields(Estimates)
     )
     # There the corners differ by single precision's rounding, 3e-5 px; the fit forgets it.
-    framed = estimator(sightings_of(monkeypatch, 6, "window=full"))
+    framed = estimator(recorded(monkeypatch, 6, "window=full")[0])
     assert framed.translation == pytest.approx(whole.translation, rel=1e-9)
     assert framed.rotation == pytest.approx(whole.rotation, abs=1e-9)
     assert framed.residual_ratio == pytest.approx(whole.residual_ratio, rel=1e-8)
 
 
 def test_nonsense_is_not_solved(monkeypatch):
-    seen = sightings_of(monkeypatch, 5)
+    seen, _ = recorded(monkeypatch, 5)
     estimator = Photometric(refined=True, spread_free=False)
     point = dataclasses.replace(seen, corners=np.full_like(seen.corners, 300.0))
     beside = dataclasses.replace(seen, corners=seen.corners + 10_000.0)

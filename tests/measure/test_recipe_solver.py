@@ -1,7 +1,5 @@
 """The recipe "add a solver": one is added in the one place that the recipe names."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -40,7 +38,7 @@ RECORD = """
     "frontal": Solver("a frontal pose", lambda setting: FrontalSolver(), needs_images=True),
 """
 
-SCRIPT = '''
+SCRIPT = """
 import json
 import numpy as np
 from sweep.errors import PipelineError
@@ -48,20 +46,16 @@ from sweep.evaluation.block import run_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.reference import TABLES
 
-TEXT = """
-[marker]
-size_m = 0.05
-[pose]
-distance_m = 0.5
-bearing_x_deg = 4
-[axes]
-solver = ["{solver}", "ippe_square"]
-roll_deg = [0, 90]
-"""
-pipeline = Pipeline.from_text(TEXT.format(solver="frontal"))
+def read(solver):
+    return Pipeline.from_dict({
+        "marker": {"size_m": 0.05}, "pose": {"distance_m": 0.5, "bearing_x_deg": 4},
+        "axes": {"solver": [solver, "ippe_square"], "roll_deg": [0, 90]},
+    })
+
+pipeline = read("frontal")
 columns = run_cells(pipeline.experiment, [np.arange(2)]).columns
 try:
-    Pipeline.from_text(TEXT.format(solver="frontale"))
+    read("frontale")
 except PipelineError as error:
     message = str(error)
 print(json.dumps({
@@ -73,7 +67,7 @@ print(json.dumps({
     "kept": [part.reason for part in pipeline.facts.parts if part.name == "pixels kept"],
     "table": TABLES["solvers"]().rows, "parameters": TABLES["estimator"]().markdown(),
 }))
-'''
+"""
 
 
 @pytest.mark.system

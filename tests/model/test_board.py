@@ -73,30 +73,6 @@ def test_grid_is_opencvs(ids):
     assert (painted(ours, -middle, middle, 10000) == reference).all()
 
 
-def test_squares_of_an_april_grid_lie_at_the_corners_of_every_marker():
-    board = Grid(
-        dictionary="DICT_APRILTAG_36h10", rows=4, columns=5, marker_m=0.016, gap_m=0.004,
-        ids=tuple(range(19, -1, -1)), corner_squares=True,
-    ).board()
-    middle = np.array([0.048, 0.038])
-    low = -middle - 0.004
-    image = painted(board, low, -low, 1000)  # 2 px a module
-    expected = np.full(image.shape, 255.0)
-    theirs = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h10)
-    for row in range(5):
-        for column in range(6):
-            y, x = 20 * row, 20 * column
-            expected[y : y + 4, x : x + 4] = 0
-            if row < 4 and column < 5:
-                tag = cv2.aruco.generateImageMarker(theirs, 19 - 5 * row - column, 16)
-                expected[y + 4 : y + 20, x + 4 : x + 20] = tag
-    assert (image == expected).all()
-    around = painted(board, low - 0.002, -low + 0.002, 1000)
-    assert (around[2:-2, 2:-2] == image).all()
-    assert (around[:2] == 255).all()  # a sheet of one module more
-    assert (painted(board, low - 0.004, -low, 1000)[:2, :2] == 128).all()
-
-
 def test_markers_of_a_table_have_their_own_sheets_sizes_and_turns():
     board = Markers(dictionary=DICTIONARY, markers=(
         BoardMarker(marker_id=3, x_m=0.1, y_m=0.2, size_m=0.06),
@@ -115,27 +91,6 @@ def test_markers_of_a_table_have_their_own_sheets_sizes_and_turns():
     tag = cv2.aruco.generateImageMarker(OPENCV, 9, 120)
     expected[240:360, 40:160] = cv2.rotate(tag, cv2.ROTATE_90_COUNTERCLOCKWISE)
     assert (image == expected).all()
-
-
-def test_a_table_on_one_sheet_is_white_between_its_markers():
-    board = Markers(dictionary=DICTIONARY, margin_m=0.01, markers=(
-        BoardMarker(marker_id=3, x_m=0.0, y_m=0.0, size_m=0.06),
-        BoardMarker(marker_id=4, x_m=0.1, y_m=0.0, size_m=0.06),
-    )).board()
-    image = painted(board, (-0.05, -0.05), (0.15, 0.05), 1000)
-    assert (image[:10] == 128).all()
-    assert (image[10:90, 80:120] == 255).all()
-    assert (image[20:80, 20:80] == cv2.aruco.generateImageMarker(OPENCV, 3, 60)).all()
-
-
-def test_edges_can_leave_a_marker_out():
-    board = Grid(
-        dictionary=DICTIONARY, rows=1, columns=2, marker_m=0.06, gap_m=0.01, margin_m=0
-    ).board()
-    with_both, without = board.edges(), board.edges(leave_out=[1])
-    own = board.prints[1].edges
-    assert len(without.ends) == len(with_both.ends) - len(own.ends)
-    assert without.ends[:, [0, 2]].max() == pytest.approx(0.065)  # the sheet's
 
 
 def squares(centres, sides, rolls):

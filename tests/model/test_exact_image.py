@@ -146,16 +146,6 @@ def test_coverage_does_not_drift_along_the_rows_of_a_wide_frame(roll_deg):
     assert worst_difference(value) < 1e-9
 
 
-@pytest.mark.parametrize("roll_deg", [0.0, 45.0])
-def test_marker_touching_the_frame_by_a_corner_or_an_edge_is_drawn_there(roll_deg):
-    for shift_px in (-48.5, -48.0, -47.9999999, -47.5, 47.5, 47.9999999, 48.0, 48.5):
-        value = values(
-            width_px=96, height_px=96, fx_px=1024.0, size_m=1.0, distance_m=64.0,
-            shift_u_px=shift_px, shift_v_px=shift_px, roll_deg=roll_deg,
-        )
-        assert worst_difference(value) < TOLERANCE
-
-
 @pytest.mark.parametrize("on_image", [False, True])
 @lengths(5, 40)
 def test_image_is_the_clipped_area_before_the_background_rounded_once(count, on_image, tmp_path):

@@ -1,7 +1,5 @@
 """The recipe "add an effect": two are added, one a step, in the one place that the recipe names."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -26,47 +24,32 @@ RECORDS = """
     ),
 """
 
-SCRIPT = '''
+SCRIPT = """
 import json
 import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import detections_of, scenes_at, search_windows
 from sweep.measure.flags import BoundStatus
-from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import marker_levels
-from sweep.model.scene import build_scenes
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.reference import TABLES
 
-TEXT = """
-[camera]
-width_px = 160
-height_px = 120
-[marker]
-size_m = 0.05
-[pose]
-distance_m = 0.3
-tilt_deg = 20
-[scene]
-background = 90
-black = 20
-white = 230
-bound = "known_blur"
-{scene}
-[axes]
-haze = [0, 0.25]
-column_noise_grey = [0, 6]
-window = ["auto", "full"]
-"""
+def read(**scene):
+    return Pipeline.from_dict({
+        "camera": {"width_px": 160, "height_px": 120}, "marker": {"size_m": 0.05},
+        "pose": {"distance_m": 0.3, "tilt_deg": 20},
+        "scene": {"background": 90, "black": 20, "white": 230, "bound": "known_blur"} | scene,
+        "axes": {"haze": [0, 0.25], "column_noise_grey": [0, 6], "window": ["auto", "full"]},
+    })
 
-def broken(scene):
+def broken(**scene):
     try:
-        Pipeline.from_text(TEXT.format(scene=scene))
+        read(**scene)
     except PipelineError as error:
         return str(error)
 
-pipeline = Pipeline.from_text(TEXT.format(scene="column_period_px = 3"))
+pipeline = read(column_period_px=3)
 indices = [index.ravel() for index in np.indices((2, 2, 2))]
 batch = scenes_at(pipeline.experiment, indices)
 scenes, boxes, settings = batch.scenes, batch.boxes, pipeline.experiment.detectors
@@ -74,19 +57,19 @@ scenes, boxes, settings = batch.scenes, batch.boxes, pipeline.experiment.detecto
 box = tuple(boxes[0].tolist())
 mean, share = marker_levels(scenes, 0, box)
 cells = run_cells(pipeline.experiment, indices)
-margins = search_windows(scenes, boxes, settings[0], np.zeros(8, dtype=bool))
+parts = pipeline.facts.parts
 print(json.dumps({
     "box": box, "levels": (mean + (1 - share) * 90).tolist(),
     "images": [result.images[row].tolist() for row in range(8)],
-    "origins": result.origins.tolist(), "windows": margins.tolist(),
-    "parts": {part.name: [part.active, part.switch] for part in pipeline.facts.parts},
-    "draws": next(part.reason for part in pipeline.facts.parts if part.name == "random draws"),
+    "origins": result.origins.tolist(),
+    "windows": search_windows(scenes, boxes, settings[0], np.zeros(8, dtype=bool)).tolist(),
+    "parts": {part.name: [part.active, part.switch] for part in parts},
+    "draws": next(part.reason for part in parts if part.name == "random draws"),
     "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
-    "broken": [broken("haze_x = 1"), broken("read_noise_e = 3")],
-    "table": TABLES["effects"]().rows,
-    "parameters": TABLES["scene"]().markdown(),
+    "broken": [broken(haze_x=1), broken(read_noise_e=3)],
+    "table": TABLES["effects"]().rows, "parameters": TABLES["scene"]().markdown(),
 }))
-'''
+"""
 
 
 @pytest.fixture(scope="module")

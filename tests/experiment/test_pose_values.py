@@ -21,6 +21,7 @@ from sweep.model.marker import module_count
 from sweep.model.scene import build_scenes
 
 FLIP = np.diag([1.0, -1.0, -1.0])
+SCIPY = "SciPy's `Rotation`"
 ANGLE_DEG = 1e-12
 """Of an angle in degrees: 2e-14 rad, some hundred roundings."""
 
@@ -56,18 +57,25 @@ def test_view_angle_is_the_angle_to_the_line_of_sight_at_the_extremes():
     )
 
 
-def test_yaw_pitch_and_roll_are_scipys():
+def drawn(pose, count):
+    """Return as :func:`made`, of ``count`` draws from ranges (low, high) by name."""
+    return made({name: {"uniform": list(ends)} for name, ends in pose.items()}, {"trial": count})
+
+
+@lengths(1000, 100_000)
+def test_yaw_pitch_and_roll_are_scipys(count, claim):
     turns = [*range(-180, 181, 15), 1e-9, 89.9]
-    values, scenes = made(
-        {"distance_m": 1}, {"yaw_deg": turns, "pitch_deg": turns, "roll_deg": turns}
-    )
-    angles = [values[f"{name}_deg"].values for name in ("yaw", "pitch", "roll")]
-    expected = Rotation.from_euler("YXZ", np.stack(angles, axis=1), degrees=True).as_matrix()
-    np.testing.assert_allclose(scenes.rotation, expected @ FLIP, atol=1e-14)
-    one = made({"distance_m": 1, "pitch_deg": 20})[1]
-    np.testing.assert_allclose(
-        one.rotation[0], Rotation.from_euler("X", 20, degrees=True).as_matrix() @ FLIP, atol=1e-15
-    )
+    names = [f"{name}_deg" for name in ("yaw", "pitch", "roll")]
+    worst = 0.0
+    for values, scenes in (
+        made({"distance_m": 1}, dict.fromkeys(names, turns)),
+        drawn({"distance_m": (1, 2), **dict.fromkeys(names, (-180, 180))}, count),
+    ):
+        angles = np.stack([values[name].broadcast(len(scenes)) for name in names], axis=1)
+        expected = Rotation.from_euler("YXZ", angles, degrees=True).as_matrix() @ FLIP
+        worst = max(worst, np.abs(scenes.rotation - expected).max())
+    claim("rotations by yaw, pitch and roll, 10^5", SCIPY, worst, "of an element")
+    assert worst < 1e-14
 
 
 def test_places_in_metres_are_the_truth():
@@ -161,31 +169,34 @@ def test_a_marker_larger_than_the_frame_is_cut_off_alike_at_both_edges(distortio
 
 # The world
 
-def test_places_in_the_world_are_scipys():
-    axes = {
+@lengths(1000, 100_000)
+def test_places_in_the_world_are_scipys(count, claim):
+    wholes = [made({}, {
         "camera_x_m": [0, -3], "camera_y_m": [1], "camera_z_m": [0.5, 1000], "camera_yaw_deg": [20],
         "camera_pitch_deg": [-10, 90], "camera_roll_deg": [5], "marker_x_m": [2, -2],
         "marker_z_m": [0.2], "marker_yaw_deg": [180, 30], "marker_pitch_deg": [-90, 0, 12],
         "marker_roll_deg": [0, 40],
-    }
-    values, scenes = made({}, axes)
-    count = len(scenes)
-    of = {name: values[name].broadcast(count) if not values[name].missing else np.zeros(count)
-          for name in WORLD}
-
-    def part(whose):
-        place = np.stack([of[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
-        angles = [of[f"{whose}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
-        return place, Rotation.from_euler("ZYX", np.stack(angles, axis=1), degrees=True)
-
-    (camera, body), (marker, other) = part("camera"), part("marker")
+    }), drawn({name: (-100, 100) if name.endswith("_m") else (-180, 180) for name in WORLD}, count)]
     image = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     face = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    expected = (image * body.inv() * other * face).as_matrix()
-    np.testing.assert_allclose(scenes.rotation, expected, atol=1e-14)
-    np.testing.assert_allclose(
-        scenes.translation, image.apply(body.inv().apply(marker - camera)), atol=1e-12
-    )
+    worst = np.zeros(2)
+    for values, scenes in wholes:
+        of = {name: np.zeros(len(scenes)) if values[name].missing
+              else values[name].broadcast(len(scenes)) for name in WORLD}
+
+        def part(whose, of=of):
+            place = np.stack([of[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
+            angles = [of[f"{whose}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
+            return place, Rotation.from_euler("ZYX", np.stack(angles, axis=1), degrees=True)
+
+        (camera, body), (marker, other) = part("camera"), part("marker")
+        turned = (image * body.inv() * other * face).as_matrix()
+        moved = image.apply(body.inv().apply(marker - camera))
+        worst = np.maximum(worst, [np.abs(scenes.rotation - turned).max(),
+                                   np.abs(scenes.translation - moved).max()])
+    claim("rotations in the world, 10^5", SCIPY, worst[0], "of an element")
+    claim("positions in the world, up to 1 km, 10^5", SCIPY, worst[1], "m")
+    assert (worst < [1e-14, 1e-12]).all()
 
 
 # Any pose, to the ends of the ranges

@@ -640,7 +640,10 @@ def diagnose(
         zero_sd_m=zero_sd_m, compared=compared, output=output)
 
 
-def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
+def error_model(
+    store: str | os.PathLike[str] | xr.Dataset,
+    photographs: str | os.PathLike[str] | xr.Dataset | None = None,
+) -> DetectionModel:
     """Make a model of the error of one detection: covariance, bias, probability of a flip.
 
     Parameters
@@ -648,6 +651,9 @@ def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
     store
         A simulation of one detector setting and one solver, with drawn poses: its path, or results
         of `open`, of which one setting was chosen with ``.isel``.
+    photographs
+        A store of `photos` with the same setting and solver, or its results: the covariance is
+        multiplied by a factor, so that it describes their errors. Judge it on others.
 
     Returns
     -------
@@ -659,7 +665,8 @@ def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
     Raises
     ------
     StoreError, DatasetError
-        If there is no store, fewer than 2,000 solved poses, or several settings.
+        If there is no store, fewer than 2,000 solved poses or 50 of photographs, or several
+        settings.
 
     Examples
     --------
@@ -673,7 +680,7 @@ def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
     >>> at.covariance.shape, at.covariance.dims
     ((3, 6, 6), ('pose', 'row', 'column'))
     """
-    return library.detection.error_model(store)
+    return library.detection.error_model(store, photographs)
 
 
 def measure_tradeoff(

@@ -39,6 +39,9 @@ AMBIGUITY_SHARES = (0.02, 0.4, 0.7, 0.85, 0.93, 0.98, 0.998)
 MIN_POSES = 2000
 """Solved poses from which on a model is made."""
 
+MIN_PHOTOGRAPHED = 50
+"""Poses in photographs from which on a factor of the covariance is known."""
+
 MIN_AT_KNOT = 25.0
 """Poses (sum of hat functions) at each knot that is used, below which nothing is known there."""
 
@@ -152,10 +155,64 @@ class DetectionModel:
         return cls(**values)
 
 
-def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
+def error_model(
+    store: xr.Dataset | str | os.PathLike[str],
+    photographs: xr.Dataset | str | os.PathLike[str] | None = None,
+) -> DetectionModel:
     """Return a model of one detection's error: `sweep.error_model`."""
-    results = store if isinstance(store, xr.Dataset) else open_dataset(os.fspath(store))
-    errors, rvec, tvec, ratio, flipped = estimated(results)
+    results, seen = (
+        open_dataset(os.fspath(each)) if isinstance(each, (str, os.PathLike)) else each
+        for each in (store, photographs))
+    assert results is not None  # noqa: S101  (the type of ``store``)
+    model = of_simulation(results)
+    return model if seen is None else widened(model, seen)
+
+
+def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
+    """Return a model whose covariance times a factor describes the errors in photographs."""
+    factor = 1.0
+    for _ in range(ROUNDS):  # the truth's own errors are not multiplied
+        wider = dataclasses.replace(
+            model, log_covariance=model.log_covariance + math.log(factor) * np.eye(6))
+        squares = judged(wider, photographs)["squared_error"].values
+        used = int(np.isfinite(squares).sum())
+        if used < MIN_PHOTOGRAPHED:
+            raise DatasetError(
+                f"{used} solved poses of photographs that are not flipped and that the simulation "
+                f"knows: a factor needs {MIN_PHOTOGRAPHED} or more; take more photographs, or "
+                "simulate their poses (`sweep.twins`)")
+        factor *= float(np.nanmean(squares)) / 6.0
+    return wider
+
+
+def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
+    """Return what a model says of the solved poses of a dataset, beside their errors.
+
+    Returns
+    -------
+    xr.Dataset
+        As `DetectionModel.at`, and ``error`` (pose, row): estimated minus true, less the bias;
+        ``truth_std`` (pose, row), 0 where it is not known; ``flipped``; ``squared_error``: the
+        error's square in units of both covariances, 6 on average where these are right, NaN of
+        flipped poses and where nothing is known.
+    """
+    errors, rvec, tvec, ratio, flipped, deviations = estimated(results)
+    found = model.at(rvec, tvec, ratio)
+    lengths = np.linalg.norm(tvec, axis=1)
+    left = errors * np.repeat([lengths, np.ones(len(tvec))], 3, axis=0).T - found["bias"].values
+    covariance = found["covariance"].values + np.eye(6) * deviations[:, None, :] ** 2
+    squares = np.full(len(left), np.nan)
+    used = found["known"].values & ~flipped
+    squares[used] = np.einsum(
+        "ni,nij,nj->n", left[used], np.linalg.inv(covariance[used]), left[used])
+    return found.assign(
+        error=(("pose", "row"), left), truth_std=(("pose", "row"), deviations),
+        flipped=("pose", flipped), squared_error=("pose", squares))
+
+
+def of_simulation(results: xr.Dataset) -> DetectionModel:
+    """Return the model of a simulation's poses."""
+    errors, rvec, tvec, ratio, flipped, _ = estimated(results)
     if len(tvec) < MIN_POSES:
         raise DatasetError(f"{len(tvec):,} solved poses; a model of one detection needs "
                            f"{MIN_POSES:,} or more: more trials")
@@ -208,10 +265,11 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
     return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
 
 
-def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks]:
-    """Return errors (n, 6) of solved poses, the estimates, their ambiguity, and the flips.
+def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks, Floats]:
+    """Return errors (n, 6) of solved poses, estimates, ambiguity, flips, and errors of the truth.
 
-    Errors are along and about the camera's axes, those of positions over the estimated range.
+    Errors are along and about the camera's axes, those of positions over the estimated range; the
+    truth's standard deviations (n, 6), in metres and radians, are 0 where they are not known.
 
     Raises
     ------
@@ -229,8 +287,14 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
                            "results.isel(...)")
     one = {dim: 0 for dim in results["estimate"].dims if dim not in scene}
     poses = [dim for dim in scene if dim != "xyz"]
-    table = results[list(names)].isel(one, drop=True).load().stack(pose=poses, create_index=False)
+    own = [name for name in ("truth_std",) if name in results]
+    table = results[[*names, *own]].isel(one, drop=True).load().stack(
+        pose=poses, create_index=False)
     used = (table["estimate"] == EstimateStatus.solved).values
+    deviations = np.zeros((used.sum(), 6))
+    for name in own:  # rotation, then position
+        deviations += np.nan_to_num(table[name].transpose("pose", ...).values[used])[:, [
+            3, 4, 5, 0, 1, 2]]
     rvec, tvec, rotation, position = (
         table[name].transpose("pose", "xyz").values[used].astype(np.float64) for name in names[:4])
     chosen, other, flipped = (table[name].values[used] for name in names[4:7])
@@ -240,7 +304,7 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
         [position / np.linalg.norm(estimate, axis=1)[:, None], rotation], axis=1)
     known = np.isfinite(other) & (other > 0)  # a solver may return one solution alone
     ratio = np.divide(chosen, other, out=np.zeros(len(other)), where=known)
-    return errors, turned, estimate, ratio, flipped == Flipped.flipped
+    return errors, turned, estimate, ratio, flipped == Flipped.flipped, deviations
 
 
 def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> tuple[Floats, Floats]:

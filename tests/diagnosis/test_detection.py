@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.diagnosis.detection import DetectionModel, error_model, estimated
+from sweep.diagnosis.detection import DetectionModel, error_model, judged
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import (
@@ -52,24 +52,29 @@ def model():
     return error_model(drawn(1))
 
 
-def judged(model, results):
-    """Return squared distances of unflipped poses, and (chance, flipped) of all known ones."""
-    _, rvec, tvec, ratio, flipped = estimated(results)
-    found = model.at(rvec, tvec, ratio)
-    known = found["known"].values
-    error = np.concatenate([results["translation_error_m"], results["rotation_error_rad"]], axis=1)
-    left = (error - found["bias"].values)[known & ~flipped]
-    squares = np.einsum("ni,nij,nj->n", left, np.linalg.inv(
-        found["covariance"].values[known & ~flipped]), left)
-    return squares, found["flip_probability"].values[known], flipped[known]
-
-
 def test_errors_of_other_draws_are_as_large_as_the_covariance_says(model):
-    squares, chance, flipped = judged(model, drawn(2))
-    assert 5.8 < squares.mean() < 6.2
+    found = judged(model, drawn(2))
+    known = found["known"].values
+    chance, flipped = (found[name].values[known] for name in ("flip_probability", "flipped"))
+    assert 5.8 < found["squared_error"].mean() < 6.2
     for bin_ in np.array_split(np.argsort(chance), 5):
         expected, spread = chance[bin_].sum(), np.sqrt((chance * (1 - chance))[bin_].sum())
         assert abs(flipped[bin_].sum() - expected) < 4 * spread + 3
+
+
+def test_a_factor_from_photographs_widens_the_covariance_to_their_errors():
+    photographs = drawn(3, 3000)
+    for name in ("rotation_error_rad", "translation_error_m"):
+        unflipped = photographs["flipped"] == Flipped.not_flipped
+        photographs[name] = photographs[name] * xr.where(unflipped, 2.0, 1.0)
+    photographs["truth_std"] = (("trial", "component"), np.full((3000, 6), 1e-4))
+    seen, others = photographs.isel(trial=slice(1500)), photographs.isel(trial=slice(1500, None))
+    simulated = drawn(1)
+    assert judged(error_model(simulated), others)["squared_error"].mean() > 20
+    wider = error_model(simulated, seen)
+    assert 5.5 < judged(wider, others)["squared_error"].mean() < 6.5
+    with pytest.raises(DatasetError, match="take more photographs"):
+        error_model(simulated, seen.isel(trial=slice(40)))
 
 
 def test_outside_what_was_simulated_nothing_is_known(model):

@@ -109,37 +109,31 @@ def write_store(folder, poses):
 
 
 def chunk(rng, pipeline, block):
-    """Return plausible values of a block: small markers are missed, steep ones flip less."""
+    """Return plausible values of a block: small markers are missed; errors grow as they shrink."""
     scene = block.shape
+    estimated = (*scene[:-1], len(pipeline.axis("solver")), scene[-1])
     sides = np.array(pipeline.axis("side_px").values)[block.starts[2]:block.stops[2], None]
-    tilts = np.array(pipeline.axis("tilt_deg").values)[block.starts[1]:block.stops[1]]
-    solvers = len(pipeline.axis("solver"))
     depth = np.broadcast_to(30.0 / sides, scene)
     found = rng.random(scene) < 1 - np.exp(-sides / 8)
-    solved = found[..., None] & (rng.random((*scene, solvers)) < 0.995)
-    flipped = solved & (rng.random((*scene, solvers)) < (0.1 - 0.001 * tilts)[:, None, None, None])
-    noise = (0.3 / sides)[..., None, None]
-    rotation = noise * rng.standard_normal((*scene, solvers, 3), dtype=np.float32)
-    position = noise * rng.standard_normal((*scene, solvers, 3), dtype=np.float32)
-    for errors in (rotation, position):
-        errors[~solved] = np.nan
-    angle = np.degrees(np.sqrt((rotation**2).sum(axis=-1)))
-    of_solvers = {
-        "estimate": np.where(solved, EstimateStatus.solved, np.where(
-            found[..., None], EstimateStatus.solver_failed, EstimateStatus.no_detection)),
-        "flipped": np.where(flipped, Flipped.flipped, np.where(
-            solved, Flipped.not_flipped, Flipped.no_estimate)),
-        "rotation_error_rad": rotation, "translation_error_m": position,
-        "rotation_error_deg": angle,
-        "reprojection_error_px": np.where(solved, 0.1, np.nan).astype("f4"),
-        "alternative_reprojection_error_px": np.where(
-            solved, rng.uniform(0.1, 1.0, (*scene, solvers)), np.nan).astype("f4"),
-    }
+    solved = found[..., None, :] & (rng.random(estimated) < 0.995)
+    flipped = solved & (rng.random(estimated) < 0.05)
+    errors = rng.standard_normal((2, *estimated, 3), dtype=np.float32)
+    errors *= 0.3 / sides[..., None, None]
+    errors[:, ~solved] = np.nan
     return {
         "true_tvec_m": np.stack([0 * depth, 0 * depth, depth], axis=-1),
         "marker_area_px": sides**2 * rng.uniform(0.9, 1.0, scene),
         "detection": np.where(found, DetectionStatus.detected, DetectionStatus.no_candidate),
-    } | {name: np.moveaxis(values, 4, 3) for name, values in of_solvers.items()}
+        "estimate": np.where(solved, EstimateStatus.solved, np.where(
+            found[..., None, :], EstimateStatus.solver_failed, EstimateStatus.no_detection)),
+        "flipped": np.select(
+            [flipped, solved], [Flipped.flipped, Flipped.not_flipped], Flipped.no_estimate),
+        "rotation_error_rad": errors[0], "translation_error_m": errors[1],
+        "rotation_error_deg": np.degrees(np.linalg.norm(errors[0], axis=-1)),
+        "reprojection_error_px": np.where(solved, 0.1, np.nan),
+        "alternative_reprojection_error_px": np.where(
+            solved, rng.uniform(0.1, 1.0, estimated), np.nan),
+    }
 
 
 def measured(store, call):

@@ -33,11 +33,11 @@ def added(folder, *changes):
 
 
 def printed_by(folder, script):
-    """Run a script with the package in a folder; return what it prints, read as JSON."""
+    """Run a script with the package in a folder; return its last line, read as JSON."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment, cwd=folder,
         capture_output=True, text=True, check=False,
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(done.stdout.splitlines()[-1])

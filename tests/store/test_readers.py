@@ -1,8 +1,10 @@
-"""Readers beside a writer: no flag speaks of a number that is not there, no block is torn."""
+"""Readers beside a writer and of copies: no torn block, what is gone is named with its remedy."""
 
 import pickle
+import random
 import shutil
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +13,20 @@ import zarr.storage._local as local
 
 import sweep
 from support.store_files import editable
-from support.stores import by_hand
+from support.stores import by_hand, same
+from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
+from sweep.execution.reuse import match
+from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
+from sweep.integrity.reproduction import reproduce
 from sweep.integrity.verification import verify
 from sweep.measure.flags import EstimateStatus, present_values
-from sweep.store.blocks import drop_block, receipts
+from sweep.processor import processor
+from sweep.store.blocks import committed, drop_block, missing_chunks, receipts
 from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
@@ -38,10 +45,45 @@ trial = 4
 solver = ["ippe_square", "iterative"]
 """
 
+GRID = """
+seed = 3
+[pose]
+jitter_px = 0.5
+tilt_deg = { uniform = [0, 60] }
+[axes]
+side_px = [30, 60]
+solver = ["ippe_square", "iterative"]
+trial = 4
+"""
+
+EXTENTS = (1, 2)
+"""Four blocks of the grid."""
+
 
 @pytest.fixture(scope="module")
 def pipeline():
     return Pipeline.from_text(TEXT, name="read")
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return Pipeline.from_text(GRID, name="grid")
+
+
+@pytest.fixture(scope="module")
+def written(grid, tmp_path_factory):
+    """A store of the grid of which every block is committed, and that is not finished."""
+    url = tmp_path_factory.mktemp("written") / "written.zarr"
+    by_hand(str(url), grid, EXTENTS)
+    return url
+
+
+@pytest.fixture
+def copied(written, tmp_path):
+    """A copy of the store that is finished."""
+    url = Path(shutil.copytree(written, tmp_path / "whole.zarr"))
+    close(open_store(str(url), "r+"))
+    return url
 
 
 def see_no_flag_without_its_numbers(values):
@@ -129,3 +171,96 @@ def test_blocks_that_were_swapped_with_their_receipts_are_found(pipeline, tmp_pa
     assert {damage.block for damage in found.damage} == {0, 1}
     with pytest.raises(StoreError, match=r"receipt of block 0 is damaged.*verify --repair"):
         status(str(url))
+
+
+def copy_of(url, to, draw):
+    """Copy a store as one that was written meanwhile: receipts without some of their chunks."""
+    shutil.copytree(url, to)
+    store = open_store(str(to))
+    variables = sorted(variable.name for variable in store.variables)
+    lost = set()
+    for number in draw.sample(range(4), 2):
+        for name in draw.sample(variables, draw.randint(1, len(variables))):
+            path = to / store.chunks.key(name, number)
+            path.write_bytes(b"") if draw.random() < 0.2 else path.unlink()
+        lost.add(number)
+    return lost
+
+
+def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
+    grid, written, tmp_path, capsys
+):
+    copied, draw = tmp_path / "copied.zarr", random.Random(12)
+    assert missing_chunks(open_store(str(written)), range(4)) == {}
+    lost = copy_of(written, copied, draw)
+    store = open_store(str(copied), "r+")
+    found = missing_chunks(store, committed(store))
+    assert found.keys() == lost
+    for path in (copied / key for key in found.values()):
+        assert not path.exists() or path.stat().st_size == 0
+    with pytest.raises(StoreError, match=rf"{len(lost)} of 4 blocks lack chunks"):
+        close(store)
+    assert not open_store(str(copied)).finished
+    assert execute(grid, copied).computed_blocks == len(lost)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{len(lost)} committed blocks lack chunks, such as" in line
+    assert same(copied, written)
+    assert verify(str(copied), 0).damage == []
+
+
+@pytest.mark.parametrize("lost", [
+    ("detection/c/0", "rotation_error_rad/c/1/0/1"), ("true_rvec/c",), ("commits/receipt/c/2",),
+    ("tilt_deg/c/0/1",),
+], ids=["parts", "a variable", "a receipt", "a drawn coordinate"])
+def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied, capsys):
+    for key in lost:
+        path = copied / key
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    name = lost[0].partition("/c")[0]
+    for reader in (sweep.open, status, lambda url: match(grid, open_store(url))):
+        if name == "commits/receipt" and reader is not sweep.open:
+            continue
+        with pytest.raises(StoreError, match=rf"{name}/c/.* of block .*sweep verify --repair"):
+            reader(str(copied))
+    for command, *more in (["status"], ["require", "detection >= 0.1"]):
+        assert main([command, str(copied), *more]) == 2
+        assert "sweep verify --repair" in capsys.readouterr().err
+    assert {damage.block for damage in verify(str(copied), 0).damage} <= set(range(4))
+    if name == "detection":
+        with pytest.raises(StoreError, match="detection/c/0"):
+            reproduce(str(copied), "side_px=30")
+
+
+@pytest.mark.parametrize(("name", "values"), [
+    ("side_px", [30.0, 61.0]), ("solver", ["iterative", "ippe_square"]),
+    ("xyz", ["x", "z", "y"]), ("size_m", 0.02),
+])
+def test_readers_name_a_coordinate_that_was_rewritten(name, values, copied, capsys):
+    array = editable(copied, name)
+    array[...] = np.array(values, dtype=object if array.dtype.kind in "OTU" else None)
+    with pytest.raises(StoreError, match=rf"{name}/c.*changed.*--repair"):
+        sweep.open(copied)
+    assert main(["require", str(copied), "detection >= 0.1"]) == 2
+    assert f"{name}/c" in capsys.readouterr().err
+    assert name in {damage.where.partition("/")[0] for damage in verify(str(copied), 0).damage}
+
+
+def test_reused_cells_keep_the_processor_that_computed_them(
+    grid, tmp_path, monkeypatch, capsys
+):
+    old, url = str(tmp_path / "old.zarr"), str(tmp_path / "grown.zarr")
+    with monkeypatch.context() as patch:
+        patch.setattr("sweep.execution.block_task.processor", lambda: "elsewhere")
+        by_hand(old, grid, EXTENTS)
+    grown = Pipeline.from_text(GRID.replace("trial = 4", "trial = 6"), name="grown")
+    store = create_store(url, grown, (1, 3))
+    for block in store.blocks:
+        compute_block(url, store.run_id, block, (old,))
+    close(store)
+    found = [receipt.processors for _, receipt in receipts(store, range(4))]
+    assert found == [("elsewhere",), tuple(sorted({"elsewhere", processor()}))] * 2
+    report = verify(url, 40)
+    assert (report.damage, report.processors) == ([], {"elsewhere": 4, processor(): 2})
+    for command in ("verify", "status"):
+        assert main([command, url]) == 0
+        assert "processors with 2 different sets of features" in capsys.readouterr().out

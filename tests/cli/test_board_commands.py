@@ -1,15 +1,12 @@
-"""Every command and every analysis on a store of boards: an answer, or one line that says why not.
+"""Every command on a store of boards: an answer, or one line that says why not.
 
 The targets are one marker, a ChArUco and a grid of the same area, on one axis.
 """
 
 import pytest
-import xarray as xr
 
 import sweep
-from sweep import analysis
 from sweep.cli import main
-from sweep.errors import SweepError
 
 BOARDS = {
     "seed": 22,
@@ -58,41 +55,3 @@ def test_a_command_answers_of_boards_or_refuses_in_a_line(command, store, monkey
         assert len(error.strip().splitlines()) == 1
     else:
         assert status in ({0, 1, 3} if command == "require" else {0}), error
-
-
-ANALYSES = {
-    "ambiguity": lambda each: analysis.ambiguity(each, ["distance_m"]),
-    "check_requirements": lambda each: analysis.check_requirements(each, ["detection >= 0.5"]),
-    "compare": lambda each: analysis.compare(each, each),
-    "covariance_trust": analysis.covariance_trust,
-    "detection_limit": analysis.detection_limit,
-    "detection_rate": analysis.detection_rate,
-    "efficiency": analysis.efficiency,
-    "error_models": analysis.error_models,
-    "error_statistics": analysis.error_statistics,
-    "failure_composition": analysis.failure_composition,
-    "farthest_met": lambda each: analysis.farthest_met(each, ["detection >= 0.5"],
-                                                       along="distance_m"),
-    "flip_rate": analysis.flip_rate,
-    "marker_ranking": analysis.marker_ranking,
-    "precision_reached": lambda each: analysis.precision_reached(each, {"detection_rate": 0.1}),
-    "renderer_bias": analysis.renderer_bias,
-    "requirement_limits": lambda each: analysis.requirement_limits(
-        each, ["detection >= 0.5"], along="distance_m"),
-    "store_differences": lambda each: analysis.store_differences(each, each),
-    "decode_flags": sweep.decode_flags,
-}
-
-
-@pytest.mark.parametrize("markers", [False, True], ids=["boards", "markers"])
-@pytest.mark.parametrize("analysed", ANALYSES)
-def test_an_analysis_answers_of_boards_or_refuses_in_a_line(analysed, markers, store):
-    results = sweep.open(store)
-    results = analysis.per_marker(results) if markers else results
-    try:
-        assert isinstance(ANALYSES[analysed](results).compute(), xr.Dataset)
-    except SweepError as error:
-        refusal = str(error)
-    else:
-        refusal = ""
-    assert "\n" not in refusal

@@ -4,6 +4,7 @@ import argparse
 import ast
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError
@@ -215,3 +216,26 @@ def test_python_3_10_is_refused_in_one_line():
     old = "import sys; sys.version_info = (3, 10, 4); "
     done = python(f"{old}sys.argv[0] = '/usr/bin/sweep'; import sweep")
     assert (done.returncode, done.stderr) == (1, f"{problem}\n")
+
+
+# Completion.
+
+@pytest.mark.system
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_script_is_one_of_its_shell_and_has_every_command_and_option(shell, capsys, tmp_path):
+    pytest.importorskip("shtab")
+    assert cli.main(["completion", shell]) == 0
+    text = capsys.readouterr().out
+    for parser in build_parser()[1]:
+        assert parser.prog.removeprefix("sweep ") in text
+        for option in parser._option_string_actions:
+            assert option.lstrip("-") in text
+    if shutil.which(shell) is not None:
+        (tmp_path / "script").write_text(text)
+        subprocess.run([shell, "-n", tmp_path / "script"], check=True)
+
+
+def test_without_its_package_the_remedy_is_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert cli.main(["completion", "bash"]) == 1
+    assert capsys.readouterr().err.strip().endswith("pip install shtab")

@@ -13,10 +13,8 @@ from support.reports import command
 from sweep import cli
 from sweep.errors import MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
-from sweep.execution.runner import execute
 from sweep.experiment.grid import Block
-from sweep.experiment.pipeline import Pipeline
-from sweep.store.locations import check_writable, exists
+from sweep.store.locations import check_writable
 
 PIPELINE = """
 [pose]
@@ -103,27 +101,6 @@ def test_a_store_that_can_only_be_read_is_not_begun(folder, monkeypatch):  # noq
     monkeypatch.setattr("sweep.store.locations.remote_run_id", lambda _: None)
     assert line_of("run", "small.toml", "--store", "https://example.org/x.zarr") == (
         "https://example.org/x.zarr: can only be read; choose a path or s3://")
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may become another user")
-def test_a_folder_that_may_not_be_searched_is_told(folder, monkeypatch):
-    private = folder / "private"
-    private.mkdir(mode=0o700)
-    folder.chmod(0o777)
-    # The other user may be unable to read this environment: what is needed is imported before.
-    for reader in READERS:
-        line_of(*reader, "none.zarr")
-    monkeypatch.setattr("sweep.installation.check_installation", lambda: None)
-    os.seteuid(54321)
-    try:
-        assert not exists("none.zarr")
-        for reader in READERS:
-            line = line_of(*reader, "private/s.zarr")
-            assert line == "private/s.zarr: cannot be read: Permission denied"
-        with pytest.raises(StoreError, match="cannot be read: Permission denied"):
-            execute(Pipeline.from_text(PIPELINE), "private/s.zarr")
-    finally:
-        os.seteuid(0)
 
 
 def test_a_worker_that_does_not_see_the_store_says_what_it_needs(folder):

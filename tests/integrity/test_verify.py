@@ -13,9 +13,10 @@ import pytest
 import sweep
 from support.flags_and_numbers import contradictions
 from support.poison import Poison, poisoned, raising
-from support.store_files import edit_receipt, editable, files, see_same
+from support.store_files import edit_receipt, edit_root, editable, files, see_same
 from support.stores import by_hand
-from sweep.errors import StoreError
+from sweep.cli import main
+from sweep.errors import StoreError, SweepError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
@@ -374,3 +375,59 @@ def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
     assert found.damage == []
     assert set(found.left_over) == set(extra)
     see_repaired(copied, sound, set(), here)
+
+
+# Stores that fit no pipeline: refused in a line.
+
+def see_refused(url, capsys):
+    """Assert that all refuse a store in a line; verify may tell damage in place of that."""
+    with pytest.raises(SweepError) as told:
+        sweep.open(url)
+    assert str(told.value).isprintable()
+    capsys.readouterr()
+    assert main(["status", str(url)]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    code = main(["verify", str(url), "--sample", "0"])
+    said = capsys.readouterr()
+    assert "damaged" in said.out if code == 1 else (code, said.err.count("\n")) == (2, 1)
+
+
+CHANGED = {
+    "type": lambda text: text.replace('"float32"', '"float64"'),
+    "chunks": lambda text: text.replace('"chunk_shape"', '"chunkshape"'),
+    "scaled": lambda text: text.replace('"attributes":', '"attributes": {"scale_factor": 9}, "x":'),
+    "nested too deeply": lambda _: "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("change", CHANGED.values(), ids=CHANGED)
+def test_array_whose_metadata_was_changed_is_refused(change, copied, capsys):
+    path = copied / "translation_error_m/zarr.json"
+    before = path.read_text()
+    path.write_text(change(before))
+    assert path.read_text() != before
+    see_refused(copied, capsys)
+
+
+@pytest.mark.parametrize("change", [
+    lambda attributes, _: attributes.update(pipeline="\x00\x1b[2J"),
+    lambda _, metadata: metadata.update(fingerprint=5),
+])
+def test_root_of_something_else_is_refused(change, copied, capsys):
+    edit_root(copied, change)
+    see_refused(copied, capsys)
+
+
+@pytest.mark.parametrize("number", [7, None])
+def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_path, capsys):
+    edit_root(copied, lambda _, metadata: metadata.update(format=number))
+    see_refused(copied, capsys)
+    file = tmp_path / "small.toml"
+    file.write_text(TEXT)
+    for more in (["--store", str(copied)], ["--reuse", str(copied), "--store", f"{tmp_path}/n"]):
+        assert main(["run", str(file), *more]) == 2
+        said = capsys.readouterr().err
+        assert f"{copied}: store format {number}" in said
+        assert "sweep run PIPELINE --store NEW" in said
+        assert said.count("\n") == 1

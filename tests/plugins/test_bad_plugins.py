@@ -20,35 +20,17 @@ from sweep.plugins.loading import call
 from sweep.store.provenance import fingerprint
 from sweep.tradeoff.costs import clock_of
 
-DETECTORS = '''
+DETECTOR = """
 import os
 import numpy as np
 
-class At:
-    """Misbehaves where there is a marker."""
-    def __init__(self, settings, family):
-        pass
-    def __call__(self, image):
-        return self.returned(image) if image.max() > 200 else ([], [])
-
-def at(function):
-    return type("At", (At,), {"returned": lambda self, image: function(image)})
-
 ONE = np.zeros((1, 4, 2))
-nan = at(lambda image: (ONE * np.nan, [0]))
-shape = at(lambda image: (ONE[0], [0]))
-many = at(lambda image: (np.zeros((10000, 4, 2)), np.zeros(10000, int)))
-masked = at(lambda image: (np.ma.masked_array(ONE, mask=True), [0]))
-ids_float = at(lambda image: (ONE, [0.0]))
-ids_negative = at(lambda image: (ONE, [-1]))
-nothing = at(lambda image: None)
-changes = at(lambda image: (image.fill(0), ([], []))[1])
-raises = at(lambda image: open("model.onnx"))
-exits = at(lambda image: os.sys.exit(3))
 
-never_made = lambda settings, family: 1 / 0
-no_function = lambda settings, family: 3
-'''
+def at_marker(settings, family):
+    return lambda image: {returned} if image.max() > 200 else ([], [])
+
+D = {made}
+"""
 
 GRID = """
 [camera]
@@ -59,38 +41,44 @@ size_m = 0.05
 [pose]
 side_px = 48
 [axes]
-detector = ["opencv", "bad:{name}"]
+detector = ["opencv", "bad:D"]
 """
 
 
 @pytest.fixture
 def pipeline(tmp_path):
-    (tmp_path / "bad.py").write_text(DETECTORS)
-    return lambda name: Pipeline.from_text(GRID.format(name=name), folder=tmp_path)
+    """Return a function that makes a pipeline with a detector that returns this at a marker."""
+    def written(returned="([], [])", made="at_marker"):
+        (tmp_path / "bad.py").write_text(DETECTOR.format(returned=returned, made=made))
+        return Pipeline.from_text(GRID, folder=tmp_path)
+
+    return written
 
 
-@pytest.mark.parametrize(("name", "told"), [
-    ("nan", "returned corners that are not finite"),
-    ("shape", "returned corners of shape (4, 2); expected (n, 4, 2)"),
-    ("many", "returned 10,000 corners for one image; expected at most 1,000"),
-    ("masked", "returned corners of which some are masked; expected NaN or none"),
-    ("ids_float", "returned ids of type float64; expected whole numbers"),
-    ("ids_negative", "returned the ID -1; expected at least 0"),
-    ("nothing", "returned a NoneType; expected a tuple (corners, ids)"),
-    ("changes", "changed the image that it was given; copy it first"),
-    ("raises", "raises FileNotFoundError"),
-    ("exits", "raises SystemExit: 3"),
+@pytest.mark.parametrize(("returned", "told"), [
+    ("(ONE * np.nan, [0])", "returned corners that are not finite"),
+    ("(ONE[0], [0])", "returned corners of shape (4, 2); expected (n, 4, 2)"),
+    ("(np.zeros((10000, 4, 2)), np.zeros(10000, int))",
+     "returned 10,000 corners for one image; expected at most 1,000"),
+    ("(np.ma.masked_array(ONE, mask=True), [0])",
+     "returned corners of which some are masked; expected NaN or none"),
+    ("(ONE, [0.0])", "returned ids of type float64; expected whole numbers"),
+    ("(ONE, [-1])", "returned the ID -1; expected at least 0"),
+    ("None", "returned a NoneType; expected a tuple (corners, ids)"),
+    ("(image.fill(0), ([], []))[1]", "changed the image that it was given; copy it first"),
+    ("open('model.onnx')", "raises FileNotFoundError"),
+    ("os.sys.exit(3)", "raises SystemExit: 3"),
 ])
-def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, name, told):
-    bad = pipeline(name)
-    use(bad, "detector", f"bad:{name}")  # on a blank frame nothing is wrong
+def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, returned, told):
+    bad = pipeline(returned)
+    use(bad, "detector", "bad:D")  # on a blank frame nothing is wrong
     cells = run_cells(bad, [])
     assert [flags.tolist() for flags in cells.columns["detection"]] == [
         [DetectionStatus.detected], [DetectionStatus.failed],
     ]
     (failure,) = cells.failures
     assert (failure.stage, failure.setting) == ("detection", 1)
-    assert f"PluginError: bad:{name}: {told}" in failure.text.splitlines()[-1]
+    assert f"PluginError: bad:D: {told}" in failure.text.splitlines()[-1]
 
 
 def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
@@ -105,14 +93,14 @@ def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize(("name", "told"), [
-    ("never_made", "raises ZeroDivisionError: division by zero"),
-    ("no_function", "make returns a int, not a function"),
+@pytest.mark.parametrize(("made", "told"), [
+    ("lambda settings, family: 1 / 0", "raises ZeroDivisionError: division by zero"),
+    ("lambda settings, family: 3", "make returns a int, not a function"),
 ])
-def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, name, told):
+def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, made, told):
     with pytest.raises(PluginError) as refused:
-        check_plugins(Here(), pipeline(name))
-    assert str(refused.value) == f"bad:{name}: {told}"
+        check_plugins(Here(), pipeline(made=made))
+    assert str(refused.value) == f"bad:D: {told}"
 
 
 @pytest.mark.parametrize(("source", "told"), [
@@ -180,45 +168,42 @@ def test_names_of_plug_ins_that_are_not_there(text, told, tmp_path):
     assert told in line
 
 
-SOLVERS = """
+SOLVER = """
 import numpy as np
-
-def returning(function):
-    return lambda settings: lambda detections: function(len(detections.corners))
 
 EYE = np.diag([1.0, -1.0, -1.0])
 
 def poses(count, rotation=EYE, depth=0.4):
     return np.tile(rotation, (count, 1, 1)), np.tile([0, 0, depth], (count, 1))
 
-nan = returning(lambda n: (poses(n)[0] * np.nan, poses(n)[1]))
-behind = returning(lambda n: poses(n, depth=-0.4))
-wrong = returning(lambda n: poses(n, depth=4.0))
-mirrored = returning(lambda n: poses(n, np.eye(3) * [1, 1, -1]))
-few = returning(lambda n: poses(n + 1))
-nothing = returning(lambda n: None)
-half = returning(lambda n: (*poses(n), None, poses(n)[0]))
+def solve(detections):
+    n = len(detections.corners)
+    return {returned}
+
+S = lambda settings: solve
 """
 
 
-@pytest.mark.parametrize(("name", "status", "told"), [
-    ("nan", EstimateStatus.solver_failed, None),
-    ("behind", EstimateStatus.solver_failed, None),
-    ("wrong", EstimateStatus.solver_failed, None),
-    ("mirrored", EstimateStatus.failed, "returned a rotation that is no rotation matrix"),
-    ("few", EstimateStatus.failed, "returned a rotation of shape (2, 3, 3); expected (1, 3, 3)"),
-    ("nothing", EstimateStatus.failed, "returned a NoneType; expected a tuple"),
-    ("half", EstimateStatus.failed, "returned half an alternative"),
+@pytest.mark.parametrize(("returned", "status", "told"), [
+    ("(poses(n)[0] * np.nan, poses(n)[1])", EstimateStatus.solver_failed, None),
+    ("poses(n, depth=-0.4)", EstimateStatus.solver_failed, None),
+    ("poses(n, depth=4.0)", EstimateStatus.solver_failed, None),
+    ("poses(n, np.eye(3) * [1, 1, -1])", EstimateStatus.failed,
+     "returned a rotation that is no rotation matrix"),
+    ("poses(n + 1)", EstimateStatus.failed,
+     "returned a rotation of shape (2, 3, 3); expected (1, 3, 3)"),
+    ("None", EstimateStatus.failed, "returned a NoneType; expected a tuple"),
+    ("(*poses(n), None, poses(n)[0])", EstimateStatus.failed, "returned half an alternative"),
 ])
-def test_a_solver_s_faults_never_pass_as_solved(tmp_path, name, status, told):
-    (tmp_path / "bad.py").write_text(SOLVERS)
-    text = f'[pose]\nside_px = 60\n[axes]\nsolver = ["ippe", "bad:{name}"]\n'
+def test_a_solver_s_faults_never_pass_as_solved(tmp_path, returned, status, told):
+    (tmp_path / "bad.py").write_text(SOLVER.format(returned=returned))
+    text = '[pose]\nside_px = 60\n[axes]\nsolver = ["ippe", "bad:S"]\n'
     cells = run_cells(Pipeline.from_text(text, folder=tmp_path), [])
     assert [flags[0] for flags in cells.columns["estimate"]] == [EstimateStatus.solved, status]
     assert np.isnan(cells.columns["rotation_error_rad"][1]).all()
     lines = [failure.text.splitlines()[-1] for failure in cells.failures]
     assert len(lines) == (told is not None)
-    assert all(f"PluginError: bad:{name}: {told}" in line for line in lines)
+    assert all(f"PluginError: bad:S: {told}" in line for line in lines)
 
 
 @pytest.mark.parametrize(("result", "told"), [
@@ -254,12 +239,13 @@ def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
 
 
 def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
-    bad = pipeline("nan")
+    bad = pipeline()
     begun = fingerprint(bad)
     assert other_here(bad, begun) == []
-    (tmp_path / "bad.py").rename(tmp_path / "gone.py")
+    content = (tmp_path / "bad.py").read_text()
+    (tmp_path / "bad.py").unlink()
     (line,) = other_here(bad, begun)
-    assert line.startswith(f"detector bad:nan: expected the file bad.py in {tmp_path}")
-    (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
+    assert line.startswith(f"detector bad:D: expected the file bad.py in {tmp_path}")
+    (tmp_path / "bad.py").write_text(content + "# changed\n")
     (line,) = other_here(bad, begun)
     assert "bad.py as it was when the run began" in line

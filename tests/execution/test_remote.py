@@ -1,4 +1,4 @@
-"""Remote: a store on an S3 server, a scheduler over TLS, workers that come and go; on loopback."""
+"""Remote: a store on an S3 server, and a scheduler over TLS; on loopback."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ import trustme
 
 import sweep
 from support.blocks import run_block
-from support.clusters import CLIENT, Cluster
+from support.clusters import Cluster
 from support.commands import command, started
 from support.here import calls_here
 from sweep.cli import main
@@ -25,7 +25,6 @@ from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.locations import exists
 from sweep.store.lock import is_written, writing
@@ -47,15 +46,6 @@ tilt_deg = [0, 50]
 solver = ["ippe_square", "iterative"]
 trial = 3
 """
-
-MANY = "[axes]\ntrial = 5000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
-
-
-def wait_until(true, what):
-    deadline = time.monotonic() + TIMEOUT_S
-    while not true():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
 
 
 def expected(text):
@@ -119,11 +109,12 @@ def bucket(tmp_path_factory):
     with log.open("w") as told, started(
         ["-m", "moto.server", "-H", "127.0.0.1", "-p", "0"], stdout=told, stderr=told
     ) as server:
-        def endpoint():
-            return re.search(r"http://127\.0\.0\.1:\d+", log.read_text())
-
-        wait_until(lambda: endpoint() or server.poll() is not None, "the S3 server does not start")
-        url = endpoint()[0]
+        deadline = time.monotonic() + TIMEOUT_S
+        while (found := re.search(r"http://127\.0\.0\.1:\d+", log.read_text())) is None:
+            assert server.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, "the S3 server does not start"
+            time.sleep(0.05)
+        url = found[0]
         with pytest.MonkeyPatch.context() as patch:
             for name in [name for name in os.environ if name.startswith("AWS_")]:
                 patch.delenv(name)
@@ -283,41 +274,3 @@ def test_credentials_in_a_store_name_are_refused_and_not_repeated(url, small, tm
         assert len(err.splitlines()) == 1
         assert "wJalrXUtnFEMI" not in out + err
         assert "AKIDEXAMPLE" not in out + err
-
-
-# Workers that come and go.
-
-
-def blocks_done(url):
-    with contextlib.suppress(StoreError):
-        return len(committed(open_store(url)))
-    return 0
-
-
-@pytest.mark.evidence
-def test_workers_join_and_leave_during_a_run(claim, tmp_path):
-    many, url = tmp_path / "many.toml", str(tmp_path / "many.zarr")
-    many.write_text(MANY)
-    with Cluster(tmp_path / "cluster") as cluster, (tmp_path / "run.log").open("w+") as log:
-        first = cluster.worker()
-        with started(
-            ["-c", CLIENT, many, url, cluster.address, 0.5], stdout=log, stderr=log
-        ) as running:
-            def after(count):
-                wait_until(
-                    lambda: running.poll() is not None or blocks_done(url) >= count, "no progress")
-                assert running.poll() is None
-
-            after(1)
-            cluster.worker()
-            after(3)
-            first.kill()
-            first.wait(TIMEOUT_S)
-            after(5)
-            cluster.worker()
-            assert running.wait(TIMEOUT_S) == 0
-        log.seek(0)
-        assert log.read() == ""
-    see_expected(url, MANY)
-    claim("a run whose workers join, leave and are killed", "a block computed alone", 0.0,
-          "bits differ")

@@ -5,7 +5,6 @@ central differences and NumPy's linear algebra give the bound.
 """
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -518,23 +517,6 @@ def test_every_flag_stands_beside_its_scenes_and_a_number_beside_given_only(expe
         assert np.isfinite(numbers[1])
     else:
         assert all(np.isnan(number).all() for number in numbers)
-
-
-def test_bounds_of_a_grid_are_those_of_its_cells_one_by_one():
-    axes = {
-        "noise_grey": [0.0, 2.0], "tilt_deg": [20.0, 95.0], "bound": ["none", "known_blur"],
-        "blur_px": [0.0, 1.0],
-    }
-    text = TOLD.replace("tilt_deg = 30\n", "") + "[axes]\n" + "".join(
-        f"{name} = {choices}\n".replace("'", '"') for name, choices in axes.items()
-    )
-    shape = [len(choices) for choices in axes.values()]
-    grid = run_cells(Pipeline.from_text(text), [part.ravel() for part in np.indices(shape)])
-    each = itertools.product(*axes.values())
-    for n, choice in enumerate(each):
-        settings = [f"{name}={value}" for name, value in zip(axes, choice, strict=True)]
-        for name, expected in zip(("bound", *COLUMNS), told(*settings), strict=True):
-            np.testing.assert_array_equal(grid.columns[name][0][n], expected)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0])

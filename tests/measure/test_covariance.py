@@ -1,6 +1,5 @@
 """Covariances of poses from corners, squared deviations, and the arithmetic of the likelihood."""
 
-import math
 
 import cv2
 import mpmath
@@ -10,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from support.exact_image import LENSES
 from sweep.measure.estimation import point_covariance, squared_deviations
-from sweep.measure.likelihood import solve_positive, state_of, turn_between
+from sweep.measure.likelihood import solve_positive
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import marker_corners
@@ -152,20 +151,3 @@ def test_positive_definite_systems_are_solved_whatever_their_scale():
 
 
 # Rotations.
-
-def state(rotation, translation=(0.0, 0.0, 1.0)):
-    return state_of(np.asarray(rotation), np.array(translation), 0.0, np.zeros(3))
-
-
-def test_turn_between_two_states_is_the_angle_that_one_was_turned_by():
-    rng = np.random.default_rng(10)
-    for angle in (0.0, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 2.0, 3.0, math.pi - 1e-6, math.pi):
-        for _ in range(20):
-            axis = rng.normal(size=3)
-            axis /= np.linalg.norm(axis)
-            start = Rotation.random(rng=rng).as_matrix()
-            end = (Rotation.from_rotvec(angle * axis) * Rotation.from_matrix(start)).as_matrix()
-            first, second = state(start), state(end)
-            # Matrices are right to some 1e-16 each, whatever the angle.
-            assert turn_between(second, first) == pytest.approx(angle, abs=2e-15)
-            assert turn_between(first, second) == pytest.approx(angle, abs=2e-15)

@@ -8,7 +8,8 @@ sit, and who else tests them:
 - projection: ``Cameras.project``, which the flag ``not_visible`` is taken from;
 - lens inverse, solvers: ``measure/solver.py`` (``test_solver_guard.py`` has IPPE at half turns,
   SQPNP at absolute lengths of 1 mm, and what becomes of garbage);
-- reach of the sub-pixel refinement: ``margin_px`` in ``measure/detectors.py``.
+- reach of the sub-pixel refinement: ``margin_px`` in ``measure/detectors.py``
+  (``tests/evaluation/test_window.py``).
 """
 
 
@@ -17,13 +18,10 @@ import numpy as np
 import pytest
 
 from support.lengths import lengths
-from support.searching import searched
 from support.solving import estimate
-from sweep.evaluation import search as search_module
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS
@@ -212,42 +210,3 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens, solve
     check_lens(solver, True, scenes)
     with pytest.raises(AssertionError):
         check_lens(solver, False, scenes)
-
-
-# Sub-pixel refinement is what is measured, so it is not guarded; what is said of it is held.
-
-WIDE_REFINEMENT = {
-    "cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
-    "relativeCornerRefinmentWinSize": 100.0,
-}
-MARGINS = """
-seed = 7
-[pose]
-tilt_deg = {{ uniform = [0, 70] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-[marker]
-quiet_zone_modules = 0.25
-[axes]
-background = [255, 128]
-side_px = [30, 60, 120]
-trial = {count}
-"""
-
-
-def check_margin(scenes, framed, margin, monkeypatch):
-    """Hold a wide refinement to work in the windows of a margin as it does in the frame."""
-    with monkeypatch.context() as patched:
-        patched.setattr(search_module, "margin_px", margin)
-        found = searched(scenes, DetectorSetting(**WIDE_REFINEMENT))
-    np.testing.assert_array_equal(found.flags, framed.flags)
-
-
-@lengths(6, 100)
-def test_window_leaves_room_for_the_refinement(count, monkeypatch):
-    """cornerSubPix refuses images narrower than its window: with the usual 16 px, for 40 %."""
-    scenes = scenes_of(Pipeline.from_text(MARGINS.format(count=count)))
-    framed = searched(scenes, DetectorSetting(**WIDE_REFINEMENT), full=True)
-    check_margin(scenes, framed, margin_px, monkeypatch)
-    with pytest.raises(AssertionError):
-        check_margin(scenes, framed, lambda _: 16, monkeypatch)

@@ -19,8 +19,6 @@ from sweep.model import lens
 from sweep.model.exposure import areas_px
 from sweep.model.pose import (
     angle_between,
-    mirrored,
-    rotation_of_angles,
     rotation_of_vector,
     vector_of_rotation,
 )
@@ -406,25 +404,6 @@ def test_angle_between_vectors_keeps_its_digits_from_1e_15_to_pi():
         sine = mp.norm([x[i - 2] * y[i - 1] - x[i - 1] * y[i - 2] for i in range(3)])
         truth = mp.atan2(sine, mp.fsum(map(operator.mul, x, y)))
         assert error_of(angle_between(a, b), truth) < 1e-12 * truth
-
-
-def test_mirrored_pose_is_exact_at_a_grazing_line_of_sight():
-    # Q·S·Qᵀ of the model is the reflection 1 - 2·s·sᵀ, s the line of sight. Measured 6e-16.
-    rng = np.random.default_rng(19)
-    for slant, near_plane in itertools.product(
-        (1.0, 0.5, 1e-2, 1e-4, 1e-8, 1e-16, 1e-100), (False, True) * 10
-    ):
-        rotation = rotation_of_angles(rng.uniform(0.1, np.pi / 2), *rng.uniform(0, 7, 2))[0]
-        turn, across = rng.uniform(0, 7), np.sqrt((1 - slant) * (1 + slant))
-        sight = np.array([across * np.cos(turn), across * np.sin(turn), slant])
-        if near_plane:  # the line of sight is in the marker's plane but for an angle
-            sight = rotation[:, :2] @ rng.normal(size=2)
-            sight = sight * np.sign(sight[2]) - slant * rotation[:, 2]
-        sight *= np.exp(rng.uniform(np.log(1e-9), np.log(1e12)))
-        along = mp.matrix(sight.tolist()) / mp.norm(sight.tolist())
-        reflection = mp.eye(3) - 2 * along * along.T
-        truth = reflection * mp.matrix(rotation.tolist()) * mp.diag([1, 1, -1])
-        assert error_of_rotation(mirrored(rotation[None], sight[None])[0], truth) < 4e-15
 
 
 # Areas.

@@ -1,11 +1,14 @@
-"""Boards have OpenCV's layouts: corners, IDs and the picture, of its own drawing functions."""
+"""Boards have OpenCV's layouts: corners and IDs; Kalibr's grids its picture.
+
+Pictures of the other kinds are held in tests/evaluation/test_board_scenes.py.
+"""
 
 import cv2
 import numpy as np
 import pytest
 
 from sweep.model.board import corners_of, first_overlap
-from sweep.model.board_kinds import AprilGrid, BoardMarker, Charuco, Grid, Markers
+from sweep.model.board_kinds import AprilGrid, Charuco
 
 DICTIONARY = "DICT_4X4_250"
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
@@ -48,49 +51,6 @@ def test_charuco_board_is_opencvs(shape, legacy):
     assert np.abs(ours.corners_m - corners).max() < 1e-8
     chessboard = in_our_frame(np.array(theirs.getChessboardCorners()), middle)
     assert np.abs(ours.chessboard_m - chessboard).max() < 1e-8
-    # 10 px a module of the markers, 100 px a square.
-    reference = theirs.generateImage((shape[0] * 100, shape[1] * 100), marginSize=0)
-    found = painted(ours, -middle, middle, 5000)
-    assert (found != reference).mean() < 0.02  # OpenCV rounds the markers' corners to pixels
-    small = cv2.erode((found != reference).astype(np.uint8), np.ones((3, 3)))
-    assert not small.any()
-    assert (painted(ours, -middle - 0.01, middle + 0.01, 5000)[:49] == 255).all()
-    assert (painted(ours, -middle - 0.02, -middle, 5000)[:49, :49] == 128).all()
-
-
-@pytest.mark.parametrize("ids", [None, (19, 18, 17, 16, 15, 14)])
-def test_grid_is_opencvs(ids):
-    ours = Grid(
-        dictionary=DICTIONARY, rows=2, columns=3, marker_m=0.03, gap_m=0.006, ids=ids, margin_m=0,
-    ).board()
-    listed = np.arange(6) if ids is None else np.array(ids)
-    theirs = cv2.aruco.GridBoard((3, 2), 0.03, 0.006, OPENCV, listed)
-    middle = np.array([0.051, 0.033])
-    assert ours.marker_ids == tuple(listed)
-    corners = in_our_frame(np.array(theirs.getObjPoints()), middle)
-    assert np.abs(ours.corners_m - corners).max() < 1e-8
-    reference = theirs.generateImage((1020, 660), marginSize=0)
-    assert (painted(ours, -middle, middle, 10000) == reference).all()
-
-
-def test_markers_of_a_table_have_their_own_sheets_sizes_and_turns():
-    board = Markers(dictionary=DICTIONARY, markers=(
-        BoardMarker(marker_id=3, x_m=0.1, y_m=0.2, size_m=0.06),
-        BoardMarker(marker_id=9, x_m=-0.1, y_m=0.0, size_m=0.12, roll_deg=90.0),
-    )).board()
-    left_top = [[-0.03, 0.03], [0.03, 0.03], [0.03, -0.03], [-0.03, -0.03]]
-    assert np.abs(board.corners_m[0, :, :2] - [0.1, 0.2] - left_top).max() < 1e-15
-    # A quarter turn from x to y takes the top left corner to the bottom left.
-    turned = [[-0.06, -0.06], [-0.06, 0.06], [0.06, 0.06], [0.06, -0.06]]
-    assert np.abs(board.corners_m[1, :, :2] - [-0.1, 0.0] - turned).max() < 1e-15
-    image = painted(board, (-0.2, -0.3), (0.2, 0.1), 1000)
-    expected = np.full((400, 400), 128)
-    expected[60:140, 260:340] = 255
-    expected[70:130, 270:330] = cv2.aruco.generateImageMarker(OPENCV, 3, 60)
-    expected[220:380, 20:180] = 255
-    tag = cv2.aruco.generateImageMarker(OPENCV, 9, 120)
-    expected[240:360, 40:160] = cv2.rotate(tag, cv2.ROTATE_90_COUNTERCLOCKWISE)
-    assert (image == expected).all()
 
 
 def squares(centres, sides, rolls):

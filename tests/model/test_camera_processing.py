@@ -116,6 +116,8 @@ COMBINATIONS = {
         "curvature_per_m=4", "geometry_px=0.5", "marker_scale=1.1", "sharpening=1", "bayer=RGGB",
         "jpeg_quality=40",
     ],
+    "warp": ["renderer=warp", "distortion=[-0.3, 0.1, 0, 0]"],
+    "samples": ["renderer=supersample-2-jittered", "distortion=[-0.3, 0.1, 0, 0]"],
     "motion": ["exposure_s=0.01", "velocity_x_m_s=2", "row_time_s=1e-4", "sharpening=1"],
 }
 

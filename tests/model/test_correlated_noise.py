@@ -64,16 +64,6 @@ def test_field_has_mean_variance_and_correlations_of_the_weights(count, correlat
         assert abs(product.mean() - expected) < FAR * deviation, (down, right)
 
 
-def test_number_of_a_pixel_depends_on_the_pixel_alone():
-    for correlation in (0.0, 0.5, 0.99):
-        whole = normal_field(np.uint64(3), 2, 0, 0, (90, 110), correlation)
-        for left, top, right, bottom in ((0, 0, 1, 1), (7, 3, 64, 90), (109, 89, 110, 90)):
-            part = normal_field(
-                np.uint64(3), 2, left, top, (bottom - top, right - left), correlation
-            )
-            np.testing.assert_array_equal(part, whole[top:bottom, left:right])
-
-
 # In images: levels, table, quantisation.
 
 FLAT = ["background=120", "distance_m=10", "width_px=400", "height_px=300", "quiet_zone_modules=0"]

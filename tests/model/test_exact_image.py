@@ -162,25 +162,6 @@ def test_image_is_the_clipped_area_before_the_background_rounded_once(count, on_
         assert (frame_of(value)[decided] == np.floor(reference + 0.5)[decided]).all()
 
 
-@pytest.mark.parametrize("renderer", ["exact", "warp", "supersample-3", "supersample-2-jittered"])
-@pytest.mark.parametrize("distortion", [(), LENSES[0]])
-@pytest.mark.parametrize("on_image", [False, True])
-def test_image_does_not_depend_on_the_window(renderer, distortion, on_image, tmp_path):
-    rng = np.random.default_rng(6)
-    for value in drawn_poses(3, 6, (10, 120), 70, renderer=renderer, distortion=distortion):
-        size = value["width_px"], value["height_px"]
-        if on_image:
-            value["background"] = str(tmp_path / f"{size}.png")
-            cv2.imwrite(value["background"], rng.integers(0, 256, size[::-1], dtype=np.uint8))
-        scenes, box = scene_of(value)
-        frame = frame_of(value)
-        for _ in range(5):
-            left, top = rng.integers(0, box[:2] + 1).tolist()
-            right, bottom = rng.integers(box[2:], np.array(size) + 1).tolist()
-            image = render(scenes, 0, box, (left, top, right, bottom))
-            assert np.array_equal(image, frame[top:bottom, left:right])
-
-
 # The approximate renderers.
 
 def paper_image(value):

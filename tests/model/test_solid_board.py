@@ -11,7 +11,6 @@ from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.exposure import marker_boxes
 from sweep.model.marker import modules
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
@@ -145,46 +144,6 @@ def test_an_image_is_that_of_rays(name, tilt_deg):
     assert fine < 0.8
     assert fine < 0.3 * coarse or fine == coarse == 0
     assert chosen.largest_board[0] == (4 if ground else len(declared["markers"]))
-
-
-MOTION = {"velocity_x_m_s": 0.5, "velocity_y_m_s": -0.3, "velocity_z_m_s": 0.4,
-          "rotation_x_deg_s": 300.0, "rotation_y_deg_s": -400.0, "rotation_z_deg_s": 200.0}
-
-
-@pytest.mark.parametrize(("name", "shutter"), [
-    ("cube", {"exposure_s": 0.006, "row_time_s": 1e-4}),
-    pytest.param("field", {"row_time_s": 3e-4}, marks=pytest.mark.long),
-    pytest.param("distractors", {"exposure_s": 0.006}, marks=pytest.mark.long),
-])
-def test_a_moving_target_in_several_planes_is_the_mean_of_rays(name, shutter):
-    """Each row's mean over instants of its exposure, of rays to the target where it is then."""
-    declared = BOARDS[name]
-    chosen = pipeline([], 60.0, board=declared, scene=MOTION | shutter)
-    scenes = scenes_of(chosen)
-    shown = [*declared["markers"], *declared.get("distractors", [])]
-    width, height = scenes.frame[0].tolist()
-    rotation, position = scenes.rotation[0], scenes.translation[0]
-    velocity, turning = (np.array(list(MOTION.values())[part]) for part in (
-        slice(3), slice(3, 6)))
-    # Without an exposure to average over, only the rays within a pixel smooth its edges: four along
-    # each side leave 1.2 levels, eight 0.45 and sixteen 0.17.
-    count, rays = (16, 4) if "exposure_s" in shutter else (1, 8)
-    offsets = ((np.arange(count) + 0.5) / count - 0.5) * shutter.get("exposure_s", 0.0)
-    expected = np.zeros((height, width))
-    for v in range(height):
-        for offset in offsets:
-            instant = offset + shutter.get("row_time_s", 0.0) * (v - (height - 1) / 2)
-            turned_by = Rotation.from_rotvec(np.radians(turning) * instant).as_matrix()
-            pose = turned_by @ rotation, position + velocity * instant
-            expected[v] += traced(shown, (width, 1, 150.0, 79.5, 59.5 - v), pose, rays)[0] / count
-    box = marker_boxes(scenes)[0]
-    inside = np.zeros((height, width), dtype=bool)
-    inside[box[1] : box[3], box[0] : box[2]] = True
-    assert (expected[~inside] == LEVELS[0]).all()
-    off = image_of(scenes) - expected
-    assert np.sqrt((off**2).mean()) < 0.8
-    still = image_of(scenes_of(pipeline([], 60.0, board=declared)))
-    assert np.sqrt(((still - expected) ** 2).mean()) > 10  # it does move
 
 
 EXPOSED = {"exposure_s": 0.01, "row_time_s": 1e-4, "velocity_x_m_s": 0.6, "velocity_z_m_s": -0.5,

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from support.blocks import run_block
-from sweep.errors import PipelineError
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -61,17 +60,3 @@ def test_ids_are_those_listed_in_the_order_of_the_kind(board):
     values = run(FOUND, (1, 1, 1), board | {"ids": ids})
     assert values["board_marker_id"].ravel().tolist() == ids
     assert (values["marker_detection"] == DetectionStatus.detected).mean() > 0.5
-
-
-@pytest.mark.parametrize(("settings", "named"), [
-    (["ids=[1, 2]"], ["board.ids", "12 IDs"]),
-    (["ids=[1, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]"], ["board.ids", "1 is listed"]),
-    (["ids=[1, 0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]", "marker_id=3"], ["board.ids", "marker_id"]),
-    (["marker_id=580"], ["marker_id = 580"]),
-    (["gap_m=0.01"], ["board.gap_m", "aprilgrid"]),
-])
-def test_faults_of_an_april_grid_name_their_key(settings, named):
-    with pytest.raises(PipelineError) as refused:
-        pipeline(settings)
-    for each in named:
-        assert each in str(refused.value)

@@ -7,7 +7,7 @@ import pytest
 from support import searching
 from support.blocks import run_cells
 from support.lengths import lengths
-from sweep.evaluation.search import search_windows, visibility_flags
+from sweep.evaluation.search import visibility_flags
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
@@ -88,19 +88,6 @@ def test_what_is_found_in_windows_is_what_a_plain_loop_finds_in_frames(count):
         np.testing.assert_allclose(got, expected, atol=1e-3)
         twice += [each[0] for each in expected].count(2) == 2
     assert twice > count / 4
-
-
-def test_pixels_beyond_the_window_are_the_background():
-    chosen = pipeline({**GRID, "distractors": BESIDE}, pose={"tilt_deg": 40, "distance_m": 0.5})
-    scenes, _ = shown(chosen)
-    boxes = marker_boxes(scenes)
-    image = render(scenes, 0, boxes[0], (0, 0, 320, 240)).astype(int)
-    left, top, right, bottom = search_windows(
-        scenes, boxes, DetectorSetting(), np.zeros(1, dtype=bool)
-    )[0]
-    assert (right - left) * (bottom - top) < 320 * 240
-    image[top:bottom, left:right] = 120
-    assert (image == 120).all()
 
 
 @pytest.mark.parametrize("board", [GRID, {"kind": "none"}])

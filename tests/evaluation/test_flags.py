@@ -159,14 +159,6 @@ solver = ["ippe_square", "iterative", "sqpnp", "p3p", "epnp"]
 guarded = [true, false]
 """
 
-def test_every_variable_has_the_shape_of_the_template_even_without_axes():
-    for settings in ([], ["tilt_deg=[0, 30]"], ["solver=['p3p', 'ippe']"]):
-        pipeline = Pipeline.from_text(PLAIN, settings)
-        values = run(pipeline)
-        for variable in SCHEMA:
-            assert values[variable.name].shape == variable.shape(pipeline), variable.name
-            assert values[variable.name].dtype == variable.dtype, variable.name
-
 
 def test_numbers_exist_exactly_where_the_flags_say_so():
     pipeline = Pipeline.from_text(MIXED)
@@ -209,7 +201,6 @@ def classified(*found, truth=SQUARE):
     return DetectionStatus(result.flags[0]), result.marker_corners[0, 0]
 
 
-TILTED = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
 ELSEWHERE = [SQUARE + shift for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0])]
 
 
@@ -226,16 +217,3 @@ def test_what_is_found_is_judged_by_its_id_its_place_and_its_turn(found, expecte
     assert flag == expected
     right = found[0][1] if expected == DetectionStatus.detected else np.full((4, 2), np.nan)
     np.testing.assert_array_equal(corners, right)
-
-
-def test_of_two_right_ones_the_nearest_counts():
-    near, far = SQUARE - 0.2, SQUARE * 0.9 + 12.5
-    for found in ([(7, near), (7, far)], [(7, far), (7, near)]):
-        np.testing.assert_allclose(classified(*found)[1], near, rtol=0, atol=1e-5)
-
-
-def test_truth_may_be_seen_turned_and_tilted():
-    assert classified((7, TILTED + 0.3), truth=TILTED)[0] == DetectionStatus.detected
-    # In the bounding box, but not in the quadrilateral.
-    beside = classified((7, TILTED * 0.1 + [85, 82]), truth=TILTED)
-    assert beside[0] == DetectionStatus.no_candidate

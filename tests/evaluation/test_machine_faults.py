@@ -84,11 +84,3 @@ def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(p
             warm_up(PIPELINE)
     finally:
         machine_faults.clear()
-
-
-@pytest.mark.parametrize("renderer", ["exact", "warp", "supersample-2"])
-def test_standard_scene_is_computed_with_what_a_pipeline_uses(renderer):
-    warm_up(sweep.Pipeline.from_dict({
-        "pose": {"side_px": 40, "jitter_px": 0.5},
-        "scene": {"renderer": renderer, "noise_grey": 1.0, "bound": "known_blur"},
-        "axes": {"solver": ["p3p", "photometric"], "trial": 2}}))

@@ -20,7 +20,7 @@ from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers, with_distractors
+from sweep.model.board_kinds import BoardMarker, Charuco, Markers, with_distractors
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.scene import build_scenes
@@ -322,17 +322,6 @@ def test_pixels_of_a_distractor_tell_nothing_of_the_board():
     expected = board.deviations(1e-6, seen=seen)
     np.testing.assert_allclose(both.found().std[0], expected, rtol=2e-5)
     assert (both.found().std > 1.002 * Reference(board_scene(CHARUCO, **FLAT)).found().std).any()
-
-
-@pytest.mark.parametrize("board", [
-    FOLD, Grid(dictionary="DICT_4X4_50", rows=1, columns=2, marker_m=0.03, gap_m=0.014).board(),
-], ids=["fold", "flat"])
-def test_what_a_distractor_in_front_hides_tells_nothing(board):
-    hidden = with_distractors(board, [(9, -0.01, 0.0, 0.015, 0, 0.06, 20, 10, None)], 1, 1)
-    behind, free = (
-        Reference(board_scene(each, blur_px=0.5)).found().std for each in (hidden, board)
-    )
-    assert (behind > free).all()
 
 
 @pytest.mark.parametrize("unknown_blur", [False, True])

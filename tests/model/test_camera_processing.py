@@ -55,16 +55,6 @@ def test_jpeg_is_opencvs_encoder_on_the_whole_frame(quality):
         np.testing.assert_array_equal(part, expected[b:d, a:c])
 
 
-def test_jpeg_reaches_as_far_as_its_blocks():
-    settings = ["jpeg_quality=5", "bearing_x_deg=2", "distance_m=0.9"]
-    left, top, right, bottom = marker_boxes(scenes_of(settings))[0].tolist()
-    assert left % 8 == top % 8 == 0
-    assert right % 8 == 0 or right == 57
-    image = image_of(settings).copy()
-    image[top:bottom, left:right] = image[0, 0]
-    assert (image == image[0, 0]).all()
-
-
 def test_images_larger_than_jpeg_are_compressed_in_parts():
     rng = np.random.default_rng(8)
     image = rng.integers(0, 256, (9, 70_001)).astype(np.uint8)

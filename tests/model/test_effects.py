@@ -247,6 +247,7 @@ MOVING = {
     "blur of 0.3 px, a sheet": (9, "both", 6.0, 256, {"blur_px": 0.3, "occlusion": 0.3}),
     "rows of one instant": (10, "both", 15.0, 1, {"exposure_s": 0.0, "row_time_s": 1e-3}),
     "rows and exposure": (11, "both", 6.0, 48, {"exposure_s": 0.02, "row_time_s": 1e-3}),
+    "bent": (9, "both", 6.0, 256, {"blur_px": 0.3, "curvature_per_m": 3.0, "bend_deg": 20.0}),
     "0.5 px, angular": (6, "angular", 0.5, 256, {}),
     "100 px": (7, "linear", 100.0, 2048, {}),
 }

@@ -236,20 +236,3 @@ def test_shifts_that_fold_the_image_are_not_modelled():
     assert not_modelled(scenes)[0]
     _, scenes = scenes_of(geometry_px=40.0, geometry_length_px=2000.0)
     assert not not_modelled(scenes)[0]
-
-
-@pytest.mark.long
-def test_a_moving_bent_marker_is_the_mean_of_resting_ones():
-    count = 200
-    value, scenes = scenes_of(
-        curvature_per_m=6.0, bend_deg=20.0, tilt_deg=25.0, exposure_s=0.1, velocity_x_m_s=0.1,
-        geometry_px=0.3, noise_key=9,
-    )
-    found = exact_frame(scenes, value)
-    times = ((np.arange(count) + 0.5) / count - 0.5) * 0.1
-    still = value | {"exposure_s": 0.0, "velocity_x_m_s": 0.0}
-    mean = np.zeros_like(found)
-    for time in times:
-        _, resting = scenes_of(**(still | {"x_m": 0.1 * float(time), "y_m": 0.0, "side_px": None}))
-        mean += exact_frame(resting, value) / count
-    assert np.abs(found - mean).max() < 0.2

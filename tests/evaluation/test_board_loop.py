@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.blocks import run_block, run_cells
-from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
+from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, opencv_board
 from support.lengths import first_of
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
@@ -24,45 +24,29 @@ DETECTED, NOT_VISIBLE = 1, 5
 SOLVED, SOLVER_FAILED = 1, 3
 
 
-def text(name, trials):
-    kind = KINDS[name]
-    points = ["markers", "chessboard"] if "square_m" in kind else ["markers"]
-    return f"""
-seed = 8
-[camera]
-width_px = 320
-height_px = 240
-fx_px = 300
-fy_px = 300
-[marker]
-dictionary = "{NAME}"
-size_m = {SIZE_M}
-{board_toml(kind)}
-[pose]
-tilt_deg = {{ uniform = [0, 70] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-24, 24] }}
-bearing_y_deg = {{ uniform = [-18, 18] }}
-[scene]
-window = "full"
-black = 30
-white = 220
-background = 100
-noise_grey = 3
-blur_px = 0.5
-[detector]
-cornerRefinementMaxIterations = 1
-[estimator]
-guarded = false
-[axes]
-distance_m = [0.13, 0.25]
-trial = {trials}
-distortion = [[], {LENS}]
-cornerRefinementMethod = ["none", "subpix"]
-solver = {list(METHODS)}
-points = {points}
-"""
+def pipeline_of(name, trials):
+    return Pipeline.from_dict({
+        "seed": 8,
+        "camera": {"width_px": 320, "height_px": 240, "fx_px": 300, "fy_px": 300},
+        "marker": {"dictionary": NAME, "size_m": SIZE_M}, "board": KINDS[name],
+        "pose": {
+            "tilt_deg": {"uniform": [0, 70]}, "azimuth_deg": {"uniform": [0, 360]},
+            "roll_deg": {"uniform": [0, 360]}, "bearing_x_deg": {"uniform": [-24, 24]},
+            "bearing_y_deg": {"uniform": [-18, 18]},
+        },
+        "scene": {"window": "full", "black": 30, "white": 220, "background": 100,
+                  "noise_grey": 3, "blur_px": 0.5},
+        "detector": {"cornerRefinementMaxIterations": 1}, "estimator": {"guarded": False},
+        "axes": {
+            "distance_m": [0.13, 0.25], "trial": trials, "distortion": [[], LENS],
+            "cornerRefinementMethod": ["none", "subpix"], "solver": list(METHODS),
+            "points": points_of(name),
+        },
+    })
+
+
+def points_of(name):
+    return ["markers", "chessboard"] if "square_m" in KINDS[name] else ["markers"]
 
 
 def board_detector(board, refinement):
@@ -108,7 +92,7 @@ def plain_pose(objects, pixels, lens, method, limit_px):
 @pytest.mark.parametrize("name", first_of(("charuco", *(k for k in KINDS if k != "charuco")), 2))
 def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, request):
     trials = 8 if request.node.get_closest_marker("long") else 1
-    pipeline = Pipeline.from_text(text(name, trials), [])
+    pipeline = pipeline_of(name, trials)
     shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     block = Block((0,) * len(shape), shape)
     result = run_block(pipeline, block)
@@ -124,7 +108,6 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, request):
     board, ours = opencv_board(name)
     object_corners = ours(board.getObjPoints())
     number = {marker_id: k for k, marker_id in enumerate(board.getIds().ravel().tolist())}
-    points_names = ["markers", "chessboard"] if "square_m" in KINDS[name] else ["markers"]
     compared = solved = 0
     for row in range(len(block)):
         if (got["detection"][row] == NOT_VISIBLE).all():
@@ -182,7 +165,7 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, request):
                     board.matchImagePoints(cross, cross_ids) if indices else (None, None)
                 )
             for (solver, method), (p, _) in (
-                (each, point) for each in METHODS.items() for point in enumerate(points_names)
+                (each, point) for each in METHODS.items() for point in enumerate(points_of(name))
             ):
                 at = (row, k, list(METHODS).index(solver), p)
                 objects, pixels = found[p]

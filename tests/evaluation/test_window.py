@@ -87,25 +87,19 @@ def compared(scenes, setting):
     return difference, len(exceptions)
 
 
-PINNED = """
-[marker]
-dictionary = "DICT_6X6_250"
-marker_id = 17
-[pose]
-side_px = 10.376535841555254
-tilt_deg = 20.68056882444784
-azimuth_deg = 215.69171069220565
-roll_deg = 319.86845927813033
-bearing_x_deg = 8.876074845458405
-bearing_y_deg = 21.136956593398267
-[scene]
-background = 255
-"""
+PINNED = {
+    "marker": {"dictionary": "DICT_6X6_250", "marker_id": 17}, "scene": {"background": 255},
+    "pose": {
+        "side_px": 10.376535841555254, "tilt_deg": 20.68056882444784,
+        "azimuth_deg": 215.69171069220565, "roll_deg": 319.86845927813033,
+        "bearing_x_deg": 8.876074845458405, "bearing_y_deg": 21.136956593398267,
+    },
+}
 
 
 def test_pose_that_a_margin_of_16_px_lost_to_the_apriltag_search_is_found_as_in_the_frame():
     """Rejected in the frame and no candidate in a window with 16 px around it."""
-    scenes = build_scenes(Pipeline.from_text(PINNED).experiment.scene_values([]), 1)
+    scenes = build_scenes(Pipeline.from_dict(PINNED).experiment.scene_values([]), 1)
     assert not compared(scenes, DetectorSetting(cornerRefinementMethod="apriltag"))[1]
 
 
@@ -174,25 +168,20 @@ def test_window_finds_what_the_frame_holds_of_a_processed_image(count, name):
     compared(visible_scenes(count, settings=PROCESSING[name]), DetectorSetting())
 
 
-PAIRED = """
-seed = 3
-[pose]
-tilt_deg = { uniform = [0, 70] }
-bearing_x_deg = { uniform = [-30, 30] }
-[scene]
-background = 128
-[axes]
-side_px = [15, 40, 120]
-trial = 12
-cornerRefinementMethod = ["none", "subpix", "contour", "apriltag"]
-adaptiveThreshWinSizeMax = [23]
-solver = ["ippe_square", "iterative"]
-"""
+def paired(*settings):
+    return Pipeline.from_dict({
+        "seed": 3, "scene": {"background": 128},
+        "pose": {"tilt_deg": {"uniform": [0, 70]}, "bearing_x_deg": {"uniform": [-30, 30]}},
+        "axes": {
+            "side_px": [15, 40, 120], "trial": 12, "cornerRefinementMethod": list(REFINEMENTS),
+            "adaptiveThreshWinSizeMax": [23], "solver": ["ippe_square", "iterative"],
+        },
+    }, settings)
 
 
 def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
     alone, beside = (
-        run_block(Pipeline.from_text(PAIRED, settings), Block((0, 0), (3, 12))).values
+        run_block(paired(*settings), Block((0, 0), (3, 12))).values
         for settings in ((), ("adaptiveThreshWinSizeMax=[61, 23]",))
     )
     assert (alone["detection"] == DetectionStatus.detected).any()
@@ -206,7 +195,7 @@ def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
 def test_deglitching_is_refused():
     """OpenCV's aprilTagDeglitch reads memory that it never wrote, at the image's border."""
     with pytest.raises(PipelineError, match="aprilTagDeglitch = 1"):
-        Pipeline.from_text(PAIRED, ["cornerRefinementMethod=apriltag", "aprilTagDeglitch=1"])
+        paired("cornerRefinementMethod=apriltag", "aprilTagDeglitch=1")
 
 
 BOARDS = {

@@ -9,58 +9,31 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, EstimateStatus
 from sweep.measure.photometric import Photometric
 
-CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
-GRID = 'kind = "grid"\nrows = 3\ncolumns = 3\ngap_m = 0.01'
-BESIDE = GRID + "".join(
-    f"\n[[board.distractors]]\n{text}" for text in (
-        "marker_id = 4\nx_m = 0.057\ny_m = 0.0", "x_m = -0.06\ny_m = 0.01\nroll_deg = 10",
-        "marker_id = 70\nx_m = 0.01\ny_m = 0.065\nroll_deg = 45",
-    )
-)
+CHARUCO = {"kind": "charuco", "squares_x": 5, "squares_y": 4, "square_m": 0.03}
+GRID = {"kind": "grid", "rows": 3, "columns": 3, "gap_m": 0.01}
+BESIDE = GRID | {"distractors": [
+    {"marker_id": 4, "x_m": 0.057, "y_m": 0.0}, {"x_m": -0.06, "y_m": 0.01, "roll_deg": 10},
+    {"marker_id": 70, "x_m": 0.01, "y_m": 0.065, "roll_deg": 45},
+]}
 """A grid whose sheet another touches, and two near it."""
 
-SOLID = 'kind = "markers"' + "".join(
-    f"\n[[board.markers]]\n{text}" for text in (
-        "marker_id = 3\nx_m = -0.022\ny_m = 0.0\nsize_m = 0.03\ntilt_deg = -30\nazimuth_deg = 90",
-        "marker_id = 8\nx_m = 0.022\ny_m = 0.0\nsize_m = 0.03\ntilt_deg = 30\nazimuth_deg = 90",
-        "marker_id = 5\nx_m = 0.0\ny_m = 0.03\nz_m = 0.02",
-    )
-)
+SOLID = {"kind": "markers", "markers": [
+    *({"marker_id": number, "x_m": side * 0.022, "y_m": 0.0, "size_m": 0.03,
+       "tilt_deg": side * 30, "azimuth_deg": 90} for number, side in ((3, -1), (8, 1))),
+    {"marker_id": 5, "x_m": 0.0, "y_m": 0.03, "z_m": 0.02},
+]}
 """Three markers, each in a plane of its own; the third hides parts of the others."""
-
-TEXT = """
-seed = 5
-[camera]
-width_px = 640
-height_px = 480
-fx_px = 600
-fy_px = 600
-[marker]
-dictionary = "DICT_5X5_100"
-size_m = 0.02
-[board]
-BOARD
-[pose]
-distance_m = 0.4
-tilt_deg = { uniform = [0, 60] }
-jitter_px = 20
-[scene]
-blur_px = 0.5
-noise_grey = 2
-black = 40
-white = 200
-background = 120
-bound = "known_blur"
-[estimator]
-solver = "photometric"
-[axes]
-trial = TRIALS
-"""
 
 
 def computed(board, trials, *settings):
-    text = TEXT.replace("BOARD", board).replace("TRIALS", str(trials))
-    result = run_cells(Pipeline.from_text(text, settings), [np.arange(trials)])
+    result = run_cells(Pipeline.from_dict({
+        "seed": 5, "camera": {"width_px": 640, "height_px": 480, "fx_px": 600, "fy_px": 600},
+        "marker": {"dictionary": "DICT_5X5_100", "size_m": 0.02}, "board": board,
+        "pose": {"distance_m": 0.4, "tilt_deg": {"uniform": [0, 60]}, "jitter_px": 20},
+        "scene": {"blur_px": 0.5, "noise_grey": 2, "black": 40, "white": 200, "background": 120,
+                  "bound": "known_blur"},
+        "estimator": {"solver": "photometric"}, "axes": {"trial": trials},
+    }, settings), [np.arange(trials)])
     assert not result.failures
     columns = {name: parts[0] for name, parts in result.columns.items()}
     assert (columns["bound"] == BoundStatus.given).all()

@@ -74,20 +74,14 @@ def opencv_project(self, points):
     return pixels
 
 
-AROUND_THE_CAMERA = """
-seed = 7
-[pose]
-azimuth_deg = { uniform = [0, 360] }
-roll_deg = { uniform = [0, 360] }
-[scene]
-background = 128
-[axes]
-side_px = [300, 600, 1000, 2000, 5000]
-tilt_deg = [0, 30, 60, 80, 85, 89]
-bearing_x_deg = [0, 25]
-bearing_y_deg = [0, -20, 60]
-trial = 3
-"""
+AROUND_THE_CAMERA = Pipeline.from_dict({
+    "seed": 7, "scene": {"background": 128},
+    "pose": {"azimuth_deg": {"uniform": [0, 360]}, "roll_deg": {"uniform": [0, 360]}},
+    "axes": {
+        "side_px": [300, 600, 1000, 2000, 5000], "tilt_deg": [0, 30, 60, 80, 85, 89],
+        "bearing_x_deg": [0, 25], "bearing_y_deg": [0, -20, 60], "trial": 3,
+    },
+})
 
 
 def check_visibility(scenes):
@@ -102,11 +96,10 @@ def check_visibility(scenes):
 
 def test_marker_that_reaches_behind_the_camera_is_not_visible(monkeypatch):
     """With cv2.projectPoints, 144 of 238 such markers would be drawn and looked for."""
-    pipeline = Pipeline.from_text(AROUND_THE_CAMERA)
-    check_visibility(scenes_of(pipeline))
+    check_visibility(scenes_of(AROUND_THE_CAMERA))
     monkeypatch.setattr(Cameras, "project", opencv_project)
     with pytest.raises(AssertionError):
-        check_visibility(scenes_of(pipeline))
+        check_visibility(scenes_of(AROUND_THE_CAMERA))
 
 
 # Solvers: OpenCV's success flag says nothing of what was solved.
@@ -164,26 +157,6 @@ LENSES = {
     "pincushion": (0.3, 0.0, 0.0, 0.0),
     "decentred": (-0.35, 0.12, 0.001, -0.001),
 }
-THROUGH_A_LENS = """
-seed = 3
-[marker]
-size_m = 0.1
-[camera]
-fx_px = 600
-width_px = 1280
-height_px = 960
-distortion = {lens}
-[pose]
-distance_m = 1.0
-tilt_deg = {{ uniform = [10, 60] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = 20
-bearing_x_deg = {{ uniform = [-40, 40] }}
-bearing_y_deg = {{ uniform = [-30, 30] }}
-[axes]
-trial = {count}
-"""
-
 
 def check_lens(solver, guarded, scenes):
     """Hold poses from exact corners to 0.01 degrees: 100 times what iterative solvers leave."""
@@ -206,7 +179,15 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens, solve
     makes them take the other solution; ITERATIVE, which only starts from the inverse, for none.
     Tilts from 10 degrees and a roll of 20, where the solvers themselves are stable in any frame.
     """
-    scenes = scenes_of(Pipeline.from_text(THROUGH_A_LENS.format(lens=list(lens), count=count)))
+    scenes = scenes_of(Pipeline.from_dict({
+        "seed": 3, "marker": {"size_m": 0.1}, "axes": {"trial": count},
+        "camera": {"fx_px": 600, "width_px": 1280, "height_px": 960, "distortion": list(lens)},
+        "pose": {
+            "distance_m": 1.0, "tilt_deg": {"uniform": [10, 60]}, "roll_deg": 20,
+            "azimuth_deg": {"uniform": [0, 360]}, "bearing_x_deg": {"uniform": [-40, 40]},
+            "bearing_y_deg": {"uniform": [-30, 30]},
+        },
+    }))
     check_lens(solver, True, scenes)
     with pytest.raises(AssertionError):
         check_lens(solver, False, scenes)

@@ -29,37 +29,21 @@ from sweep.model.scene import Targets
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""
 
-TEXT = """
-[camera]
-width_px = 640
-height_px = 480
-[marker]
-size_m = 0.05
-[pose]
-roll_deg = {uniform = [0, 360]}
-azimuth_deg = {uniform = [0, 360]}
-jitter_px = 0.5
-side_px = 50
-tilt_deg = 45
-[scene]
-black = 40
-white = 220
-background = 120
-bound = "known_blur"
-noise_grey = 2
-[detector]
-cornerRefinementMethod = "subpix"
-[estimator]
-solver = "photometric"
-[axes]
-trial = 1000000
-"""
+DOCUMENT = {
+    "camera": {"width_px": 640, "height_px": 480}, "marker": {"size_m": 0.05},
+    "pose": {"roll_deg": {"uniform": [0, 360]}, "azimuth_deg": {"uniform": [0, 360]},
+             "jitter_px": 0.5, "side_px": 50, "tilt_deg": 45},
+    "scene": {"black": 40, "white": 220, "background": 120, "bound": "known_blur",
+              "noise_grey": 2},
+    "detector": {"cornerRefinementMethod": "subpix"}, "estimator": {"solver": "photometric"},
+    "axes": {"trial": 1000000},
+}
 
 BLUR_UNKNOWN = ("blur_px=0.5", "bound=unknown_blur", "estimate_blur=true")
 
 
 def pipeline(*settings, seed=1, folder="."):
-    return Pipeline.from_text(f"seed = {seed}\n{TEXT}", list(settings), folder=folder)
+    return Pipeline.from_dict({"seed": seed} | DOCUMENT, list(settings), folder=folder)
 
 
 def run(trials, *settings, seed=1, folder="."):

@@ -32,8 +32,8 @@ background = 120
 noise_grey = 4
 bound = "known_blur"
 [axes]
-marker_id = [0, 7, 23]
-side_px = [7, 14, 40]
+marker_id = [0, 7]
+side_px = [7, 40]
 tilt_deg = [0, 50]
 cornerRefinementMethod = ["none", "subpix"]
 solver = ["ippe_square", "photometric"]

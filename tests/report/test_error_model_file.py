@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -10,14 +11,10 @@ from support.pose_errors import FX, SIZE_M, poses_with_law, power_law, reader_of
 from sweep.analysis import error_models, model_errors
 from sweep.analysis.error_models import Use
 from sweep.cli import main
-from sweep.errors import ArgumentError
 from sweep.report.error_model_file import (
-    check_error_model_file,
-    configuration_names,
     error_model_table,
     error_model_text,
     exponent_lines,
-    stacked,
 )
 
 TITLE = 'a " */ quote\\ \n #include <x> {{ 7 * 7 }} {% raw %} """ \u2028 </script> \udcff'
@@ -41,17 +38,17 @@ def document(models):
 def test_the_reader_of_the_guide_gives_the_same_numbers(models, document):
     """Within and around the region, rounding apart."""
     rng = np.random.default_rng(1)
-    z = np.exp(rng.uniform(np.log(0.9), np.log(4.5), 400))
+    z = np.exp(rng.uniform(np.log(0.9), np.log(4.5), 150))
     z[:3] = 1.0, 2.0, 4.0
-    x, y = rng.uniform(-0.5, 0.5, (2, 400)) * z
-    angle = rng.uniform(-5, 80, 400)
+    x, y = rng.uniform(-0.5, 0.5, (2, 150)) * z
+    angle = rng.uniform(-5, 80, 150)
     angle[:3] = 0.0, 30.0, 60.0
     x[:3] = y[:3] = 0.0
     read = reader_of_the_guide()
     bearing = np.degrees(np.arctan2(np.hypot(x, y), z))
     wanted = [model_errors(models.isel(solver=k), z, angle, None, bearing) for k in (0, 1)]
     unseen = 0
-    for n, (number, *position) in enumerate(zip(np.arange(400) % 2, x, y, z, strict=True)):
+    for n, (number, *position) in enumerate(zip(np.arange(150) % 2, x, y, z, strict=True)):
         found = read(document["models"][number], *position, angle[n])
         unseen += math.isnan(found["z"]["sigma"])
         for quantity, each in found.items():
@@ -59,7 +56,7 @@ def test_the_reader_of_the_guide_gives_the_same_numbers(models, document):
             for name in ("sigma", "bias"):
                 np.testing.assert_allclose(each[name], one[name], rtol=1e-9, atol=1e-15)
             assert each["use"] == Use(int(one.use)).name
-    assert 50 < unseen < 350
+    assert 20 < unseen < 130
     assert math.isnan(read(document["models"][0], 0.0, 0.0, 0.0, 0.0)["z"]["sigma"])
     assert math.isnan(read(document["models"][0], 0.0, 0.0, -2.0, 0.0, 74.25)["z"]["sigma"])
 
@@ -89,27 +86,18 @@ def test_the_table_compares_the_usual_rule(models):
     assert table.headings[0] == "configuration"
     assert {row[0] for row in table.rows} == {"solver = a", f"solver = {TITLE}"}
     assert {row[table.headings.index("held-out check")] for row in table.rows} == {"few draws"}
-    assert configuration_names(models)[0] == "solver = a"
-    assert stacked(models).sizes["model"] == 2
     lines = exponent_lines(models)
     assert len(lines) == 2
     for line in lines:
         assert float(line.rpartition("to the power ")[2].split()[0]) == pytest.approx(2.5, abs=0.15)
 
 
-@pytest.mark.parametrize("path", ["tag.hpp", "tag.py", "Tag.java", "tag.yaml", "model.txt", "tag"])
-def test_another_file_is_refused_with_what_to_do_instead(path):
-    with pytest.raises(ArgumentError, match=r"\.json.*reader of 20 lines"):
-        check_error_model_file(path)
-
-
 @pytest.mark.parametrize("arguments", [
-    ["error-model", "missing.zarr", "-o", "m.hpp"], ["error-model", "missing.zarr"],
+    ["error-model", "missing.zarr", "-o", "m.hpp"],
     ["report", "missing.zarr", "--error-model", "m.py"],
 ])
-def test_the_command_refuses_in_a_line(arguments, capsys, tmp_path, monkeypatch):
+def test_another_file_is_refused_with_what_to_do_instead(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    assert re.fullmatch(r".*\.json.*reader of 20 lines.*\n", capsys.readouterr().err)
     assert not list(tmp_path.iterdir())

@@ -63,20 +63,16 @@ def test_what_cannot_be_written_is_told_in_a_line(tmp_path):
     file, loop = tmp_path / "file", tmp_path / "loop"
     file.write_text("mine")
     loop.symlink_to(loop)
-    dangling = tmp_path / "dangling"
-    dangling.symlink_to(tmp_path / "none" / "file")
     for path, line in {
         tmp_path: "it is a folder; choose a file in it",
         tmp_path / "none" / "file": f"folder {tmp_path / 'none'} not found",
-        dangling: f"folder {tmp_path / 'none'} not found",
         file / "x": f"folder {file} not found",
         loop: "Too many levels of symbolic links",
         tmp_path / ("x" * 300): "File name too long",
-        Path("x/" * 3000): "File name too long",
         tmp_path / "a\0b": "embedded null byte",
     }.items():
         assert told(path).endswith(f": cannot be written: {line}")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["dangling", "file", "loop"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop"]
 
 
 def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
@@ -86,14 +82,9 @@ def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
-    assert "No space left on device" in told_while_writing(path)
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full)
+        with pytest.raises(StoreError, match="No space left on device"):
+            write_output_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def told_while_writing(path):
-    with pytest.raises(StoreError) as error:
-        write_output_file(path, b"new")
-    return str(error.value)

@@ -13,33 +13,19 @@ FOLDER = Path(__file__).parents[2] / "pipelines" / "questions"
 QUESTIONS = sorted(path.stem for path in FOLDER.glob("*.toml"))
 MAX_LINES = 12
 
-SMALL = {
-    "how_far": ["distance_m=[0.5, 3]", "tilt_deg=[0, 60]"],
-    "which": ["distance_m=[0.5, 2]"],
-    "which_size": ["size_m=[0.06, 0.4]", "tilt_deg=[0, 60]"],
-    "flips": ["tilt_deg=[5, 30]"],
-    "focal_length": ["distance_m=[0.5, 1.5]"],
-    "field_of_view": ["hfov_deg=[30, 110]", "tilt_deg=[0, 60]"],
-    "blur": ["blur_px=[0, 3]"],
-    "dictionary": ["side_px=[15, 40]"],
-    "threshold": ["adaptiveThreshConstant=[2, 7, 15]"],
-    "room": [],
+ANSWERS = {
+    "how_far": (["distance_m=[0.5, 3]", "tilt_deg=[0, 60]"], "up to 0.5 m"),
+    "which": (["distance_m=[0.5, 2]"], " against "),
+    "which_size": (["size_m=[0.06, 0.4]", "tilt_deg=[0, 60]"], "0.4 m"),
+    "flips": (["tilt_deg=[5, 30]"], "along tilt_deg"),
+    "focal_length": (["distance_m=[0.5, 1.5]"], "Detected in 100 %"),
+    "field_of_view": (["hfov_deg=[30, 110]", "tilt_deg=[0, 60]"], "up to 30"),
+    "blur": (["blur_px=[0, 3]"], "along blur_px: up to 0 px"),
+    "dictionary": (["side_px=[15, 40]"], "down to 40 px"),
+    "threshold": (["adaptiveThreshConstant=[2, 7, 15]"], " against "),
+    "room": ([], "Detected in "),
 }
-"""Few values of each axis."""
-
-EXPECTED = {
-    "how_far": "up to 0.5 m",
-    "which": " against ",
-    "which_size": "0.4 m",
-    "flips": "along tilt_deg",
-    "focal_length": "Detected in 100 %",
-    "field_of_view": "up to 30",
-    "blur": "along blur_px: up to 0 px",
-    "dictionary": "down to 40 px",
-    "threshold": " against ",
-    "room": "Detected in ",
-}
-"""A part of the first sentence on the small grid."""
+"""Few values of each axis, and a part of the first sentence."""
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
@@ -48,23 +34,21 @@ def test_a_question_is_short_and_what_it_requires_can_be(name):
     assert path.read_text().count("\n") <= MAX_LINES
     pipeline = Pipeline.from_toml(path)
     check_required(pipeline.requirements, str(path))
-    assert name in SMALL
+    assert name in ANSWERS
     assert f"({name}.toml)" in (FOLDER / "README.md").read_text()
-
-
-def asked(name, folder, trials):
-    text = (FOLDER / f"{name}.toml").read_text()
-    url = made(folder, text, name, settings=[*SMALL[name], f"trial={trials}"])
-    code, out, err = command("report", url, "-o", folder / "report.html", "--json")
-    assert (code, err) == (0, "")
-    return json.loads(out)
 
 
 @pytest.mark.evidence
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_the_first_sentence_answers_the_question(name, tmp_path):
-    shown = asked(name, tmp_path, 8 if name == "focal_length" else 150)
-    assert EXPECTED[name] in shown["answer"]
+    settings, sentence = ANSWERS[name]
+    trials = 8 if name == "focal_length" else 150
+    url = made(tmp_path, (FOLDER / f"{name}.toml").read_text(), name,
+               settings=[*settings, f"trial={trials}"])
+    code, out, err = command("report", url, "-o", tmp_path / "report.html", "--json")
+    assert (code, err) == (0, "")
+    shown = json.loads(out)
+    assert sentence in shown["answer"]
     if name == "focal_length":
         (table,) = (each for each in shown["tables"]
                     if each["caption"].startswith("Configurations, with"))

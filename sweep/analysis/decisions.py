@@ -63,8 +63,8 @@ from sweep.analysis.requirements import (
 )
 from sweep.analysis.summaries import LOOKED_FOR, detection_rate
 from sweep.errors import ArgumentError, DatasetError
-from sweep.experiment.axes import TRIAL
 from sweep.experiment.document import SEARCH
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import cf_attributes

@@ -23,8 +23,7 @@ from sweep.execution import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage, lacking_plugins
-from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.rules import file_digest
+from sweep.experiment.pipeline import Pipeline, file_digest
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import Variable
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated

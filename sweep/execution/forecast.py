@@ -20,8 +20,7 @@ from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreError
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.executors import SMALL_RUN_S
-from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Blocks
+from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs
 from sweep.experiment.pipeline import Pipeline

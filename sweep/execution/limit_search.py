@@ -100,7 +100,7 @@ def _with_search(
     if isinstance(source, Pipeline):
         pipeline = Pipeline.from_text(
             source.text, settings, name=source.name, source=source.source,
-            folder=source.folder, camera_files=source.files)
+            folder=source.folder)
     else:
         pipeline = read_pipeline(source, settings)
     if pipeline.requirements:

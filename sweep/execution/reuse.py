@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block
+from sweep.experiment.grid import TRIAL, Axis, Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import alike
 from sweep.experiment.schema import Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import RunStore, check_whole, receipts, region
@@ -64,7 +62,7 @@ class Source:
     store
         The old store.
     new
-        The new grid, with values in the old one's words.
+        The new grid.
     done
         Numbers of the old store's committed blocks.
     keys
@@ -79,7 +77,7 @@ class Source:
     @staticmethod
     def of(new: Pipeline, store: RunStore, done: frozenset[int]) -> Source:
         """Return how the cells of a new grid are found in a store."""
-        new, old = alike(new, store.pipeline)
+        old = store.pipeline
         keys = [_axis_key(axis) for axis in old.axes]
         owned = {name for key in keys for name in key.parameters}
         keys += [Key(None, (name,), {(fixed_value(old, name),): 0}.get)
@@ -174,7 +172,6 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         if variable.name not in present and not variable.drawn_as
     ]
     source = Source.of(pipeline, store, frozenset(check_whole(store)))
-    pipeline, old = alike(pipeline, old)
     drawn = pipeline.distributions.keys() | old.distributions.keys()
     for name in dict.fromkeys((*pipeline.parameters, *old.parameters, TRIAL)):
         if pipeline.distributions.get(name) != old.distributions.get(name):

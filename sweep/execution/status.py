@@ -14,7 +14,7 @@ import numpy as np
 
 from sweep.evaluation.block import bound_notes
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
-from sweep.experiment.axes import Axis
+from sweep.experiment.grid import Axis
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
 from sweep.processor import differing_processors

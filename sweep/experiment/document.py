@@ -17,17 +17,17 @@ import tomlkit
 import tomlkit.items
 
 from sweep.declaration import Declared, TablesError, check_table
-from sweep.experiment.axes import (
+from sweep.experiment.draws import SAMPLINGS
+from sweep.experiment.grid import (
     MAX_LISTED,
     TRIAL,
     Axis,
+    Grid,
     parse_axis,
     parse_distribution,
     parse_trial,
     zipped_axis,
 )
-from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.grid import Grid
 from sweep.experiment.parameters import (
     EFFECTS_KEY,
     NAMED_BY,
@@ -49,7 +49,7 @@ MAX_BYTES = 250_000
 """The largest text that is read."""
 
 MAX_PARTS = 8
-"""The most parts of a dotted key: reading it takes time that grows with their square."""
+"""The most parts of a dotted key: reading it takes memory that grows with their square."""
 
 _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(
@@ -98,7 +98,7 @@ def read_document(text: str) -> dict[str, Any]:
 
 
 def read_value(written: str) -> Any:
-    """Return a value of a command line; ValueError if the text is not exactly one.
+    """Return a value of a command line; ValueError with what was expected if it is not one.
 
     It is written as in TOML. Python's ``True`` and ``False`` count too, and a bare word, such as
     a solver's name, counts as a string.
@@ -111,13 +111,10 @@ def read_value(written: str) -> Any:
     try:
         document = read_document(f"value = {written}")
     except ValueError:
-        if _BARE.fullmatch(written):
-            return written
-        raise
-    value = document.pop("value")
-    if document:
-        raise ValueError("expected one value")
-    return value
+        document = {"value": written} if _BARE.fullmatch(written) else {}
+    if len(document) != 1:
+        raise ValueError("a TOML value, such as [0, 45] or 'text'")
+    return document["value"]
 
 
 def document_text(mapping: Mapping[str, Any]) -> str:
@@ -149,13 +146,9 @@ def document_text(mapping: Mapping[str, Any]) -> str:
                     add(tables.setdefault(key, tomlkit.table()), f"{key}.", value)
                 else:
                     table[key] = toml_item(value)
-            except TypeError:
+            except (TypeError, ValueError, RecursionError):
                 faults.append(f"{path} = {plain(repr(value))}: expected a string, a number, true, "
                               "false, a list or a table")
-            except ValueError:
-                faults.append(f"{path}: expected a number of fewer digits")
-            except RecursionError:
-                faults.append(f"{path}: nested too deeply")
 
     tables: dict[str, tomlkit.items.Table] = {}
     add(document, "", mapping)
@@ -232,25 +225,6 @@ def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> s
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """What a store has recorded, in place of files and plug-ins, which may have moved; or None.
-
-    Attributes
-    ----------
-    files
-        Path as written -> SHA-256 of every file.
-    cameras
-        The same of camera files alone, whose values the document has.
-    plugins
-        The plug-ins.
-    """
-
-    files: Mapping[str, str] | None = None
-    cameras: Mapping[str, str] | None = None
-    plugins: Sequence[DeclaredPlugin] | None = None
-
-
-@dataclass(frozen=True)
 class Reading(Grid):
     """What a document says, as far as it could be read, and its faults.
 
@@ -263,7 +237,8 @@ class Reading(Grid):
     title
         As the document says.
     recorded
-        What a store has recorded of files and plug-ins.
+        Path as written -> SHA-256 of the files of a store, which are not read: they may have
+        moved. None if the document is no store's.
     written
         Parameter -> where the document has it, and the value that stands there.
     unread
@@ -281,7 +256,7 @@ class Reading(Grid):
     document: Mapping[str, Any]
     source: str
     title: str
-    recorded: Recorded
+    recorded: Mapping[str, str] | None
     written: dict[str, tuple[str, Any]]
     unread: set[str] = field(default_factory=set)
     stated: dict[str, Any] = field(default_factory=dict)
@@ -362,21 +337,23 @@ def _rows(axis: Axis, names: Collection[str]) -> Iterable[Sequence[tuple[str, An
 
 
 def read_keys(
-    document: Mapping[str, Any], source: str, folder: str, recorded: Recorded
+    document: Mapping[str, Any], source: str, folder: str,
+    recorded: Mapping[str, str] | None = None, stored: Sequence[DeclaredPlugin] | None = None,
 ) -> Reading:
     """Return what a document says: its keys, each checked on its own.
 
-    Files that it names, and the sections of requirements and of a search, are read elsewhere.
+    ``recorded`` files and ``stored`` plug-ins are those of a store, which are not read. Files that
+    it names, and the sections of requirements and of a search, are read elsewhere.
     """
     header, lines = check_table(
         HEADER, {key: value for key, value in document.items() if key in HEADER}, "")
-    plugins, faults = read_plugins(document, folder, recorded.plugins)
+    plugins, faults = read_plugins(document, folder, stored)
     written: dict[str, tuple[str, Any]] = {}
     reading = Reading(
         seed=header["seed"], sampling=header["sampling"], title=header["title"], fixed={},
         given=written.keys(), written=written, distributions={}, axes=[], plugins=tuple(plugins),
         folder=folder, files={each.file: each.digest for each in plugins if each.file} | dict(
-            recorded.files or {}),
+            recorded or {}),
         document=document, source=source, recorded=recorded,
     )
     reading.tell(lines)
@@ -390,11 +367,6 @@ def read_keys(
         if key not in known:
             kind = "a section" if isinstance(value, dict) else "a key"
             reading.unknown_key("", key, known, f"; expected {kind} of {', '.join(known)}")
-            # Keys of a section of another name are told where they belong.
-            if isinstance(value, dict) and len(reading.faults) < MAX_FAULTS and not similar(
-                    key, known):
-                for name in reading.parameters.keys() & value.keys():
-                    reading.unknown_key(key, name, ())
         elif (key == "axes" or key in SECTIONS) and not isinstance(value, dict):
             reading.fault(key, value, f"a table: [{key}]")
     for section in SECTIONS:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import Distribution
+from sweep.experiment.grid import Distribution
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
 from sweep.model.board import along_sides
 from sweep.model.calibration import CalibrationError

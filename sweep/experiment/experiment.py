@@ -1,10 +1,11 @@
-"""The experiment: what a pipeline asks for, resolved once in each process."""
+"""The experiment: what a pipeline asks for, resolved once in each process, and facts on it."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,7 +13,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import TRIAL, Axis, combinations
 from sweep.experiment.draws import (
     CALIBRATED,
     SHIFTS,
@@ -24,19 +24,36 @@ from sweep.experiment.draws import (
     resolve_pose,
     uniform,
 )
-from sweep.experiment.grid import Block, Grid
-from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Stage
+from sweep.experiment.grid import TRIAL, Axis, Block, Grid, combinations
+from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.bound import BoundSetting
-from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
-from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
+from sweep.measure.detectors import (
+    OPENCV,
+    AnyDetectorSetting,
+    BoardDetectorSetting,
+    DetectorSetting,
+)
+from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.model.board_kinds import ARRANGING, arranged_board
-from sweep.model.camera import Column, canonical_distortion, map_columns
+from sweep.model.camera import (
+    VIEW_PARAMETERS,
+    Column,
+    are_square,
+    canonical_distortion,
+    field_of_view_deg,
+    intrinsics,
+    map_columns,
+)
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
+from sweep.model.exposure import hidden, not_modelled, outside_frame
+from sweep.model.marker import module_count
+from sweep.model.pose import angles_of_rotation, viewing_angle
+from sweep.model.scene import Scenes, build_cameras, build_scenes
 from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 T = TypeVar("T")
 
@@ -308,3 +325,379 @@ class Experiment:
             if grid.parameters[name].stage is Stage.scene
         ]
         return bits(grid.seed, f"image {grid.sampling}", hashed(texts, len(trials)), trials)
+
+
+# --------------------------------------------------------------------------------------------------
+# The settings that a configuration uses: an axis may hold others, which change nothing for it.
+
+PIXEL_SETTINGS = {
+    "photometric": frozenset({"refined_starts", "estimate_blur"}),
+    "photometric_real": frozenset({"refined_starts", "estimate_tone"}),
+}
+"""Solver on pixels -> the settings that it has beside those of all solvers."""
+
+
+def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
+    r"""Return those of some axes' values that the detector and the solver among them have.
+
+    ``values`` has an axis' name -> its value, or its label if parameters go together.
+
+    Examples
+    --------
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_text(
+    ...     "seed = 1\n[pose]\nside_px = 40\n[axes]\n"
+    ...     'solver = ["ippe", "sqpnp"]\nestimate_blur = [false, true]\n')
+    >>> used_settings(pipeline, {"solver": "ippe", "estimate_blur": True})
+    {'solver': 'ippe'}
+    """
+    chosen = {
+        name: several[0] for name in ("detector", "solver")
+        if len(several := list(set(pipeline.values_of(name)))) == 1
+    }
+    axes = {name: pipeline.axis(name) for name in values}
+    for name, axis in axes.items():
+        if axis is not None and values[name] in list(axis.values):
+            chosen |= axis.at(list(axis.values).index(values[name]))
+    unused: set[str] = set()
+    for name, table in _settings_of(pipeline).items():
+        if name in chosen:
+            unused |= set().union(*table.values()) - table.get(chosen[name], set())
+    return {name: value for name, value in values.items()
+            if (axis := axes[name]) is None or not unused.issuperset(axis.columns)}
+
+
+def _settings_of(pipeline: Grid) -> dict[str, dict[str, set[str]]]:
+    """Return the settings that each detector and each solver has, of those that others lack."""
+    plugged: dict[str, dict[str, set[str]]] = {"detector": {}, "estimator": {}}
+    for plugin in pipeline.plugins:
+        plugged.setdefault(plugin.kind, {})[plugin.name] = {each.name for each in plugin.settings}
+    return {
+        "detector": {OPENCV: {*OPENCV_FIELDS}, **plugged["detector"]},
+        "solver": {name: {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded}
+                   for name, solver in SOLVERS.items()} | plugged["estimator"],
+    }
+
+
+def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Return the indices of the combinations of axes' values that no earlier one means, too."""
+    first: dict[tuple[tuple[str, Any], ...], int] = {}
+    for index, values in enumerate(combinations):
+        first.setdefault(tuple(used_settings(pipeline, values).items()), index)
+    return list(first.values())
+
+
+def _truths(grid: Grid) -> dict[str, Any]:
+    """Return the true value of each belief, None where it varies."""
+    fixed = grid.fixed
+    view: Sequence[Any] = (None,) * 4 if any(name not in fixed for name in VIEW_PARAMETERS) else (
+        intrinsics(*(fixed[name] for name in VIEW_PARAMETERS)))
+    lens = fixed.get("distortion")
+    return {
+        **{f"believed_{name}_px": value
+           for name, value in zip(("fx", "fy", "cx", "cy"), view, strict=True)},
+        "believed_focal_scale": 1.0, "believed": "truth",
+        "believed_distortion": None if lens is None else canonical_distortion(lens),
+        **{f"believed_{name}": fixed.get(name) for name in ("size_m", "blur_px", "noise_grey")},
+    }
+
+
+def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
+    r"""Return for each value of an axis whether it makes the estimator believe what is not true.
+
+    A belief whose truth varies over the grid is right somewhere, and counts as not wrong.
+
+    Examples
+    --------
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_text(
+    ...     "seed = 1\n[pose]\nside_px = 40\n[axes]\nbelieved_focal_scale = [0.99, 1.0]\n")
+    >>> wrong_beliefs(pipeline, pipeline.axes[0])
+    (True, False)
+    """
+    truths = _truths(pipeline)
+    return tuple(
+        any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
+        for k in range(len(axis))
+    )
+
+
+def wrong_configurations(pipeline: Grid, axes: Sequence[Axis]) -> list[bool]:
+    """Return for each combination of axes' values, the last fastest, whether a belief is wrong.
+
+    Nowhere, if that is so for all of them: then none is the true one that others differ from.
+    """
+    wrong = [any(flags) for flags in itertools.product(
+        *(wrong_beliefs(pipeline, axis) for axis in axes))]
+    return [False] * len(wrong) if all(wrong) else wrong
+
+
+def _differs(believed: Any, truth: Any) -> bool:
+    """Return whether a belief is known to differ from the truth, beyond rounding."""
+    if believed is None or truth is None:
+        return False
+    if isinstance(believed, tuple):
+        believed = canonical_distortion(believed)
+    if not isinstance(believed, (int, float)):
+        return bool(believed != truth)
+    return not math.isclose(believed, truth, rel_tol=1e-9)
+
+
+Range = tuple[float, float]
+"""The least and the largest value on the grid."""
+
+MAX_SAMPLE = 600
+"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
+
+MAX_CORNERS = 200
+"""The most corners of a grid that are looked at."""
+
+OFF_CENTRE = 0.15
+"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
+
+WIDE_DEG = 150.0
+"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
+
+MIN_SHARE = 0.01
+"""Share of poses that is told."""
+
+
+def _ends(numbers: Floats) -> Range:
+    return float(np.min(numbers)), float(np.max(numbers))
+
+
+def _text(numbers: Sequence[float] | Floats, digits: int = 6) -> str:
+    """Return the least and the largest of some numbers; one of them if they print alike."""
+    low, high = (f"{round(float(end), 9) + 0.0:.{digits}g}" for end in (min(numbers), max(numbers)))
+    return low if low == high else f"{low} to {high}"
+
+
+class Facts:
+    """What an experiment's camera and poses are, and what may surprise.
+
+    Of large grids, and of what is drawn, by the scenes that are looked at. `sweep plan` prints all
+    of it; the start of a run prints the notes.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self.experiment, self.grid = experiment, experiment.grid
+
+    @cached_property
+    def _sample(self) -> tuple[int, dict[str, Column]]:
+        """The number of the scenes that are looked at, and the values of their parameters.
+
+        Every quantity of a camera is monotonic in each of its parameters, so that the corners of
+        the grid have its ends.
+        """
+        axes = self.experiment.scene_axes
+        lengths = [len(axis) for axis in axes]
+        if math.prod(lengths) <= MAX_SAMPLE:
+            indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+            return max(math.prod(lengths), 1), self.experiment.scene_values(indices)
+        # The bits of a corner's number say at which end of each axis it is.
+        corners = np.arange(min(2 ** len(axes), MAX_CORNERS))
+        anywhere = np.random.default_rng(0)
+        return MAX_SAMPLE, self.experiment.scene_values([
+            np.concatenate([
+                (corners >> k & 1) * (length - 1),
+                anywhere.integers(0, length, MAX_SAMPLE - len(corners)),
+            ]).astype(np.intp) for k, length in enumerate(lengths)
+        ])
+
+    # The camera.
+
+    @cached_property
+    def camera(self) -> dict[str, Any]:
+        """Each quantity of the camera: its least and its largest value.
+
+        Frame, focal lengths and principal point in px; hfov_deg and vfov_deg, the angle between
+        the frame's edges without lens distortion, 2 atan(width / (2 fx)); aspect, fy / fx: the
+        width of a pixel over its height; off_centre_x and off_centre_y, the principal point minus
+        the frame's centre, as a share of its width and height; square, whether the pixels are
+        square everywhere on the grid; side_px of the black square parallel to the image plane, at
+        the farthest and the nearest pose, None if all are behind the camera, of boards the sides
+        of the smallest and the largest marker; boards, whether scenes show boards.
+        """
+        count, values = self._sample
+        fx, fy, cx, cy = build_cameras(values, count).view.T
+        width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
+        given = values["side_px"]
+        with np.errstate(divide="ignore"):
+            sides = given.broadcast(count) if not given.missing else (
+                fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
+        sides = sides[sides > 0]  # before the camera
+        numbers = {
+            "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
+            "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
+            "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
+            "off_centre_x": (cx - (width - 1) / 2) / width,
+            "off_centre_y": (cy - (height - 1) / 2) / height,
+        }
+        return {name: _ends(each) for name, each in numbers.items()} | {
+            "square": bool(np.all(are_square(fx, fy))),
+            "side_px": None if not len(sides) else tuple(
+                end * scale for end, scale in zip(
+                    _ends(sides), self.grid.relative_sizes, strict=True)),
+            "boards": self.grid.shows_boards,
+        }
+
+    @property
+    def _frame(self) -> str:
+        """The frame's size, in words."""
+        return f"{_text(self.camera['width_px'])} x {_text(self.camera['height_px'])} px"
+
+    @property
+    def camera_line(self) -> str:
+        """The camera in one line."""
+        camera = self.camera
+        focal = f"fx = fy = {_text(camera['fx_px'])} px" if camera["square"] else (
+            f"fx = {_text(camera['fx_px'])} px, fy = {_text(camera['fy_px'])} px "
+            f"(pixels are not square: fy/fx = {_text(camera['aspect'], 4)})")
+        sides = camera["side_px"] and f", {self._whose} {_text(camera['side_px'], 4)} px"
+        return (f"{self._frame}, {focal}, HFOV {_text(camera['hfov_deg'], 4)}°, "
+                f"VFOV {_text(camera['vfov_deg'], 4)}°{sides or ''}")
+
+    @property
+    def _whose(self) -> str:
+        """Whose sides the camera sees, in words."""
+        return "the markers' sides are" if self.camera["boards"] else "the marker's side is"
+
+    @property
+    def camera_attributes(self) -> dict[str, Any]:
+        """The dataset's attributes of the camera: a number, or the least and the largest one."""
+        return {
+            f"camera_{name}": low if low == high else [low, high]
+            for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
+            for low, high in [self.camera[name]]
+        } | dict(zip(("farthest_side_px", "nearest_side_px"), self.camera["side_px"] or (),
+                     strict=False))
+
+    @cached_property
+    def camera_notes(self) -> list[str]:
+        """A line for each property of the camera that may surprise."""
+        wide = [f"HFOV {_text(self.camera['hfov_deg'], 4)}°: is a focal length in another unit?"
+                ] * (self.camera["hfov_deg"][1] > WIDE_DEG)
+        return [*wide, *self._centre_notes(), *self._side_notes()]
+
+    def _centre_notes(self) -> Iterator[str]:
+        for axis in "xy":
+            centre = f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}"
+            off = max(map(abs, self.camera[f"off_centre_{axis}"]))
+            if off > 0.5:
+                yield f"{centre}: outside the frame of {self._frame}"
+            elif off > OFF_CENTRE:
+                yield (f"{centre}: far from the centre of the frame of {self._frame}; is it that "
+                       "of another frame size?")
+        x, y = (self.camera[name][0] / 2 for name in ("width_px", "height_px"))
+        if (self.camera["cx_px"], self.camera["cy_px"]) == ((x, x), (y, y)):
+            yield (f"cx_px = {x:g}, cy_px = {y:g}: half the frame; with pixel (0, 0) at the "
+                   f"pixel's centre, as here, the middle is {x - 0.5:g}, {y - 0.5:g}: subtract 0.5 "
+                   "if the program that gave them has its corner there "
+                   "(pipelines/half_pixel/README.md)")
+
+    def _side_notes(self) -> Iterator[str]:
+        """Yield a line if no marker of the grid is of a size that can be detected."""
+        far, near = self.camera["side_px"] or (0.0, math.inf)
+        units = "" if "side_px" in self.grid.given else (
+            "; are size_m and the distances in metres?")
+        if near < min(map(module_count, self.grid.values_of("dictionary"))):
+            yield (f"{self._whose} at most {near:.4g} px, less than a pixel a module: too small to "
+                   f"be read{units}")
+        elif far > max(self.camera["width_px"][1], self.camera["height_px"][1]):
+            yield f"{self._whose} at least {far:.4g} px, more than the frame's{units}"
+
+    # The poses.
+
+    @cached_property
+    def _scenes(self) -> Scenes:
+        """The scenes that are looked at."""
+        count, values = self._sample
+        return build_scenes(values, count)
+
+    @cached_property
+    def views(self) -> dict[str, Floats]:
+        """Tilt to the image plane, angle to the line of sight, distance of the centre, (n,) each.
+
+        Of the scenes that are looked at.
+        """
+        rotation, translation = self._scenes.rotation, self._scenes.translation
+        return {
+            "tilt_deg": np.degrees(angles_of_rotation(rotation)[0]),
+            "viewing_angle_deg": np.degrees(viewing_angle(rotation, translation)),
+            "range_m": np.linalg.norm(translation, axis=1),
+        }
+
+    @property
+    def view_ranges(self) -> dict[str, list[float]]:
+        """The least and the largest tilt, viewing angle and distance."""
+        return {name: list(_ends(numbers)) for name, numbers in self.views.items()}
+
+    @property
+    def pose_line(self) -> str:
+        """The poses in one line."""
+        count, _ = self._sample
+        tilt, angle, distance = (_text(numbers, 4) for numbers in self.views.values())
+        sample = f" ({count:,} poses looked at)" * (count < len(self.experiment.all_scenes))
+        return f"tilt {tilt}°, viewing angle {angle}°, {distance} m away{sample}"
+
+    def _share(self, chosen: Masks) -> str:
+        """Return the share of the poses that are ``chosen``, in words."""
+        whole = len(chosen) >= len(self.experiment.all_scenes)
+        if chosen.all():
+            return "all poses" if whole else f"all {len(chosen):,} poses looked at"
+        return f"{'' if whole else 'about '}{100 * chosen.mean():.2g} % of the poses"
+
+    @property
+    def pose_notes(self) -> Iterator[str]:
+        """A line for each reason for which markers are not wholly seen; the first counts."""
+        scenes, target = self._scenes, self.grid.target_word
+        within = f"; frame_x and frame_y place a {target} within it" * (
+            self.grid.given.isdisjoint((*WORLD, "frame_x", "frame_y")))
+        left = np.ones(len(scenes), dtype=bool)
+
+        def outside() -> Masks:
+            rows, wholly = np.flatnonzero(left), np.zeros_like(left)
+            wholly[rows] = outside_frame(scenes, rows)
+            return wholly
+
+        corners = scenes.corners_px
+        reasons: tuple[tuple[Callable[[], Any], str], ...] = (
+            (lambda: ~np.isfinite(scenes.outline_px).all(axis=(1, 2)),
+             "have a corner behind the camera: not_visible"),
+            (lambda: hidden(scenes),
+             f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
+            (lambda: not_modelled(scenes),
+             "lie where the lens folds, or bend or move out of what is modelled: not_modelled"),
+            (outside, f"are outside the frame: not_visible{within}"),
+            (lambda: ((corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)).any((1, 2)),
+             "are cut off by the frame's edge"),
+        )
+        for reason, what in reasons:
+            chosen = np.asarray(left & reason())
+            left &= ~chosen
+            if chosen.mean() > MIN_SHARE:
+                yield f"{self._share(chosen)} {what}"
+
+    # The detections, and all notes.
+
+    @property
+    def detector_notes(self) -> Iterator[str]:
+        """A line for each property of the detections that may surprise."""
+        squares = "aprilgrid" in self.grid.values_of("kind") or any(
+            self.grid.values_of("corner_squares"))
+        if squares and self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector")):
+            yield ("board: squares touch its markers' corners, and OpenCV's default threshold "
+                   "joins both: it finds a third of sharp markers; adaptiveThreshConstant = 60, "
+                   "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in "
+                   "five (pipelines/boards/README.md)")
+        if "apriltag" in self.grid.values_of("cornerRefinementMethod"):
+            yield ("cornerRefinementMethod = apriltag: OpenCV's corners are 0.4 to 0.5 px right of "
+                   "and below those of its other refinements, and of its calibrations: half a "
+                   "pixel in position and direction (pipelines/half_pixel/README.md)")
+
+    @property
+    def notes(self) -> list[str]:
+        """The lines that `sweep plan` and the start of a run print."""
+        if PHOTOGRAPHS in self.grid.given:
+            return []
+        return [*self.camera_notes, *self.pose_notes, *self.detector_notes]

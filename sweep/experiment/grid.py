@@ -1,19 +1,22 @@
-"""The grid: the value, axis or distribution of every parameter; its blocks of scene cells."""
+"""The grid: axes and distributions, the values of every parameter, blocks of scene cells."""
 
 from __future__ import annotations
 
+import collections
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import Axis, Distribution, combinations
 from sweep.experiment.parameters import (
+    ONE_VALUE,
+    PARAMETERS,
     PHOTOGRAPHS,
     SIMULATED,
     STATED,
@@ -21,10 +24,366 @@ from sweep.experiment.parameters import (
     Stage,
     parameters_with,
 )
+from sweep.messages import label, nearest, plain, shown
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.calibration import CalibrationError
-from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.plugins.declared import DeclaredPlugin
+from sweep.typing import Floats
+
+TRIAL = "trial"
+"""The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ..."""
+
+MAX_VALUES = 10**9
+"""The longest axis (``range`` and ``trial``; they are never written out)."""
+
+MAX_LISTED = 10**6
+"""The longest axis of any other form; also the most values of all such axes together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A dimension of the grid.
+
+    Attributes
+    ----------
+    name
+        A parameter's, ``trial``, or a name of the user's own if parameters go together along it.
+    columns
+        Parameter (or ``trial``) -> its values along the axis.
+    parameters
+        Its parameters; none of ``trial``.
+    labels
+        A label of each combination of parameters that go together; empty for a single one.
+    """
+
+    name: str
+    columns: Mapping[str, Sequence[Any]]
+    parameters: tuple[Parameter, ...] = field(default=(), compare=False)
+    labels: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def zipped(self) -> bool:
+        """Whether parameters go together along it."""
+        return bool(self.labels)
+
+    @property
+    def values(self) -> Sequence[Any]:
+        """Its values, without repeats; labels if parameters go together."""
+        return self.labels or self.columns[self.name]
+
+    def at(self, index: int) -> dict[str, Any]:
+        """Return the value of each of its parameters at an index."""
+        return {name: values[index] for name, values in self.columns.items()}
+
+    def index_of(self, wanted: Mapping[str, Any]) -> int | None:
+        """Return the first index at which its parameters have the wanted values; None without."""
+        names = self.columns.keys() & wanted.keys()
+        if names == {self.name}:  # also of a long range
+            values = self.values
+            return values.index(wanted[self.name]) if wanted[self.name] in values else None
+        rows = range(len(self))
+        return next(
+            (i for i in rows if all(self.columns[name][i] == wanted[name] for name in names)), None)
+
+    @property
+    def stage(self) -> Stage:
+        """The first stage that the axis touches."""
+        return self.parameters[0].stage if self.parameters else Stage.scene
+
+    @property
+    def unit(self) -> str:
+        """The unit of its values; empty if they have none."""
+        return "" if self.zipped or not self.parameters else self.parameters[0].unit
+
+    @property
+    def meaning(self) -> str:
+        """Meaning of the values, in words."""
+        if self.zipped:
+            return f"{', '.join(self.columns)}, which go together"
+        return self.parameters[0].meaning if self.parameters else "number of the draw"
+
+    @property
+    def kind(self) -> type:
+        """Type of its coordinates: of its values, if all are booleans or numbers; else strings."""
+        kinds = {int} if isinstance(self.values, range) else set(map(type, self.values))
+        return kinds.pop() if kinds in ({bool}, {int}, {float}) else str
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its values are numbers, and not labels or switches."""
+        return self.kind in (int, float)
+
+    def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Return the values [start, stop) as coordinates: numbers, booleans or strings."""
+        part = self.values[start:stop]
+        if isinstance(part, range):
+            return np.arange(part.start, part.stop, part.step, dtype=np.int64)
+        if self.kind is str:
+            return np.array([label(value) for value in part], dtype=np.dtypes.StringDType())
+        return np.array(part, dtype=self.kind)
+
+
+MAX_DEVIATIONS = 8.3
+"""The largest distance of a normal draw of 53 bits from its mean, in standard deviations."""
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """A parameter that is drawn per trial: ``uniform`` on [a, b] or ``normal`` (mean a, sd b)."""
+
+    kind: str
+    a: float
+    b: float
+
+    def at(self, uniform: Floats) -> Floats:
+        """Return the inverse CDF at uniform numbers in (0, 1), of any shape."""
+        if self.kind == "uniform":
+            return self.a + (self.b - self.a) * uniform
+        from scipy.special import ndtri  # noqa: PLC0415  (slow to import, and seldom needed)
+
+        return np.asarray(self.a + self.b * ndtri(uniform))
+
+    @property
+    def largest(self) -> float:
+        """The largest number that a draw is added up from."""
+        return max(abs(self.a), self.b * MAX_DEVIATIONS if self.kind == "normal" else abs(self.b))
+
+    def __str__(self) -> str:
+        return f"{self.kind}({self.a:.12g},{self.b:.12g})"
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form in which the values of an axis are generated.
+
+    Attributes
+    ----------
+    expected
+        The numbers of the form, in words.
+    lengths
+        How many there may be.
+    count
+        Returns how many values they make; 0 for numbers that make none.
+    values
+        Returns the values.
+    """
+
+    expected: str
+    lengths: tuple[int, ...]
+    count: Callable[..., int]
+    values: Callable[..., Any]
+
+
+def _range(*ends: int) -> range:
+    sound = 0 not in ends[2:] and all(isinstance(end, int) and abs(end) < 2**62 for end in ends)
+    return range(*ends) if sound else range(0)
+
+
+def _steps(start: float, stop: float, step: float) -> int:
+    steps = (float(stop) - float(start)) / step if step else 0.0
+    # Half-open also if the last step misses the stop only by rounding.
+    return math.ceil(min(max(steps, 0.0), 2.0 * MAX_VALUES) - 1e-9)
+
+
+def _stepped(*ends: float) -> Sequence[float]:
+    if all(isinstance(end, int) for end in ends):
+        return range(*map(int, ends))
+    start, _, step = map(float, ends)
+    return [start + step * i for i in range(_steps(*ends))]
+
+
+def _spaced(_first: float, _last: float, count: float) -> int:
+    return count if isinstance(count, int) else 0
+
+
+AXIS_FORMS = {
+    "range": Form("[start, stop] or [start, stop, step], whole numbers, half-open", (2, 3),
+                  lambda *ends: len(_range(*ends)), _range),
+    "arange": Form("[start, stop, step], half-open", (3,), _steps, _stepped),
+    "linspace": Form("[first, last, count], both inclusive", (3,), _spaced, np.linspace),
+    "geom": Form("[first, last, count], both inclusive, above 0", (3,),
+                 lambda *ends: _spaced(*ends) if min(ends) > 0 else 0, np.geomspace),
+}
+DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
+
+
+def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribution:
+    """Return the distribution of a table such as ``{ uniform = [a, b] }``.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if the table is not a distribution of the parameter.
+    """
+    ends: Any
+    kind, ends = next(iter(table.items()), ("", []))
+    if len(table) != 1 or kind not in DISTRIBUTION_FORMS:
+        if kind in (*AXIS_FORMS, "values"):
+            raise ValueError("one value here; more than one goes under [axes]")
+        forms = " or ".join(f"{{ {each} = {form} }}" for each, form in DISTRIBUTION_FORMS.items())
+        raise ValueError(f"{parameter.expected()}, or {forms}")
+    if not parameter.drawable:
+        drawable = ", ".join(p.name for p in PARAMETERS.values() if p.drawable)
+        raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
+    sound = isinstance(ends, list) and len(ends) == 2 and _are_numbers(ends)
+    if not sound or not ends[1] > (ends[0] if kind == "uniform" else 0):
+        raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
+    a, b = map(float, ends)
+    if kind == "uniform":
+        parameter.check(a)
+        parameter.check(b)
+    elif not all(parameter.admits(a + side * MAX_DEVIATIONS * b) for side in (-1, 1)):
+        extent = parameter.range_text()
+        raise ValueError(f"mean - {MAX_DEVIATIONS} sd and mean + {MAX_DEVIATIONS} sd {extent}")
+    return Distribution(kind, a, b)
+
+
+def _are_numbers(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool)
+               and abs(value) < 1e300 for value in values)
+
+
+def parse_trial(value: Any) -> Axis:
+    """Return the axis of ``trial = N``; ValueError with the expectation if N is not a count."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_VALUES:
+        raise ValueError(f"a whole number from 1 to {MAX_VALUES:,}: how many draws")
+    return Axis(TRIAL, {TRIAL: range(value)})
+
+
+def parse_axis(
+    parameter: Parameter, given: Any, quota: int = MAX_LISTED, *, repeats: bool = False
+) -> Axis:
+    """Return the axis of a list or of a table such as ``{ geom = [0.05, 1, 40] }``.
+
+    Parameters
+    ----------
+    parameter
+        The parameter that varies along the axis.
+    given
+        The list or table of the document.
+    quota
+        The most values that are listed; a ``range`` is not.
+    repeats
+        Whether a value may be repeated.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if it is not an axis of the parameter.
+
+    Examples
+    --------
+    >>> parse_axis(PARAMETERS["tilt_deg"], {"linspace": [0, 60, 3]}).values
+    (0.0, 30.0, 60.0)
+    """
+    table = {"values": given} if isinstance(given, list) else given
+    form, ends = next(iter(table.items()), ("", [])) if isinstance(table, dict) else ("", [])
+    if parameter.name in ONE_VALUE:
+        raise ValueError(f"one value under [{parameter.section}]: it cannot be an axis")
+    if form == "zip":
+        raise ValueError(
+            f"an axis of {parameter.name} alone; parameters that go together need a name of "
+            "your own, such as pair = { zip = { ... } }"
+        )
+    if form in DISTRIBUTION_FORMS:
+        raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
+    known = [*AXIS_FORMS, "values"]
+    if form not in known or len(table) != 1:
+        raise ValueError(f"a list, or a table with one of {', '.join(known)}{nearest(form, known)}")
+    if form in AXIS_FORMS:
+        return Axis(parameter.name, {parameter.name: _generated(parameter, form, ends, quota)},
+                    (parameter,))
+    if not isinstance(ends, list):
+        raise ValueError(f"{form} = a list")  # noqa: TRY004  (a fault of the file)
+    if len(ends) > quota:
+        raise ValueError(TOO_MANY)
+    if not ends:
+        raise ValueError("at least one value")
+    values = tuple(_checked(parameter, value) for value in ends)
+    value, count = collections.Counter(values).most_common(1)[0]
+    if count > 1 and not repeats:
+        raise ValueError(f"each value once ({shown(value)} is repeated)")
+    return Axis(parameter.name, {parameter.name: values}, (parameter,))
+
+
+def _generated(parameter: Parameter, name: str, ends: Any, quota: int) -> Sequence[Any]:
+    """Return the values of a form that generates them."""
+    form = AXIS_FORMS[name]
+    sound = isinstance(ends, list) and len(ends) in form.lengths and _are_numbers(ends)
+    count = form.count(*ends) if sound else 0
+    if count < 1:
+        raise ValueError(f"{name} = {form.expected}, at least one value")
+    is_whole = parameter.types == (int,)
+    if count > (MAX_VALUES if is_whole and name == "range" else quota):
+        raise ValueError(f"at most {MAX_VALUES:,} values" if name == "range" else TOO_MANY)
+    values: Sequence[Any] = form.values(*ends)
+    # All are numbers: if the least and the largest are admitted, all are.
+    for end in (values[0], values[-1]):
+        _checked(parameter, end)
+    return values if is_whole else tuple(map(float, values))
+
+
+TOO_MANY = f"at most {MAX_LISTED:,} values, all axes together"
+
+
+def zipped_axis(
+    name: str, columns: Mapping[str, Sequence[Any]],
+    parameters: Mapping[str, Parameter] = PARAMETERS,
+) -> Axis:
+    """Return the axis along which parameters go together, of ``parameters`` by their names.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if their values are not equally many, they belong to different stages, or
+        a combination is repeated.
+
+    Examples
+    --------
+    >>> zipped_axis("lens", {"fx_px": (600.0, 800.0), "fy_px": (600.0, 802.5)}).values
+    ('600, 600', '800, 802.5')
+    """
+    together = tuple(parameters[key] for key in columns)
+    if len({len(values) for values in columns.values()}) > 1:
+        counts = ", ".join(f"{key} has {len(values):,}" for key, values in columns.items())
+        raise ValueError(f"equally many values of each parameter: {counts}")
+    if len({each.stage for each in together}) > 1:
+        listed = ", ".join(f"{each.name} is of the {each.stage.name}" for each in together)
+        raise ValueError(f"parameters of one stage: {listed}")
+    rows = list(zip(*columns.values(), strict=True))
+    labels = tuple(", ".join(map(_short, row)) for row in rows)
+    row, count = collections.Counter(rows).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"each combination once ({plain(labels[rows.index(row)])} is repeated)")
+    if len(set(labels)) < len(labels):
+        labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
+    return Axis(name, {key: tuple(values) for key, values in columns.items()}, together, labels)
+
+
+def _short(value: Any) -> str:
+    """Return a value as a label; a whole number without its decimals."""
+    whole = isinstance(value, float) and value == int(value) and abs(value) < 1e15
+    return str(int(value)) if whole else label(value)
+
+
+def _checked(parameter: Parameter, value: Any) -> Any:
+    try:
+        return parameter.check(value)
+    except ValueError as error:
+        expected, semicolon, hint = str(error).partition("; did you mean")
+        raise ValueError(f"{expected} (not {shown(value)}){semicolon}{hint}") from None
+
+
+def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    """Return the parameters' values at all combinations of axes, the last axis fastest."""
+    rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
+    return [
+        {name: value for row in chosen for name, value in row.items()}
+        for chosen in itertools.product(*rows)
+    ]
+
 
 # --------------------------------------------------------------------------------------------------
 # What a document and the pipeline that is read from it have in common: values on a grid.
@@ -108,26 +467,6 @@ class Grid:
         sd, covariance = (self.fixed[name] for name in STATED)
         count = len(sd) or round(len(covariance) ** 0.5)
         return CalibrationError.of(sd, covariance, count - 4)
-
-    @property
-    def view(self) -> tuple[float, ...] | None:
-        """The numbers fx, fy, cx, cy of the camera, if there is a single one."""
-        if any(name not in self.fixed for name in VIEW_PARAMETERS):
-            return None
-        return tuple(map(float, intrinsics(*(self.fixed[name] for name in VIEW_PARAMETERS))))
-
-    @property
-    def truth(self) -> dict[str, Any]:
-        """The true value of each belief, None where it varies."""
-        names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
-        lens = self.fixed.get("distortion")
-        return {
-            **dict(zip(names, self.view or (None,) * 4, strict=True)),
-            "believed_focal_scale": 1.0,
-            "believed_distortion": None if lens is None else canonical_distortion(lens),
-            **{f"believed_{name}": self.fixed.get(name)
-               for name in ("size_m", "blur_px", "noise_grey")},
-        }
 
     def arrangements(self) -> Iterator[tuple[Any, ...]]:
         """Yield the values of `ARRANGING` of each combination of their axes."""

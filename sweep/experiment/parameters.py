@@ -115,6 +115,9 @@ STATED = ("calibration_sd", "calibration_covariance")
 SIMULATED = "simulated"
 """The parameter that takes from such a record the poses alone."""
 
+ONE_VALUE = ("camera_file", *STATED, SIMULATED, "ids", "markers", "distractors")
+"""The parameters that cannot be an axis."""
+
 RIVALS: dict[str, frozenset[str]] = {
     name: frozenset(
         other for ways in CHOICES for way in ways

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
-from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.document import file_text, read_document
+from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown

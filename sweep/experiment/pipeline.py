@@ -1,10 +1,13 @@
-"""The pipeline: a document that is checked as a whole; its values changed by --set and --at."""
+"""The pipeline: rules across the keys of a document; its values changed by --set and --at."""
 
 from __future__ import annotations
 
 import copy
+import hashlib
+import math
+import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,13 +16,12 @@ from typing import Any
 import tomlkit
 
 from sweep.declaration import Declared
-from sweep.experiment.axes import DISTRIBUTION_FORMS, TRIAL, Axis
+from sweep.errors import PluginError
 from sweep.experiment.document import (
     HEADER,
     REQUIRE,
     SEARCH,
     Reading,
-    Recorded,
     document_text,
     file_text,
     read_document,
@@ -28,43 +30,563 @@ from sweep.experiment.document import (
     section_of,
     toml_item,
 )
-from sweep.experiment.experiment import Experiment
-from sweep.experiment.facts import Facts
-from sweep.experiment.grid import Grid
+from sweep.experiment.draws import REPLICATES, SAMPLINGS
+from sweep.experiment.experiment import Experiment, Facts
+from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
 from sweep.experiment.parameters import (
+    CHOICES,
     EFFECTS_KEY,
+    FIELDS_OF_VIEW,
+    IN_CAMERA,
+    IN_MM,
     NAMED_BY,
     PARAMETERS,
+    PHOTOGRAPHS,
     RIVALS,
+    SECTIONS,
+    SIMULATED,
     STATED,
+    WORLD,
     Parameter,
+    Stage,
     is_zip,
     parameters_with,
     read_plugins,
 )
-from sweep.experiment.rules import (
-    FILE_VALUES,
-    OTHER_WAYS,
-    check_rules,
-    read_camera_file,
-    resolve_sensor,
-)
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.sampling import (
     MAX_TRIALS,
-    REQUIRE_KEYS,
     StoppingRule,
     read_required,
     read_search,
 )
-from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
-from sweep.model.board_kinds import used_by
+from sweep.experiment.schema import LABELS, VARIABLES
+from sweep.measure.detectors import OPENCV
+from sweep.measure.estimators import SOLVERS
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal, shown
+from sweep.model.board_kinds import (
+    ARRANGING,
+    NEEDED,
+    SINGLE,
+    arrangement_faults,
+    is_solid,
+    used_by,
+)
+from sweep.model.calibration import MAX_BYTES, CalibrationError, calibration_of, read_tree
+from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
+from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular
+from sweep.model.marker import (
+    has_circles,
+    marker_count,
+    missing_package,
+    opencv_dictionary_names,
+)
+from sweep.model.scene import RENDERERS, is_renderer
+from sweep.model.sensor import MAX_LEVEL
 from sweep.plugins.declared import DeclaredPlugin
+from sweep.plugins.recording import is_recording
+
+# --------------------------------------------------------------------------------------------------
+# Two kinds of rules: of values that cannot meet on the grid, and of parameters that have no place
+# somewhere. A parameter whose own value is at fault is passed over: its fault is known already.
+
+Check = Callable[[Reading], None]
+"""Notes the faults of a document that break a rule."""
+
+
+def apart(
+    names: tuple[str, ...], wrong: Callable[..., bool], expected: str | Callable[..., str]
+) -> Check:
+    """Return the rule that values of parameters cannot meet; the first is at fault.
+
+    Parameters
+    ----------
+    names
+        The parameters.
+    wrong
+        Whether a value of each cannot meet. Of numbers it gets the least and the largest, and of
+        IDs the largest alone: in each number it changes once.
+    expected
+        What is expected in place of the first: text, or a function of a value of each.
+    """
+    def check(reading: Reading) -> None:
+        for values in reading.meeting(*names):
+            if wrong(*values):
+                reading.refuse_value(names[0], values[0], expected if isinstance(
+                    expected, str) else expected(*values))
+
+    return check
+
+
+def absent(
+    names: Iterable[str], where: Callable[[Reading], Any], expected: str, *, active: bool = False
+) -> Check:
+    """Return the rule that parameters have no place where something holds.
+
+    ``expected`` is expected in place of one that is given; with ``active`` a neutral value is none
+    that counts.
+    """
+    def check(reading: Reading) -> None:
+        for name in names:
+            if name in reading.given and where(reading) and (
+                    reading.is_active(name) or not active):
+                reading.refuse(name, expected)
+
+    return check
+
+
+def _is_no_noise_table(table: Sequence[float]) -> bool:
+    levels, deviations = table[::2], table[1::2]
+    return (
+        list(levels) != sorted(set(levels))
+        or not all(0 <= level <= MAX_LEVEL for level in levels)
+        or not all(0 <= deviation <= 1e6 for deviation in deviations)
+    )
+
+
+def _without(*names: str) -> Callable[[Reading], bool]:
+    """Return what says whether none of some parameters is given."""
+    return lambda reading: reading.given.isdisjoint(names)
+
+
+def _is_calibrated(reading: Reading) -> bool:
+    """Return whether an estimator believes a calibration."""
+    return "calibration" in reading.values_of("believed")
+
+
+def _in_planes(*listed: Any) -> bool:
+    """Return whether prints, listed as parameters' values, lie in several planes."""
+    return any(map(is_solid, listed))
+
+
+SEVERAL_PLANES = "for prints with z_m or tilt_deg"
+
+OTHER_WAYS = (*IN_MM, *FIELDS_OF_VIEW)
+"""The ways to give a camera beside focal lengths in pixels, and beside a file."""
+
+PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
+"""Parameter -> those of which one must be given beside it, or one of a rival way."""
+
+RECORDS: tuple[Check, ...] = (
+    *(absent((name,), _without(*others, *RIVALS.get(name, ())),
+                f"{' or '.join(others)} beside it", active=True)
+      for name, others in PARTNERS.items()),
+    apart(("marker_id", "dictionary"),
+         lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
+         lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
+         f"{dictionary} has"),
+    apart(("noise_table",), _is_no_noise_table,
+         "level, standard deviation, level, standard deviation, ...: levels that ascend from 0 "
+         f"to {MAX_LEVEL:g}, deviations of at least 0"),
+    apart(("adaptiveThreshWinSizeMax", "adaptiveThreshWinSizeMin"),
+         lambda largest, smallest: largest < smallest, "at least adaptiveThreshWinSizeMin"),
+    apart(("height_px", "width_px"), lambda height, width: height * width > MAX_PIXELS,
+         f"a frame of at most {MAX_PIXELS:,} pixels"),
+    # Renderers.
+    apart(("renderer", "dictionary"),
+         lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
+         "exact for STag's markers, which have circles"),
+    apart(("renderer", "kind", "distractors"),
+         lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
+         f"{RENDERERS}, for boards"),
+    apart(("renderer", "markers", "distractors"),
+         lambda renderer, *listed: renderer != "exact" and _in_planes(*listed),
+         f"exact, {SEVERAL_PLANES}"),
+    absent(GEOMETRIC, lambda reading: {*reading.values_of("renderer")} - {"exact"},
+              "renderer = exact beside it, which alone has it", active=True),
+    absent(("curvature_per_m", "occlusion"),
+              lambda reading: _in_planes(
+                  *reading.values_of("markers"), *reading.values_of("distractors")),
+              f"it absent, {SEVERAL_PLANES}: it is of one sheet", active=True),
+    # Cameras, and what estimators believe of them.
+    absent(OTHER_WAYS, lambda reading: reading.stated,
+              "no other camera beside camera_file; delete it, or camera_file"),
+    absent(
+        ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px",
+         "believed_focal_scale", "believed_distortion"), _is_calibrated,
+        "no other belief about the camera beside believed = calibration; delete one of them"),
+    # Photographs, which have their own poses and light.
+    absent((SIMULATED,), _without(PHOTOGRAPHS),
+              "photographs beside it, whose poses are taken", active=True),
+    absent(("kind",), lambda reading: PHOTOGRAPHS in reading.given and reading.shows_boards,
+              "no board beside photographs, whose board `sweep photos` knows; delete it"),
+    apart(("believed", PHOTOGRAPHS), lambda believed, file: file and believed == "calibration",
+         "truth, for photographs"),
+    # Boards.
+    absent(("points", "refine", "refineDetectedMarkers", "minMarkers"),
+              lambda reading: not reading.shows_boards, "a board: give kind under [board]"),
+    absent(("ids",), lambda reading: "marker_id" in reading.given,
+              "ids, or marker_id of the first; not both", active=True),
+    apart(("points", "detector"),
+         lambda points, detector: points == "chessboard" and is_recording(detector),
+         "markers beside recorded detections, which have no corners of chessboards"),
+    apart(("refineDetectedMarkers", "detector"),
+         lambda refine, detector: refine and is_recording(detector),
+         "false beside recorded detections: no image is searched"),
+    apart(("refineDetectedMarkers", "markers"),
+         lambda refine, listed: refine and is_solid(listed), f"false, {SEVERAL_PLANES}"),
+    apart(("solver", "points", "markers"),
+         lambda solver, points, listed: is_solid(listed) and solver in SOLVERS
+         and SOLVERS[solver].planar_only and points in ("markers", "chessboard"),
+         f"one of iterative, sqpnp, epnp, photometric, {SEVERAL_PLANES}"),
+)
+
+# --------------------------------------------------------------------------------------------------
+# The camera: the sides of its sensor, and the file of a calibration, whose values take the place
+# of the camera's keys.
+#
+# A camera is given in one of four ways: focal lengths in pixels, a field of view, a focal length
+# in millimetres (with the sensor's sides or the size of a pixel), or a calibration's file. The
+# file's values are written into the pipeline's text: a store does not need the file any more.
+
+FILE_VALUES = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+"""The parameters whose values a camera file has."""
+
+
+def file_and_camera(written: str, is_file: Callable[[str], bool]) -> tuple[str, str]:
+    """Return the path, and the name of the camera in the file or "".
+
+    >>> file_and_camera("chains/camchain.yaml#cam1", lambda path: "#" not in path)
+    ('chains/camchain.yaml', 'cam1')
+    """
+    path, mark, camera = written.rpartition("#")
+    return (path, camera) if mark and not is_file(written) else (written, "")
+
+
+def read_camera_file(reading: Reading) -> None:
+    """Give the camera's parameters the values of its file, which take its place; note faults.
+
+    Keys that say something else than the file are at fault.
+    """
+    written = reading.fixed.get("camera_file")
+    if written is None:
+        return
+    folder = Path(reading.folder)
+    path, camera = file_and_camera(written, lambda path: (folder / path).is_file())
+    try:
+        content = read_regular(folder / path, MAX_BYTES)
+        calibration = calibration_of(read_tree(content), camera)
+    except (OSError, ValueError) as error:
+        reason = error.strerror or "unreadable" if isinstance(error, OSError) else error
+        reading.refuse("camera_file", f"a camera file ({reason})")
+        return
+    name = plain(Path(path).name)
+    values = {key: getattr(calibration, key) for key in FILE_VALUES} | {
+        key: numbers for key, numbers in zip(
+            STATED, (calibration.sd, calibration.covariance), strict=True) if numbers}
+    missing = [key for key in values if values[key] is None and key not in reading.given]
+    if missing:
+        reading.refuse("camera_file", f"{' and '.join(missing)} beside it: {name} does not say "
+                       "which frame size it holds for")
+    for key, value in values.items():
+        if value is None:
+            continue
+        if key not in reading.given:
+            try:
+                reading.fixed[key] = PARAMETERS[key].check(value)
+            except ValueError as error:
+                reading.refuse(
+                    "camera_file", f"a camera file ({key} = {shown(value)}: expected {error})")
+                del reading.fixed[key]
+            reading.written[key] = f"camera.{key}", value
+            reading.stated[key] = value
+        elif reading.fixed.get(key) != value:
+            reading.refuse(key, f"{shown(value)}, which {name} has; delete it, or camera_file")
+    del reading.written["camera_file"]
+    reading.fixed["camera_file"] = None
+
+
+def beliefs_in_one_way(reading: Reading) -> None:
+    """Demand the error of a calibration in one way, and one where a calibration is believed."""
+    if not reading.fixed.keys() >= {*STATED}:
+        return
+    sd, covariance = STATED
+    given = [name for name in STATED if reading.fixed[name]]
+    if len(given) == 2:
+        reading.refuse(sd, f"{sd} or {covariance}, not both; delete one of them")
+    elif given:
+        _errors_are_sound(reading, given[0])
+    elif _is_calibrated(reading):
+        where = "camera_file has none" if reading.stated else "or a camera_file"
+        reading.refuse("believed", "a calibration's standard deviations: give calibration_sd under "
+                       f"[camera] ({where})")
+
+
+def _errors_are_sound(reading: Reading, name: str) -> None:
+    """Demand as many errors as the camera has numbers, and focal lengths that stay above 0."""
+    try:
+        for count in {len(lens) for lens in reading.values_of("distortion")}:
+            CalibrationError.of(reading.fixed[STATED[0]], reading.fixed[STATED[1]], count)
+    except ValueError as error:
+        reading.refuse(name, str(error))
+
+
+# --------------------------------------------------------------------------------------------------
+# Files that a pipeline names: background images, photographs. Their digests are noted.
+
+def check_backgrounds(reading: Reading) -> None:
+    """Demand background images that can be read and have the frame's size."""
+    sizes = {}
+    for value in reading.values_of("background"):
+        if not isinstance(value, str) or reading.recorded is not None:
+            continue
+        path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
+        try:
+            sizes[value] = decode_grey(path).shape[::-1]
+            reading.files[value] = file_digest(Path(path)) or ""
+        except ValueError as error:
+            reading.refuse_value("background", value, f"a level or an image file ({error})")
+    _have_the_frames_size(reading, "background", sizes)
+
+
+def _have_the_frames_size(
+    reading: Reading, name: str, sizes: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Demand frames of the ``sizes``, width and height in pixels, of the files of a parameter."""
+    for side, key in enumerate(("width_px", "height_px")):
+        for file, length in reading.meeting(name, key):
+            if file in sizes and sizes[file][side] != length:
+                reading.refuse_value(
+                    name, file, "images of exactly the frame's size: it is "
+                    f"{' x '.join(map(str, sizes[file]))}, but {key} = {length}")
+
+
+def file_digest(path: Path) -> str | None:
+    """Return the SHA-256 of an image file; None if it cannot be read."""
+    try:
+        return hashlib.sha256(read_image(str(path))).hexdigest()
+    except ValueError:
+        return None
+
+
+def photographs_alone(reading: Reading) -> None:
+    """Demand the photographs' own poses and images, their markers, and their files unchanged.
+
+    Of images that are simulated at their poses, the poses and the markers alone.
+    """
+    if PHOTOGRAPHS not in reading.given:
+        return
+    simulated = any(reading.values_of(SIMULATED))
+    own = "poses" if simulated else "poses and light"
+    for name in reading.given - {PHOTOGRAPHS, SIMULATED}:
+        if reading.parameters[name].section in ("pose", "pose" if simulated else "scene"):
+            reading.refuse(
+                name, f"nothing beside photographs, which have their own {own}; delete it")
+    if reading.sampling != SAMPLINGS[0]:
+        reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
+    if SEARCH in reading.document:
+        reading.fault(SEARCH, reading.document[SEARCH], "no such section: photographs are given")
+    if reading.recorded is not None:
+        return
+    sizes = {}
+    for name in dict.fromkeys(reading.values_of(PHOTOGRAPHS)):
+        path = Path(reading.folder) / name
+        try:
+            record, reading.files[name] = PHOTOGRAPH_RECORDS.read(path)
+        except PluginError as error:
+            reading.refuse_value(PHOTOGRAPHS, name, str(error))
+            continue
+        sizes[name] = record.width_px, record.height_px
+        for relative, known in zip(record.paths, record.digests, strict=True):
+            found = known if simulated else file_digest(path.parent / relative)
+            if found != known:
+                reading.note(plain(relative), "the photograph cannot be read" if found is None else
+                             "the photograph is not the one that was recorded: its SHA-256 differs")
+            reading.files[relative] = known
+    _have_the_frames_size(reading, PHOTOGRAPHS, sizes)
+
+
+# --------------------------------------------------------------------------------------------------
+# Targets: boards, what is beside them, what can search and solve them.
+
+MAX_BOARDS = 10_000
+"""The most boards of a grid: all are checked before anything is computed."""
+
+def boards_can_be_printed(reading: Reading) -> None:
+    """Demand what each kind of board needs, and boards whose parts do not overlap."""
+    kinds = dict.fromkeys(reading.values_of("kind"))
+    needed = {name: kind for kind in kinds for name in NEEDED[kind] if name not in reading.given}
+    for name, kind in needed.items():
+        meaning = reading.parameters[name].meaning
+        reading.note(f"board.{name}", f"missing; kind = {shown(kind)} needs it: {meaning}")
+    used = {"kind", *(name for kind in kinds for name in used_by(kind))}
+    for name in reading.given - used if kinds else ():
+        if reading.parameters[name].section == "board":
+            users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
+            reading.refuse(name, f"kind = {users}, which uses it; kind = {' or '.join(kinds)} does "
+                           "not: delete it")
+    if not reading.shows_boards or needed or not all(map(reading.values_of, ARRANGING)):
+        return
+    count = math.prod(
+        len(axis) for axis in reading.axes if not axis.columns.keys().isdisjoint(ARRANGING))
+    if count > MAX_BOARDS:
+        reading.note("axes", f"{count:,} different boards: expected at most {MAX_BOARDS:,}")
+        return
+    for values in reading.arrangements():
+        for name, value, expected in arrangement_faults(values):
+            section = reading.parameters[name.partition("[")[0]].section
+            reading.fault(f"{section}.{name}", value, expected)
+
+
+
+BOARD_SOLVERS = ", ".join(name for name, each in SOLVERS.items() if each.of_boards)
+
+
+def targets_are_solved(reading: Reading) -> None:
+    """Demand solvers that can do boards, or single markers."""
+    plugged = [each.name for each in reading.plugins if each.of_boards]
+    if not reading.shows_boards:
+        apart(("solver",), lambda solver: solver in plugged,
+             "a solver of single markers, or a board: give kind under [board]")(reading)
+        return
+    if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & {
+            *reading.values_of("kind")}:
+        reading.refuse_value(
+            "points", "chessboard", "kind = charuco or diamond, which have a chessboard")
+    if "solver" not in reading.given:
+        reading.note("estimator.solver", f"missing; a board needs one of {BOARD_SOLVERS}")
+        return
+
+    def is_of_boards(solver: str, points: str) -> bool:
+        known = SOLVERS.get(solver)
+        return solver in plugged if known is None else (
+            known.of_boards or (points == "largest_marker" and known.corners_alone))
+
+    apart(("solver", "points"), lambda *chosen: not is_of_boards(*chosen),
+         f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "
+         "corners alone; plug-ins with of_boards=True")(reading)
+    for name, whole in (("points", "markers"), ("refine", "none")):
+        apart((name, "solver"), lambda chosen, solver, whole=whole: (
+                 chosen != whole and solver in ("photometric", *plugged)),
+             lambda _, solver, whole=whole: (
+                 f"{whole} beside solver = {solver}, which chooses by itself"))(reading)
+
+
+# --------------------------------------------------------------------------------------------------
+# All other rules: ways to give a quantity, partners, packages, random draws, names, sizes.
+
+def each_in_one_way(reading: Reading) -> None:
+    """Demand a distance, and each quantity of pose, camera and beliefs in one way."""
+    has_poses = PHOTOGRAPHS in reading.given
+    given = reading.given - reading.stated.keys() - (set(IN_CAMERA) if has_poses else set())
+    for choice in (*CHOICES, () if has_poses else (IN_CAMERA, WORLD)):
+        ways = [names for way in choice if (names := [name for name in way if name in given])]
+        for other in ways[1:]:
+            reading.refuse(other[0], f"{', '.join(ways[0])} or {', '.join(other)}, not both; "
+                           "delete one of them")
+    if not has_poses and given.isdisjoint(("distance_m", "side_px", *WORLD)):
+        reading.note("pose", "expected distance_m or side_px, fixed or under [axes]")
+
+
+def what_is_installed(reading: Reading) -> None:
+    """Demand dictionaries that are installed and that each detector has.
+
+    A store's pipeline can be read without the packages of dictionaries.
+    """
+    for dictionary in reading.values_of("dictionary") if reading.recorded is None else ():
+        if (missing := missing_package(dictionary)) is not None:
+            reading.refuse_value("dictionary", dictionary, missing)
+    known: dict[str, tuple[str, ...]] = {
+        OPENCV: opencv_dictionary_names(),
+        **{plugin.name: plugin.dictionaries for plugin in reading.plugins
+           if plugin.kind == "detector" and plugin.dictionaries},
+    }
+    apart(
+        ("dictionary", "detector"),
+        lambda dictionary, detector: dictionary not in known.get(detector, (dictionary,)),
+        lambda _, detector: "one of OpenCV's for its detector; give another detector"
+        if detector == OPENCV
+        else f"one that the detector {detector} has: {', '.join(known[detector])}",
+    )(reading)
+
+
+def something_random_to_repeat(reading: Reading) -> None:
+    """Demand a random quantity if there are trials; of Sobol' points one that they draw.
+
+    Their trials are whole replicates.
+    """
+    trials = len(reading.values_of(TRIAL)) or 1
+    drawn = (
+        bool(reading.distributions) or reading.is_active("jitter_px") or _is_calibrated(reading))
+    noisy = map(reading.is_active, (*RANDOM, *(
+        plugin.settings[0].name for plugin in reading.plugins
+        if plugin.kind == "effect" and plugin.random)))
+    if trials > 1 and not drawn and not any(noisy) and PHOTOGRAPHS not in reading.given:
+        reading.fault("axes.trial", trials, "something random to repeat: jitter_px above 0, noise, "
+                      "or a distribution")
+    if reading.sampling != "sobol" or reading.axis(TRIAL) is None or SEARCH in reading.document:
+        return
+    if trials % REPLICATES or trials < 2 * REPLICATES:
+        reading.fault("axes.trial", trials, f"a multiple of {REPLICATES}, at least "
+                      f"{2 * REPLICATES}, for sampling = sobol: {REPLICATES} replicates of as many "
+                      "points each, best a power of two")
+    if not drawn:
+        reading.fault("sampling", reading.sampling, "a distribution or jitter_px above 0 (the "
+                      "noise of pixels is independent in any case)")
+
+
+RESERVED = {
+    *VARIABLES, *LABELS, *HEADER, *SECTIONS, "axes", TRIAL,
+    *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
+      for flag in flags),
+    "block", "commits", "compared", "cost", "count", "draws", "failure", "failures", "image_x_px",
+    "image_y_px",
+    "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",
+}
+"""Names in datasets and tables that no axis may take."""
+
+
+def names_are_free(reading: Reading) -> None:
+    """Demand names that nothing else of the dataset has for plug-ins' settings and joint axes."""
+    names = [(plugin.name, f"name for its setting {setting.name}", setting.name)
+             for plugin in reading.plugins for setting in plugin.settings]
+    names += [(f"axes.{axis.name}", "name", axis.name) for axis in reading.axes if axis.zipped]
+    for start, what, name in names:
+        if name in RESERVED or name.startswith("_"):
+            reading.note(start, f"expected another {what}: the dataset or its analyses have this "
+                         "one")
+
+
+MAX_POSES = 10**12
+"""The largest grid."""
+
+MAX_CONFIGURATIONS = 10_000
+"""The most configurations: they are listed, and each has its share of every block."""
+
+
+def size_of_the_grid(reading: Reading) -> None:
+    """Limit the number of poses and of configurations."""
+    poses, settings = reading.size(*Stage), reading.size(Stage.detection, Stage.estimation)
+    if poses > MAX_POSES:
+        reading.note(
+            "axes", f"{min(poses, 10**300):.3g} poses: expected at most {MAX_POSES:.0e}")
+    if settings > MAX_CONFIGURATIONS:
+        reading.note("axes", f"{min(settings, 10**300):.3g} detector settings times estimators: "
+                     f"expected at most {MAX_CONFIGURATIONS:,}")
+
+
+RULES: tuple[Callable[[Reading], None], ...] = (
+    photographs_alone,
+    each_in_one_way,
+    beliefs_in_one_way,
+    what_is_installed,
+    boards_can_be_printed,
+    targets_are_solved,
+    check_backgrounds,
+    something_random_to_repeat,
+    names_are_free,
+    size_of_the_grid,
+    *RECORDS,
+)
+
 
 # --------------------------------------------------------------------------------------------------
 # Values that replace those of a pipeline document: ``--set`` changes it, ``--at`` fixes it.
 
 ALTERNATIVES: dict[str, Collection[str]] = {
     **RIVALS, "camera_file": (*FILE_VALUES, *STATED, *OTHER_WAYS),
+    TRIAL: (MAX_TRIALS,), f"{SEARCH}.{MAX_TRIALS}": (TRIAL,),
 }
 """Parameter -> those that say the same in another way: choosing it drops them."""
 
@@ -87,31 +609,48 @@ def parse_settings(
     >>> parse_settings(["tilt_deg=[0, 45]", "pose.roll_deg=3", "solver=ippe"])
     {'tilt_deg': [0, 45], 'roll_deg': 3, 'solver': 'ippe'}
     """
+    def read(key: str, written: str) -> dict[str, Any]:
+        section, _, name = key.rpartition(".")
+        value = read_value(written)
+        home = section_of(name, parameters)
+        if section in (REQUIRE, SEARCH):
+            return {key: value}
+        if home and section not in ("", home, "axes"):
+            raise ValueError(f"{name} or {home}.{name}")
+        if not home and name not in HEADER and not is_zip(value):
+            raise LookupError(name)
+        return {name: value}
+
+    return _assigned("--set", settings, read, [*parameters, TRIAL, *HEADER])
+
+
+def _assigned(
+    option: str, assignments: Iterable[str], read: Callable[[str, str], dict[str, Any]],
+    known: Sequence[str],
+) -> dict[str, Any]:
+    """Return the values that "name=value" texts of an option give.
+
+    ``read`` returns what a name and a value stand for; ValueError says what was expected, and
+    LookupError that the name is none of the ``known`` ones.
+    """
     faults: list[str] = []
     chosen: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, written = (part.strip() for part in setting.partition("="))
-        section, _, name = key.rpartition(".")
-        start = f"--set {plain(setting)}: "
-        if not equals or not name:
-            faults.append(f"{start}expected key=value, such as tilt_deg=45")
-            continue
+    for assignment in assignments:
+        name, _, written = (part.strip() for part in assignment.partition("="))
+        start = f"{option} {plain(assignment)}: "
         try:
-            value = read_value(written)
-        except ValueError:
-            faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
-            continue
-        home = section_of(name, parameters)
-        if (section == REQUIRE and name in REQUIRE_KEYS) or section == SEARCH:
-            chosen[f"{section}.{name}"] = value
-        elif not home and name not in HEADER and not is_zip(value):
-            known = [*parameters, TRIAL, *HEADER]
-            hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
+            if not name or not written:
+                raise ValueError("name=value, such as tilt_deg=45")
+            values = read(name, written)
+        except ValueError as error:
+            faults.append(f"{start}expected {error}")
+        except LookupError as error:
+            hint = nearest(error.args[0], known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"{start}unknown parameter{hint}")
-        elif home and section not in ("", home, "axes"):
-            faults.append(f"{start}expected {name} or {home}.{name}")
         else:
-            chosen[name] = value
+            faults += [f"{start}{each} is given twice" for each in values
+                       if each in chosen and option == "--at"]
+            chosen |= values
     if faults:
         raise refusal(faults)
     return chosen
@@ -127,28 +666,16 @@ def displaced_by(chosen: Collection[str]) -> set[str]:
     return others.difference(chosen)
 
 
-def _displaced(
-    document: Mapping[str, Any], chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]
-) -> set[str]:
+def _displaced(chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]) -> set[str]:
     """Return the keys of a document that give way to chosen values.
 
     They are other ways to say the same, and parameters of boards that chosen kinds do not use.
     """
     names = displaced_by(chosen)
-    if any(name.endswith(f".{MAX_TRIALS}") for name in chosen):
-        names.add(TRIAL)
-    elif TRIAL in chosen:
-        names.add(MAX_TRIALS)
     if "kind" in chosen:
         kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
         used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
         names |= {name for name, each in parameters.items() if each.section == "board"} - used
-    camera = document.get("camera")
-    if isinstance(camera, dict) and "camera_file" not in chosen and (
-        camera.keys() >= {"camera_file", *FILE_VALUES}
-        and not chosen.keys().isdisjoint((*FILE_VALUES, *OTHER_WAYS))
-    ):
-        names.add("camera_file")  # the document has its values, one of which is another now
     return names
 
 
@@ -160,7 +687,7 @@ def apply_settings(
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
     makes the parameter fixed or drawn. What the chosen values displace goes.
     """
-    displaced = _displaced(document, chosen, parameters)
+    displaced = _displaced(chosen, parameters)
     for table in document.values():
         if isinstance(table, dict):
             for name in table.keys() & displaced:
@@ -284,9 +811,7 @@ class Pipeline(Grid):
         try:
             text = file_text(path)
         except ValueError as error:
-            similar = _similar(path)
-            reason = f"{str(error).partition(';')[0]}{similar}" if similar else error
-            raise refusal([f"{source}: {reason}"]) from None
+            raise refusal([f"{source}: {error}"]) from None
         return Pipeline.from_text(
             text, settings, name=path.stem, source=source, folder=path.parent
         )
@@ -300,7 +825,6 @@ class Pipeline(Grid):
         source: str = "pipeline",
         folder: str | Path = ".",
         files: Mapping[str, str] | None = None,
-        camera_files: Mapping[str, str] | None = None,
         plugins: Sequence[DeclaredPlugin] | None = None,
     ) -> Pipeline:
         """Read a pipeline from TOML text.
@@ -320,8 +844,6 @@ class Pipeline(Grid):
         files
             Path as written -> SHA-256: used instead of reading the files that the text refers to,
             as for a store whose files may have moved.
-        camera_files
-            The same of camera files alone: a store's text has their values.
         plugins
             The plug-ins that a store has recorded, used instead of importing them.
 
@@ -331,13 +853,13 @@ class Pipeline(Grid):
             One line for each fault of the text or of the settings.
         """
         document = _document(text, source)
-        recorded = Recorded(files, camera_files, plugins)
         chosen = {}
         if settings:
             parameters = _parameters(document, settings, str(folder), plugins)
             chosen = parse_settings(settings, parameters)
             apply_settings(document, chosen, parameters)
-        return _checked(read_keys(document, source, str(folder), recorded), text, name, chosen)
+        reading = read_keys(document, source, str(folder), files, plugins)
+        return _checked(reading, text, name, chosen)
 
     @staticmethod
     def from_dict(
@@ -389,19 +911,6 @@ class Pipeline(Grid):
 
 
 
-def _similar(path: Path) -> str:
-    """Return the pipeline file that may be meant where there is none; else nothing."""
-    candidates = (
-        path.with_name(f"{path.name}.toml"), path.with_suffix(".toml"),
-        Path("pipelines") / path.name, Path("pipelines") / f"{path.name}.toml",
-    )
-    try:
-        similar = [each for each in candidates if each != path and each.is_file()]
-    except (OSError, ValueError):
-        return ""
-    return f"; did you mean {plain(similar[0])}?" if similar and not path.exists() else ""
-
-
 def _document(text: str, source: str) -> dict[str, Any]:
     try:
         return read_document(text)
@@ -434,16 +943,18 @@ def _checked(
     required = read_required(reading)
     stopping = read_search(reading, required)
     read_camera_file(reading)
-    resolve_sensor(reading)
-    check_rules(reading)
+    for rule in RULES:
+        rule(reading)
     if reading.faults:
         raise refusal([*reading.faults])
     if chosen or reading.stated:
         # Comments stay. A text that is refused never comes here: tomlkit is slow.
         written = tomlkit.parse(text)
         apply_settings(written, chosen or {}, reading.parameters)
-        for key, value in reading.stated.items():
-            written.setdefault("camera", tomlkit.table())[key] = toml_item(value)
+        if reading.stated:
+            camera: Any = written["camera"]
+            del camera["camera_file"]
+            camera.update({key: toml_item(value) for key, value in reading.stated.items()})
         text = tomlkit.dumps(written)
     grid = {each.name: getattr(reading, each.name) for each in fields(Grid)}
     return Pipeline(**grid | {
@@ -500,8 +1011,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     apply_settings(document, {
         name: list(value) if isinstance(value, tuple) else value for name, value in chosen.items()
     }, pipeline.parameters)
-    recorded = Recorded(cameras=pipeline.files, plugins=pipeline.plugins)
-    reading = read_keys(document, "--at", pipeline.folder, recorded)
+    reading = read_keys(document, "--at", pipeline.folder, stored=pipeline.plugins)
     single = _checked(reading, document_text(document), pipeline.name)
     return replace(single, axes=(Axis(TRIAL, {TRIAL: range(trial, trial + 1)}),))
 
@@ -523,36 +1033,18 @@ def parse_selection(at: str, pipeline: Pipeline) -> dict[str, Any]:
     >>> parse_selection("distance_m=0.3,solver=ippe", pipeline)
     {'distance_m': 0.3, 'solver': 'ippe'}
     """
-    faults: list[str] = []
-    named: dict[str, Any] = {}
     declared: dict[str, Declared] = {**pipeline.parameters, TRIAL: _TRIAL}
     together = {axis.name: axis for axis in pipeline.axes if axis.zipped}
-    for part in map(str, _PART.findall(at)):
-        name, equals, written = (piece.strip() for piece in part.partition("="))
-        try:
-            if not equals or not written:
-                raise ValueError("name=value, such as tilt_deg=45")
-            try:
-                value = read_value(written)
-            except ValueError:
-                value = written
-            if name in together:
-                row = together[name].at(_row(together[name], value))
-            elif name in declared:
-                row = {name: declared[name].check(value)}
-            else:
-                known = [*declared, *together]
-                hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-                faults.append(f"--at {plain(part)}: unknown parameter{hint}")
-                continue
-        except ValueError as error:
-            faults.append(f"--at {plain(part)}: expected {error}")
-            continue
-        faults += [f"--at {plain(part)}: {other} is given twice" for other in row if other in named]
-        named |= row
-    if faults:
-        raise refusal(faults)
-    return named
+
+    def read(name: str, written: str) -> dict[str, Any]:
+        value = read_value(written)
+        if name in together:
+            return together[name].at(_row(together[name], value))
+        if name not in declared:
+            raise LookupError(name)
+        return {name: declared[name].check(value)}
+
+    return _assigned("--at", map(str, _PART.findall(at)), read, [*declared, *together])
 
 
 def _row(axis: Axis, value: Any) -> int:
@@ -586,9 +1078,6 @@ def _written(value: Any) -> str:
 
 def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:
     """Return the coordinates of a cell on its grid, in words: "distance_m 0.3, tilt_deg 45"."""
-    parts = []
-    for name in (name for axis in pipeline.axes for name in axis.columns):
-        value = chosen.axes[0].values[0] if name == TRIAL else chosen.fixed[name]
-        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-        parts.append(f"{name} {shown}")
+    values = {**chosen.fixed, TRIAL: chosen.axes[0].values[0]}
+    parts = [f"{name} {label(values[name])}" for axis in pipeline.axes for name in axis.columns]
     return ", ".join(parts)

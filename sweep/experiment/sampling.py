@@ -12,9 +12,9 @@ from hashlib import sha256
 from typing import Any
 
 from sweep.declaration import Declared, TablesError, check_table
-from sweep.experiment.axes import TRIAL, Axis, parse_trial
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
+from sweep.experiment.grid import TRIAL, Axis, parse_trial
 from sweep.experiment.parameters import Stage
 from sweep.messages import nearest, shown
 
@@ -102,13 +102,6 @@ class StoppingRule:
         return self.kind == "largest"
 
     @property
-    def stated(self) -> dict[str, Any]:
-        """What it states, by the keys that messages name: each precision apart."""
-        stated = dataclasses.asdict(self)
-        widths = stated.pop("precision")
-        return stated | {f"precision.{name}": width for name, width in widths}
-
-    @property
     def ends(self) -> tuple[int, ...]:
         """Numbers of trials at which waves end, and decisions are made."""
         return wave_ends(self.max_trials, self.unit)
@@ -133,15 +126,15 @@ def not_continued(ours: StoppingRule | None, begun: StoppingRule | None) -> str:
         names = [f"[{SEARCH}]" if rule is not None else "a fixed number of trials"
                  for rule in (begun, ours)]
         return "" if ours is begun else f"trials: the store has {names[0]}, this run {names[1]}"
-    for name, there in begun.stated.items():
-        here = ours.stated.get(name)
-        if name.startswith("precision."):
-            if here is None or here > there:
-                return (f"{SEARCH}.{name}: the store has {there:g}, this run "
-                        f"{'none' if here is None else f'{here:g}'}, which is looser")
-        elif here != there:
-            return f"{SEARCH}.{name}: the store has {_text(there)}, this run {_text(here)}"
-    return ""
+    widths = dict(ours.precision)
+    for name, width in begun.precision:
+        if not widths.get(name, math.inf) <= width:
+            return f"{SEARCH}.precision.{name}: this run is looser than the store"
+    here = dataclasses.asdict(ours)
+    return next((
+        f"{SEARCH}.{name}: the store has {_text(there)}, this run {_text(here[name])}"
+        for name, there in dataclasses.asdict(begun).items()
+        if name != "precision" and here[name] != there), "")
 
 
 def _text(value: Any) -> str:
@@ -244,18 +237,6 @@ def _texts(example: str, least: int = 0) -> Callable[[Any], list[str]]:
     return read
 
 
-def _axis_name(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError("the axis that is searched, such as distance_m")
-    return value
-
-
-def _true(value: Any) -> bool:
-    if value is not True:
-        raise ValueError("true")
-    return value
-
-
 def _half_width(written: Any) -> float:
     percent = _PERCENT.fullmatch(written) if isinstance(written, str) else None
     number = float(percent[1]) / 100 if percent else written
@@ -283,11 +264,12 @@ def _keys(**readers: Callable[[Any], Any]) -> dict[str, Declared]:
 REQUIRE_KEYS = _keys(all=_texts('["detection >= 0.99"]', least=1), per=_texts('["distance_m"]'))
 """Texts that all must hold, and the axes whose values are conditions at which they must."""
 
-SEARCH_KEYS = _keys(
-    along=_axis_name, smallest=_axis_name, largest=_axis_name, cheapest=_true,
-    precision=_precision, per=_texts('["distance_m"]'),
-    among=_texts('["dictionary", "solver"]'), max_trials=parse_trial,
-)
+SEARCH_KEYS = {
+    **{name: Declared(name, (str,), None, "an axis") for name in ("along", "smallest", "largest")},
+    "cheapest": Declared("cheapest", (bool,), None, "whether the cheapest is chosen"),
+    **_keys(precision=_precision, per=_texts('["distance_m"]'),
+            among=_texts('["dictionary", "solver"]'), max_trials=parse_trial),
+}
 
 
 def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) -> dict[str, Any]:
@@ -311,45 +293,27 @@ def _is_of_scene(reading: Reading, name: str) -> bool:
 
 
 def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> Axis | None:
-    """Return an axis, of the scene or any but ``trial``, by name, or note why there is none."""
-    axis, together = reading.axis(name), reading.axis_of(name)
-    parameter = reading.parameters.get(name)
-    if name == TRIAL:
-        problem = "trials are what is counted, and what intervals are over"
-    elif scene and (owner := axis or parameter) is not None and owner.stage is not Stage.scene:
-        problem = "each configuration has its own answer"
-    elif axis is not None:
-        return axis
-    elif together is not None:
-        problem = f"it goes with others along the axis {together.name}"
-    elif name in reading.distributions:
-        problem = f"it is drawn for each trial: give {name} values under [axes]"
-    elif name in reading.table("axes"):
-        return None  # its own fault says why it is none
-    elif parameter is not None:
-        problem = f"it has one value: list the values of {name} under [axes]"
-    else:
-        known = [*(each.name for each in reading.axes),
-                 *(each for each in reading.parameters if not scene or _is_of_scene(reading, each))]
-        reading.note(path, f"{name}: no such axis{nearest(name, known)}")
-        return None
-    where = "scene" if scene else "grid"
-    reading.note(path, f"{name}: {problem}; expected an axis of the {where}")
-    return None
+    """Return an axis, of the scene or any but ``trial``, by name, or note that there is none."""
+    axes = {axis.name: axis for axis in reading.axes
+            if axis.name != TRIAL and (axis.stage is Stage.scene or not scene)}
+    if name not in axes:
+        known = [*axes, *(each for each in reading.parameters
+                          if not scene or _is_of_scene(reading, each))]
+        hint = "" if name in reading.parameters else nearest(name, known)
+        reading.note(path, f"{name}: no such axis{hint}; expected one under [axes] of the "
+                     f"{'scene' if scene else 'grid'}: {', '.join(axes) or 'there is none'}")
+    return axes.get(name)
 
 
 def _ordered_axis(reading: Reading, path: str, name: str) -> str:
     """Return the name of a scene axis of several numbers; "" with a fault noted if it is none."""
-    axis = _axis_at(reading, path, name) if name else None
+    axis = _axis_at(reading, path, name)
     if axis is None:
         return ""
-    if not axis.is_numeric:
-        reading.fault(path, name, f"an axis of numbers; {name} has no order")
-    elif len(axis) < 2:
-        reading.fault(path, name, f"an axis of several values, from easy to hard; {name} has one")
-    else:
-        return name
-    return ""
+    if not axis.is_numeric or len(axis) < 2:
+        reading.fault(path, name, "an axis of several numbers, from easy to hard")
+        return ""
+    return name
 
 
 # --------------------------------------------------------------------------------------------------
@@ -434,7 +398,7 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
     if reading.document[SEARCH] is not given:
         return None  # it is no table
     _make_trials(reading, table)
-    kinds = [kind for kind in KINDS if kind in given]
+    kinds = [kind for kind in KINDS if given.get(kind, False) is not False]
     if len(kinds) != 1:
         others = f", not {' and '.join(kinds)}" if kinds else ""
         reading.fault(SEARCH, given, f"one of {', '.join(KINDS)}{others}")
@@ -446,30 +410,27 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
         reading.note(SEARCH, f'expected what must be met: [{REQUIRE}] all = ["detection >= 0.99"]')
     _check_names(reading, table, kind, along)
     conditions = required["require_per"] if "per" in reading.table(REQUIRE) else None
-    roles = {
-        axis.name: _role(axis, kind, along, table, conditions)
-        for axis in reading.axes if axis.name != TRIAL
-    }
+    roles = _roles(reading, table, kind, along, conditions)
+    among = roles["among"]
     if kind == "cheapest" and math.prod(
-            len(axis) for axis in reading.axes if roles.get(axis.name) == "among") < 2:
+            len(axis) for axis in reading.axes if axis.name in among) < 2:
         reading.fault(SEARCH, given, (
             'something to choose: smallest = "size_m", with its values under [axes], or '
             'among = ["solver"], of which the cheapest is chosen'))
-    for name in conditions or () if kind in CHOICES else ():
-        if roles.get(name) in ("along", "among"):
-            reading.fault(f"{REQUIRE}.per", list(conditions or ()),
-                          f"conditions; {name} is what [{SEARCH}] chooses")
+    for name in {along, *among}.intersection(conditions or ()) if kind in CHOICES else ():
+        reading.fault(f"{REQUIRE}.per", list(conditions or ()),
+                      f"conditions; {name} is what [{SEARCH}] chooses")
     trial = reading.axis(TRIAL)
     if len(reading.faults) > faults or trial is None:
         return None
-    among, per, at_all = (tuple(name for name, own in roles.items() if own == role)
-                          for role in ("among", "per", "at_all"))
-    pooled = math.prod(len(axis) for axis in reading.axes if roles.get(axis.name) == "pooled")
+    pooled = math.prod(
+        len(axis) for axis in reading.axes_of(Stage.scene)
+        if not any(axis.name in names for names in ((along, TRIAL), *roles.values())))
     draws = COARSE_DRAWS if kind == "along" else FIRST_DRAWS
     return StoppingRule(
-        kind, len(trial), min(max(2, math.ceil(draws / pooled)), len(trial)), along, among, per,
-        at_all, required["requirements"] if kind != "precision" else (),
-        value if kind == "precision" and value else ())
+        kind, len(trial), min(max(2, math.ceil(draws / pooled)), len(trial)), along, **roles,
+        requirements=required["requirements"] if kind != "precision" else (),
+        precision=value if kind == "precision" and value else ())
 
 
 def _check_names(reading: Reading, table: Mapping[str, Any], kind: str, along: str) -> None:
@@ -493,28 +454,30 @@ def _check_names(reading: Reading, table: Mapping[str, Any], kind: str, along: s
             _axis_at(reading, f"{SEARCH}.{key}", name, scene=key == "per")
 
 
-def _role(
-    axis: Axis, kind: str, along: str, table: Mapping[str, Any], conditions: Sequence[str] | None
-) -> str:
-    """Return what a search does with an axis: :class:`StoppingRule` says what its roles mean.
+def _roles(
+    reading: Reading, table: Mapping[str, Any], kind: str, along: str,
+    conditions: Sequence[str] | None,
+) -> dict[str, tuple[str, ...]]:
+    """Return the axes of each role of a search that :class:`StoppingRule` has.
 
     ``conditions`` are those of the section [require]; None if it lists none. An axis that nothing
     names is a condition of a precision or a limit (``per``), and one at which what is chosen must
     meet the requirements (``at_all``).
     """
-    if axis.name == along:
-        return "along"
-    if axis.stage is not Stage.scene:
-        return "among" if kind in CHOICES else "configuration"
+    scene = {axis.name for axis in reading.axes_of(Stage.scene)} - {TRIAL, along}
+    among, per, at_all = set[str](), set[str](), scene.intersection(conditions or ())
     if kind in CHOICES:
-        if axis.name in table.get("among", ()):
-            return "among"
-        return "at_all" if conditions is None or axis.name in conditions else "pooled"
-    if axis.name in table.get("per", ()):
-        return "per"
-    if kind == "along" and axis.name in (conditions or ()):
-        return "at_all"
-    return "pooled" if "per" in table else "per"
+        among = {axis.name for axis in reading.axes if axis.stage is not Stage.scene}
+        among |= {*table.get("among", ())} - {along}
+        at_all = (scene if conditions is None else at_all) - among
+    else:
+        at_all = at_all if kind == "along" else set()
+        per = scene.intersection(table.get("per", scene - at_all))
+        at_all = at_all - per
+    return {
+        role: tuple(axis.name for axis in reading.axes if axis.name in names)
+        for role, names in (("among", among), ("per", per), ("at_all", at_all))
+    }
 
 
 def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
@@ -525,9 +488,8 @@ def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
     if axis is None and wanted is not None:
         axis = wanted
         reading.axes.append(wanted)
-    elif axis is not None and wanted is not None and len(axis) != len(wanted):
-        reading.fault(path, len(wanted),
-                      f"{len(axis)}, which axes.trial has, or axes.trial to be left out")
+    elif axis is not None and wanted is not None:
+        reading.fault(path, len(wanted), "it or axes.trial, not both; delete one of them")
     if MAX_TRIALS not in reading.table(SEARCH) and TRIAL not in reading.table("axes"):
         reading.fault(SEARCH, reading.table(SEARCH), NO_TRIALS)
     if axis is not None and len(axis) < MIN_TRIALS:

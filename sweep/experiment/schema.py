@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.draws import CALIBRATED
-from sweep.experiment.grid import Grid
+from sweep.experiment.grid import MAX_DEVIATIONS, Axis, Grid
 from sweep.experiment.parameters import PHOTOGRAPHS, Stage, superseded
 from sweep.measure.flags import (
     BoundStatus,
@@ -38,21 +37,8 @@ if TYPE_CHECKING:
 # xarray labels the axes of its charts by ``long_name [units]``: a sentence there would be cut
 # off. So ``long_name`` is the variable's name in words, and ``description`` says what it means.
 
-UNIT = re.compile(r"_(m_s|deg_s|deg|rad|percent|px|mm|um|ms|m|s|e|grey|modules)$")
-"""The unit at the end of a name."""
-
-WORDS = {
-    "true_rvec": "true rotation vector", "true_tvec": "true position", "bound": "accuracy bound",
-    "bound_std": "bound of the standard deviation", "bound_kappa": "bound's bias of the depth",
-    "predicted_std": "predicted standard deviation", "nees": "NEES", "marker_id": "marker ID",
-    "alternative_rotation_error": "alternative rotation",
-    "alternative_reprojection_error": "alternative reprojection",
-    "side_px_per_module": "side per module", "xy": "image axis", "xyz": "axis",
-}
-"""Names whose words are not their own."""
-
-CAPITALS = {"rmse": "RMSE", "hfov": "HFOV", "vfov": "VFOV", "dfov": "DFOV", "sd": "SD"}
-
+UNIT = re.compile(r"_(m_s|deg_s|deg|rad|percent|px|mm|um|ms|m|s|e|grey|modules)(?=_low$|_high$|$)")
+"""The unit at the end of a name, or before the end of an interval."""
 
 def short_name(name: str, units: str = "") -> str:
     """Return a variable's name in words, without its unit if it has one.
@@ -60,16 +46,11 @@ def short_name(name: str, units: str = "") -> str:
     Examples
     --------
     >>> short_name("rotation_p95_deg_low", "degree"), short_name("marker_id")
-    ('rotation p95, low end', 'marker ID')
+    ('rotation p95 low', 'marker id')
     >>> short_name("adaptiveThreshWinSizeMin", "px")
     'adaptiveThreshWinSizeMin'
     """
-    name, end = next(((name.removesuffix(f"_{end}"), f", {end} end") for end in ("low", "high")
-                      if name.endswith(f"_{end}")), (name, ""))
-    if units not in ("", "1"):
-        name = UNIT.sub("", name)
-    words = (CAPITALS.get(word, word) for word in name.split("_"))
-    return WORDS.get(name, " ".join(words)) + end
+    return (UNIT.sub("", name) if units not in ("", "1") else name).replace("_", " ")
 
 
 def with_description(name: str, attributes: Mapping[str, Any]) -> dict[str, Any]:

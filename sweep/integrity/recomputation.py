@@ -71,7 +71,6 @@ def current_pipeline(store: RunStore) -> tuple[Pipeline, list[str]]:
     stored = store.pipeline
     pipeline = Pipeline.from_text(
         stored.text, name=stored.name, source=store.url, folder=stored.folder,
-        camera_files=stored.files,
     )
     return pipeline, differences(pipeline, stored, store.fingerprint)
 

@@ -180,7 +180,7 @@ def after_step(effects: Sequence[Effect], step: str, levels: Floats, patch: Patc
 #
 # An effect is absent, at no cost, unless its switch has another value than its neutral one. Its
 # record in :data:`EFFECTS` is the only place that declares it; parameters of pipeline files,
-# their checks, the list of active parts, random draws, the bound and the windows follow from it.
+# their checks, random draws, the bound and the windows follow from it.
 
 VELOCITIES = (
     "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",

@@ -311,10 +311,17 @@ MAX_BITMAP_SIDE = 32_766
 
 
 def bitmap_shape(target: Board) -> tuple[int, int]:
-    """Return height and width of the bitmap that ``renderer = "warp"`` draws of a board."""
+    """Return height and width of the bitmap that ``renderer = "warp"`` draws of a board.
+
+    ValueError if it would be too large.
+    """
     left, top, right, bottom = extent_of(target).sheet.tolist()
-    height, width = (WARP_PX_PER_MODULE * each for each in (bottom - top, right - left))
-    return math.ceil(height), math.ceil(width)
+    height, width = (
+        math.ceil(WARP_PX_PER_MODULE * each) for each in (bottom - top, right - left))
+    if max(height, width) > MAX_BITMAP_SIDE or height * width > MAX_BITMAP_PX:
+        raise ValueError(f"warp draws bitmaps of at most {MAX_BITMAP_PX:,} pixels and a side of "
+                         f"{MAX_BITMAP_SIDE:,}; this board takes {width:,} x {height:,}")
+    return height, width
 
 
 @lru_cache(maxsize=1024)

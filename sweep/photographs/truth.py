@@ -13,7 +13,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError, PipelineError
 from sweep.exchange.answers import Conventions, read_answers
-from sweep.experiment.rules import file_and_camera
+from sweep.experiment.pipeline import file_and_camera
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px

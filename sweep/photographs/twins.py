@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from sweep.errors import ArgumentError, PluginError
-from sweep.experiment.axes import TRIAL, parse_distribution
 from sweep.experiment.document import MAX_BYTES, read_document
+from sweep.experiment.grid import TRIAL, parse_distribution
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, PhotographRecord
 from sweep.experiment.pipeline import Pipeline

@@ -27,8 +27,8 @@ from sweep.analysis.decisions import Reached
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
+from sweep.experiment.experiment import used_settings
 from sweep.experiment.parameters import Stage
-from sweep.experiment.same_meaning import used_settings
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.report.comparison import trade_lines

@@ -24,10 +24,10 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
-from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
+from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import WORLD, Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
 from sweep.report.table import axis_label

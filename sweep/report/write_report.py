@@ -18,7 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
-from sweep.experiment.axes import Axis
+from sweep.experiment.grid import Axis
 from sweep.messages import label, quoted
 from sweep.report.answer import Answer, answer
 from sweep.report.figure import Figure, Panel, panels_file

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, Blocks
+from sweep.experiment.grid import TRIAL, Axis, Block, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule

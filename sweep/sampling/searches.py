@@ -39,7 +39,7 @@ from sweep.analysis.requirements import (
     parse_requirements,
 )
 from sweep.errors import DatasetError
-from sweep.experiment.axes import TRIAL
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule

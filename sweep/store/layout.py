@@ -17,9 +17,8 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
-from sweep.experiment.axes import TRIAL, Axis
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
-from sweep.experiment.grid import Blocks
+from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import (

@@ -586,7 +586,7 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
     stored = open_store(url).pipeline
     return Pipeline.from_text(
         stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",
-        folder=stored.folder, camera_files=stored.files,
+        folder=stored.folder,
     )
 
 

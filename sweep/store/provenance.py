@@ -184,7 +184,6 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
             f"{name}: the store has {their_values.get(name)}, this run {our_values.get(name)}"
             for name in sorted({*our_values, *their_values})
             if ours.axis_of(name) is None and theirs.axis_of(name) is None
-            and name != "camera_file"
             and their_values.get(name) != our_values.get(name)
         ]
     if problem := not_continued(ours.stopping, theirs.stopping):

@@ -23,7 +23,7 @@ from sweep.evaluation.search import (
     detections_of,
     scenes_at,
 )
-from sweep.experiment.axes import TRIAL
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.detectors import AnyDetectorSetting, DetectorSetting, full_frame_reason

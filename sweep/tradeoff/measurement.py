@@ -20,10 +20,10 @@ from sweep.analysis.dataset import computed_scenes
 from sweep.analysis.summaries import guarded_error_statistics
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
-from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
+from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -116,7 +116,6 @@ def measure_trade(
     # The same versions and files must be measured as were run.
     pipeline = Pipeline.from_text(
         stored.text, name=stored.name, source=url, folder=stored.folder,
-        camera_files=stored.files,
     )
     lines = differences(pipeline, stored, store.fingerprint)
     if lines:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus
+from sweep.model.renderers import bitmap_shape
 
 TEXT = """
 [marker]
@@ -30,9 +30,13 @@ TABLE = 'kind = "markers"\n' + "".join(
 
 def test_warp_s_bitmap_of_a_board_has_a_limit():
     """OpenCV warps no more than 2^15 pixels a side."""
-    Pipeline.from_text(TEXT + TABLE.replace("0.1", "3"), ["renderer=warp"])
-    with pytest.raises(PipelineError, match=r'"warp": expected another renderer.* 36,08. x 80$'):
-        Pipeline.from_text(TEXT + TABLE.replace("0.1", "30"), ["renderer=warp"])
+    def board(x_m):
+        made = Pipeline.from_text(TEXT + TABLE.replace("0.1", x_m), ["renderer=warp"])
+        return made.experiment.scene_values([])["board"].listed(1)[0]
+
+    assert bitmap_shape(board("3")) == (80, 3680)
+    with pytest.raises(ValueError, match=r"a side of 32,766; this board takes 36,08. x 80$"):
+        bitmap_shape(board("30"))
 
 
 def test_distractors_may_touch_share_an_id_and_stand_in_planes_of_their_own():

@@ -55,10 +55,9 @@ HOSTILE = {
         "believed_size_m = { linspace = [0.1, 1, 1000] }",
         "axes: 1e+06 detector settings times estimators: expected at most 10,000",
     ),
-    "a frame too large to be searched whole": (
-        POSE + "[camera]\nwidth_px = 100000\nheight_px = 100000\n"
-        "[detector]\nuseAruco3Detection = true",
-        "detector.useAruco3Detection = true: expected what needs no whole frame",
+    "a frame too large": (
+        POSE + "[camera]\nwidth_px = 100000\nheight_px = 100000\n",
+        "camera.height_px = 100000: expected a frame of at most 500,000,000 pixels",
     ),
     # Nesting, and what takes time that grows with a square.
     "lists": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
@@ -108,7 +107,7 @@ def test_a_hostile_text_is_refused_in_short_lines(text, expected):
 
 
 SETTINGS = [
-    ("tilt_deg=" + "[" * 50_000, "expected a TOML value", "expected a number"),
+    ("tilt_deg=" + "[" * 50_000, "expected a TOML value", "expected a TOML value"),
     ("tilt_deg={a" + ".a" * 50_000 + "=1}", "expected a TOML value", None),
     ("tilt_deg=1" + "0" * 5000, "expected a TOML value", None),
     ("tilt_deg=0x1" + "0" * 5000, "tilt_deg = 0x1", "expected a number"),
@@ -116,7 +115,7 @@ SETTINGS = [
      "\\u001b\\nforged: x=3: unknown parameter"),
     ('title="\udcff"', "expected a TOML value", None),
     ("x=1," * 10_000, "expected a TOML value", "... and 9,980 faults more"),
-    ("background=\udcff", "expected a TOML value", '"\\udcff": expected'),
+    ("background=\udcff", "expected a TOML value", "expected a TOML value"),
 ]
 
 

@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
+from sweep.experiment.experiment import distinct, used_settings
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import distinct, used_settings
 
 PLUGINS = """
 from dataclasses import dataclass

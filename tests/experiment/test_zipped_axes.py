@@ -5,7 +5,7 @@ import pytest
 
 import sweep
 from sweep.errors import PipelineError
-from sweep.experiment.axes import combinations
+from sweep.experiment.grid import combinations
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import cell, parse_selection, parse_settings, selection_text
 

@@ -64,7 +64,6 @@ print(json.dumps({
     "rotation": [column.tolist() for column in columns["rotation_error_deg"]],
     "grey": columns["reprojection_error_px"][0].tolist(),
     "message": message,
-    "kept": [part.reason for part in pipeline.facts.parts if part.name == "pixels kept"],
     "table": TABLES["solvers"]().rows, "parameters": TABLES["estimator"]().markdown(),
 }))
 """
@@ -87,6 +86,5 @@ def test_solver_is_one_class_and_one_record(tmp_path):
     assert max(result["rotation"][1]) < 15
     assert all(0 < grey < 255 for grey in result["grey"])
     assert "one of frontal, ippe" in result["message"]
-    assert result["kept"] == ["solver frontal needs them"]
     assert ["frontal", "a frontal pose", "pixels", "no"] in result["table"]
     assert "frontal: a frontal pose" in result["parameters"]

@@ -57,14 +57,11 @@ scenes, boxes, settings = batch.scenes, batch.boxes, pipeline.experiment.detecto
 box = tuple(boxes[0].tolist())
 mean, share = marker_levels(scenes, 0, box)
 cells = run_cells(pipeline.experiment, indices)
-parts = pipeline.facts.parts
 print(json.dumps({
     "box": box, "levels": (mean + (1 - share) * 90).tolist(),
     "images": [result.images[row].tolist() for row in range(8)],
     "origins": result.origins.tolist(),
     "windows": search_windows(scenes, boxes, settings[0], np.zeros(8, dtype=bool)).tolist(),
-    "parts": {part.name: [part.active, part.switch] for part in parts},
-    "draws": next(part.reason for part in parts if part.name == "random draws"),
     "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
     "broken": [broken(haze_x=1), broken(read_noise_e=3)],
     "table": TABLES["effects"]().rows, "parameters": TABLES["scene"]().markdown(),
@@ -96,9 +93,6 @@ def test_pixels_are_those_of_plain_numpy(result):
 
 
 def test_all_else_follows_from_the_record(result):
-    assert result["parts"]["haze"] == [True, "haze"]
-    assert result["parts"]["column noise"] == [True, "column_noise_grey"]
-    assert result["draws"] == "column_noise_grey"
     # Neither is part of the bound's model; without them there is no noise.
     assert result["bound"] == ["no_noise"] * 2 + ["not_in_model"] * 6
     quiet, noisy = np.array(result["windows"][0]), np.array(result["windows"][2])

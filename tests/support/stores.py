@@ -4,7 +4,7 @@ import xarray as xr
 
 from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.waves import InWaves
-from sweep.experiment.axes import TRIAL
+from sweep.experiment.grid import TRIAL
 from sweep.sampling.rules import block_unit, make_rule
 from sweep.store.lifecycle import create_store
 

@@ -3,8 +3,8 @@
 import numpy as np
 import xarray as xr
 
+from sweep.experiment.experiment import wrong_beliefs
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.same_meaning import wrong_beliefs
 from sweep.tradeoff.pareto import WRONG_BELIEF, mark_front
 
 TEXT = """seed = 1

@@ -46,8 +46,7 @@ ITERATIVE = (("solver", "iterative"),)
 
 def acted(log):
     """Return the poisons that acted, and the kinds of processes that they ended."""
-    notes = [json.loads(line) for line in log.read_text().splitlines()]
-    acts = [note for note in notes if note["event"] == "act"]
+    acts = [json.loads(line) for line in log.read_text().splitlines()]
     return ({(note["cell"], note["stage"]) for note in acts},
             {note["kind"] for note in acts if note["how"] not in RAISES})
 
@@ -72,8 +71,7 @@ def expected(reference, pipeline, poisons):
         for axis in pipeline.axes_of(Stage.detection, Stage.estimation):
             if axis.name in named:
                 at[axis.name] = list(axis.values).index(named[axis.name])
-        first = {"truth": Stage.scene, "scene": Stage.detection, "detection": Stage.detection,
-                 "estimation": Stage.estimation}[poison.stage]
+        first = Stage.estimation if poison.stage == "estimation" else Stage.detection
         flags = {
             "detection": DetectionStatus.crashed if poison.deadly else DetectionStatus.failed,
             "estimate": EstimateStatus.no_detection,

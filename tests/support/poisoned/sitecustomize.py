@@ -6,7 +6,7 @@ holds JSON: ``log``, a file to which notes are appended, and ``poisons``, each w
 cell
     number of the scene on the grid of scene axes, the last axis fastest
 stage
-    truth, scene (rendering), detection or estimation
+    scene (rendering), detection or estimation
 how
     one of ``WAYS``
 setting
@@ -27,7 +27,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 
 
@@ -91,12 +90,6 @@ class _Poison:
 
         detectors.Detector = self._detector(detectors.Detector)
 
-    def note(self, event, **what):
-        line = {"event": event, "kind": _kind(), "pid": os.getpid(), "time": time.time(), **what}
-        file = os.open(self._log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-        os.write(file, json.dumps(line).encode() + b"\n")
-        os.close(file)
-
     def _act(self, stage, cells, **treatment):
         """Do what the poisons say that ``cells`` hold for this stage and treatment."""
         for poison in self._poisons:
@@ -106,12 +99,9 @@ class _Poison:
                 for name, value in poison.get(kind, {}).items()
             )
             if hit:
-                self.note("act", **poison)
+                with Path(self._log).open("a") as log:
+                    log.write(json.dumps({"kind": _kind(), **poison}) + "\n")
                 WAYS[poison["how"]]()
-
-    def _poisoned(self, stage, cells):
-        """Return which of ``cells`` have a poison for a stage."""
-        return {p["cell"] for p in self._poisons if p["stage"] == stage} & set(cells)
 
     def _cells(self, scenes):
         return next((cells for made, cells in self._made if made is scenes), None)
@@ -129,7 +119,6 @@ class _Poison:
     def build_scenes(self, *arguments):
         scenes = self._real["build_scenes"](*arguments)
         self._made.append((scenes, self._here.cells))
-        self._act("truth", self._here.cells)
         return scenes
 
     def render_all(self, scenes, rows, boxes, windows):
@@ -137,7 +126,7 @@ class _Poison:
         cells = [known[row] for row in rows.tolist()] if known else []
         self._act("scene", cells)
         images = self._real["render_all"](scenes, rows, boxes, windows)
-        marked = self._poisoned("detection", cells)
+        marked = {poison["cell"] for poison in self._poisons if poison["stage"] == "detection"}
         self._images.update(
             (cell, image) for cell, image in zip(cells, images, strict=False) if cell in marked
         )

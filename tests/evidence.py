@@ -3,12 +3,13 @@
     python -m tests.evidence run FILE.json [--shard K/N] [PYTEST ARGUMENT ...]
     python -m tests.evidence table FILE.json ...
 
-``run`` runs the long tests of one shard (files in turn: the first of N is 1/N), and writes outcome
-and duration of every test function, what tests claim by the fixture ``claim``, and on what they
-ran: version and commit of the project, versions of libraries, processor, date. It writes after each
-test, so that a run that is stopped keeps what it found. ``table`` joins the files of one commit and
-writes the table of claims into tests/README.md; it exits with 1 where a test failed, or a shard is
-missing or did not end.
+``run`` runs the long tests of one shard (files in turn: the first of N is 1/N; without ``--shard``
+also on several processors, ``-n 2 --dist loadfile``), and writes outcome and duration of every test
+function, what tests claim by the fixture ``claim``, and on what they ran: version and commit of the
+project, versions of libraries, processor, date. It writes after each test, so that a run that is
+stopped keeps what it found. ``table`` joins the files of one commit and
+writes the table of claims into tests/README.md, and prints seconds by folder; it exits with 1 where
+a test failed, or a shard is missing or did not end.
 """
 
 from __future__ import annotations
@@ -99,6 +100,8 @@ def run(file: str, *arguments: str) -> int:
         place = others.index("--shard")
         shard, shards = (int(number) for number in others[place + 1].split("/"))
         del others[place : place + 2]
+        if "-n" in others:  # pytest's workers do not know of shards
+            raise SystemExit("expected --shard or -n, not both")
     recorder = Recorder(Path(file), shard, shards)
     status = int(pytest.main(["-m", "evidence", *others], plugins=[recorder]))
     recorder.write(status)
@@ -143,6 +146,12 @@ def table(*files: str, page: Path = README) -> int:
     _, _, tail = rest.partition(END)
     page.write_text("\n".join([f"{head}{BEGIN}", "", *lines, "", f"{END}{tail}"]),
                     encoding="utf-8")
+    folders: Counter[str] = Counter()
+    for part in parts:
+        for name, spent in part["seconds"].items():
+            folders[name.partition("::")[0].rpartition("/")[0]] += spent
+    for folder, spent in folders.most_common():
+        print(f"{folder}: {spent:.0f} s")
     for name in failed:
         print(f"failed: {name}")
     if missing:

@@ -854,18 +854,19 @@ class PositiveMean(Mean[ViewT]):
         of_points = design.unit is Unit.replicate
         sums = self.scores(columns, largest=of_points)
         sample = Sample(sums.used)
-        value, low, high = exponential(
-            sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
         # What may be unseen is a draw with all its poses, or a point of the replicates.
+        draws: Floats | Integers
         if of_points:
-            draws: Floats | Integers = sample.n / design.points
-            largest = sums.largest
+            draws, largest = sample.n / design.points, sums.largest
         else:
             draws = sample.freedom + 1
             largest = np.divide(sums.values[..., 0], sums.used, where=sums.used > 0,
                                 out=np.full(sums.used.shape, -np.inf))
-        return value, low, with_unseen_tail(
-            high, largest.max(axis=(1, 2), initial=-np.inf), draws, level, self.unseen_factor)
+        most = largest.max(axis=(1, 2), initial=-np.inf)
+        del largest  # of 10^7 poses it has 80 MB
+        value, low, high = exponential(
+            sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
+        return value, low, with_unseen_tail(high, most, draws, level, self.unseen_factor)
 
     def scores(self, columns: Columns[ViewT], *, largest: bool) -> Sums:
         """Return the sums of what the mean is of, ``largest`` as for `sums`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import itertools
 import os
@@ -135,24 +136,17 @@ def document_text(mapping: Mapping[str, Any]) -> str:
     """
     faults: list[str] = []
     document = tomlkit.document()
-
-    def add(table: Any, home: str, items: Mapping[str, Any]) -> None:
+    tables = {key: value for key, value in mapping.items() if isinstance(value, Mapping)}
+    above = {key: value for key, value in mapping.items() if key not in tables}
+    for home, items in [(None, above), *tables.items()]:
+        table = document if home is None else document.setdefault(home, tomlkit.table())
         for key, value in items.items():
-            path = plain(f"{home}{key}")
             try:
-                if not isinstance(key, str):
-                    faults.append(f"{path}: expected a string as key")
-                elif isinstance(value, Mapping) and not home:
-                    add(tables.setdefault(key, tomlkit.table()), f"{key}.", value)
-                else:
-                    table[key] = toml_item(value)
+                table[key] = toml_item(value)
             except (TypeError, ValueError, RecursionError):
-                faults.append(f"{path} = {plain(repr(value))}: expected a string, a number, true, "
-                              "false, a list or a table")
-
-    tables: dict[str, tomlkit.items.Table] = {}
-    add(document, "", mapping)
-    document.update(tables)  # tables stand below all keys
+                path = key if home is None else f"{home}.{key}"
+                faults.append(f"{plain(path)} = {plain(repr(value))}: expected a string, a number, "
+                              "true, false, a list or a table")
     if faults:
         raise ValueError("\n".join(faults))
     return tomlkit.dumps(document)
@@ -284,6 +278,17 @@ class Reading(Grid):
         """Note a fault of one of a parameter's values."""
         self.fault(f"{self.parameters[name].section}.{name}", value, expected)
 
+    @contextlib.contextmanager
+    def noting(self, path: str, key: str, value: Any) -> Iterator[None]:
+        """Note the fault of a key's value that its reader raises as ValueError."""
+        try:
+            yield
+        except TablesError as error:
+            self.tell(f"{path}{line}" for line in error.lines)
+        except ValueError as error:
+            if key not in self.unread:
+                self.fault(path, value, str(error))
+
     def unknown_key(
         self, section: str, key: str, known: Collection[str], expected: str = ""
     ) -> None:
@@ -391,18 +396,14 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
                 each.name for each in reading.parameters.values() if each.section == section])
         return
     reading.written[key] = path, value
-    try:
+    with reading.noting(path, key, value):
         if isinstance(value, dict):
             reading.distributions[key] = parse_distribution(parameter, value)
+        elif isinstance(value, list) and tuple not in parameter.types and not parameter.reads:
+            raise ValueError(f"{parameter.expected()}; several values are an axis: they go under "
+                             "[axes]")
         else:
             reading.fixed[key] = parameter.check(value)
-    except TablesError as error:
-        reading.tell(f"{path}{line}" for line in error.lines)
-    except ValueError as error:
-        if key not in reading.unread:
-            axis = "; several values are an axis: they go under [axes]" if (
-                isinstance(value, list) and tuple not in parameter.types) else ""
-            reading.fault(path, value, f"{error}{axis}")
 
 
 def _read_axes(reading: Reading) -> None:
@@ -424,26 +425,23 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
     Of a parameter that goes together with others, ``table`` is the name of their axis.
     """
     path = f"axes.{table}.{key}" if table else f"axes.{key}"
-    try:
+    with reading.noting(path, key, value):
         if key == TRIAL and not table:
             return parse_trial(value)
         if key == TRIAL:
             raise ValueError("it as an axis of its own: every cell has the same trials")
         if key in reading.given:
             other, _ = reading.written[key]
-            reading.fault(path, value, f"it once: {other} is given too; delete one of them")
-        elif key in reading.parameters:
+            raise ValueError(f"it once: {other} is given too; delete one of them")
+        if key in reading.parameters:
             reading.written[key] = path, value
             return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
-        elif isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
+        if isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
             raise ValueError(
                 "parameters that go together as "
                 "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip")
-        elif not reading.unread or key in HEADER:
+        if not reading.unread or key in HEADER:
             reading.unknown_key(path.removesuffix(f".{key}"), key, [*reading.parameters, TRIAL])
-    except ValueError as error:
-        if key not in reading.unread:
-            reading.fault(path, value, str(error))
     return None
 
 

@@ -30,7 +30,7 @@ from sweep.experiment.document import (
     section_of,
     toml_item,
 )
-from sweep.experiment.draws import REPLICATES, SAMPLINGS
+from sweep.experiment.draws import REPLICATES
 from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
 from sweep.experiment.parameters import (
@@ -306,20 +306,15 @@ def beliefs_in_one_way(reading: Reading) -> None:
     if len(given) == 2:
         reading.refuse(sd, f"{sd} or {covariance}, not both; delete one of them")
     elif given:
-        _errors_are_sound(reading, given[0])
+        try:
+            for count in {len(lens) for lens in reading.values_of("distortion")}:
+                CalibrationError.of(reading.fixed[sd], reading.fixed[covariance], count)
+        except ValueError as error:
+            reading.refuse(given[0], str(error))
     elif _is_calibrated(reading):
         where = "camera_file has none" if reading.stated else "or a camera_file"
         reading.refuse("believed", "a calibration's standard deviations: give calibration_sd under "
                        f"[camera] ({where})")
-
-
-def _errors_are_sound(reading: Reading, name: str) -> None:
-    """Demand as many errors as the camera has numbers, and focal lengths that stay above 0."""
-    try:
-        for count in {len(lens) for lens in reading.values_of("distortion")}:
-            CalibrationError.of(reading.fixed[STATED[0]], reading.fixed[STATED[1]], count)
-    except ValueError as error:
-        reading.refuse(name, str(error))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -373,8 +368,6 @@ def photographs_alone(reading: Reading) -> None:
         if reading.parameters[name].section in ("pose", "pose" if simulated else "scene"):
             reading.refuse(
                 name, f"nothing beside photographs, which have their own {own}; delete it")
-    if reading.sampling != SAMPLINGS[0]:
-        reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
     if SEARCH in reading.document:
         reading.fault(SEARCH, reading.document[SEARCH], "no such section: photographs are given")
     if reading.recorded is not None:
@@ -521,9 +514,6 @@ def something_random_to_repeat(reading: Reading) -> None:
         reading.fault("axes.trial", trials, f"a multiple of {REPLICATES}, at least "
                       f"{2 * REPLICATES}, for sampling = sobol: {REPLICATES} replicates of as many "
                       "points each, best a power of two")
-    if not drawn:
-        reading.fault("sampling", reading.sampling, "a distribution or jitter_px above 0 (the "
-                      "noise of pixels is independent in any case)")
 
 
 RESERVED = {

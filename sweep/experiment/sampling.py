@@ -214,9 +214,6 @@ MAX_TRIALS = "max_trials"
 NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
 """What is expected where nothing says how many trials there are at most."""
 
-MIN_TRIALS = 2
-"""The fewest that make an interval."""
-
 FIRST_DRAWS = 50
 """Draws of a condition in the first wave, about: all pooled cells together."""
 
@@ -339,9 +336,6 @@ def read_required(reading: Reading) -> dict[str, Any]:
                 raise ValueError("there is another budget; delete one")
         except ValueError as error:
             reading.note(f"{REQUIRE}.all = {shown(text)}", str(error))
-    if "per" in table and "all" not in reading.table(REQUIRE):
-        reading.fault(REQUIRE, reading.table(REQUIRE),
-                      'what is required, too: all = ["detection >= 0.99"]')
     conditions = tuple(dict.fromkeys(table.get("per", ())))
     for name in conditions:
         if not _is_of_scene(reading, name):
@@ -408,15 +402,10 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
     along = _ordered_axis(reading, f"{SEARCH}.{kind}", value) if isinstance(value, str) else ""
     if kind != "precision" and not required["requirements"]:
         reading.note(SEARCH, f'expected what must be met: [{REQUIRE}] all = ["detection >= 0.99"]')
-    _check_names(reading, table, kind, along)
+    _check_names(reading, table, kind)
     conditions = required["require_per"] if "per" in reading.table(REQUIRE) else None
     roles = _roles(reading, table, kind, along, conditions)
     among = roles["among"]
-    if kind == "cheapest" and math.prod(
-            len(axis) for axis in reading.axes if axis.name in among) < 2:
-        reading.fault(SEARCH, given, (
-            'something to choose: smallest = "size_m", with its values under [axes], or '
-            'among = ["solver"], of which the cheapest is chosen'))
     for name in {along, *among}.intersection(conditions or ()) if kind in CHOICES else ():
         reading.fault(f"{REQUIRE}.per", list(conditions or ()),
                       f"conditions; {name} is what [{SEARCH}] chooses")
@@ -433,7 +422,7 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
         precision=value if kind == "precision" and value else ())
 
 
-def _check_names(reading: Reading, table: Mapping[str, Any], kind: str, along: str) -> None:
+def _check_names(reading: Reading, table: Mapping[str, Any], kind: str) -> None:
     """Note the faults of the axes that ``per`` and ``among`` list.
 
     A fixed parameter is a condition of one value.
@@ -447,10 +436,7 @@ def _check_names(reading: Reading, table: Mapping[str, Any], kind: str, along: s
             f"{SEARCH}.among", given["among"], f"it beside {', '.join(CHOICES)} alone")
     key = "among" if kind in CHOICES else "per"
     for name in dict.fromkeys(table.get(key, ())):
-        if along and name == along:
-            reading.fault(
-                f"{SEARCH}.{key}", name, f"other axes than {along}, which is searched along")
-        elif key == "among" or name not in reading.fixed or not _is_of_scene(reading, name):
+        if key == "among" or name not in reading.fixed or not _is_of_scene(reading, name):
             _axis_at(reading, f"{SEARCH}.{key}", name, scene=key == "per")
 
 
@@ -492,8 +478,6 @@ def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
         reading.fault(path, len(wanted), "it or axes.trial, not both; delete one of them")
     if MAX_TRIALS not in reading.table(SEARCH) and TRIAL not in reading.table("axes"):
         reading.fault(SEARCH, reading.table(SEARCH), NO_TRIALS)
-    if axis is not None and len(axis) < MIN_TRIALS:
-        reading.fault(path, len(axis), f"at least {MIN_TRIALS}: intervals are over the draws")
     if reading.sampling != SAMPLINGS[0]:
         reading.fault(
             "sampling", reading.sampling,

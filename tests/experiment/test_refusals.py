@@ -82,7 +82,6 @@ BROKEN = [
     (P + '[require]\nall = ["detection"]', 'require.all = "detection": expected NAME >= NUMBER'),
     (P + '[require]\nall = ["detection >= 0.9"]\nper = ["solver"]',
      "require.per: solver: no such axis; expected one under [axes] of the scene: there is none"),
-    (P + '[require]\nper = ["distance_m"]', "what is required, too"),
     ("seed = -1\n[pose]\ndistance_m = 1", "seed = -1: expected a whole number from 0"),
     ("[pose\ndistance_m = 1", "not TOML: "),
     (P + '[scene]\nbackground = "none.png"',

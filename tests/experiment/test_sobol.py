@@ -120,8 +120,6 @@ def test_replicates_are_independent():
 @pytest.mark.parametrize(("settings", "sections", "line"), [
     (["trial=40"], {}, "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),
     (["sampling=halton"], {}, 'sampling = "halton": expected one of independent, sobol'),
-    ([], {"pose": {"distance_m": 1}, "scene": {"noise_grey": 1}},
-     'sampling = "sobol": expected a distribution or jitter_px above 0'),
 ])
 def test_what_cannot_be_sampled_evenly_is_one_line(settings, sections, line):
     with pytest.raises(PipelineError) as refusal:

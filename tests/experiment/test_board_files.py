@@ -82,15 +82,6 @@ def test_a_fault_is_one_line(tmp_path, text, line):
     assert found[0].startswith(line)
 
 
-def test_all_faults_come_at_once(tmp_path):
-    found = faults(tmp_path, MARKERS.replace("x_m = 0\n", "x_m = true\n").replace(
-        "size_m = 0.1\n[[", "roll = 3\n[["
-    ))
-    assert [fault.split(" ")[0] for fault in found] == [
-        "markers[0].x_m", "markers[0].roll:", "markers[0].size_m:"
-    ]
-
-
 def test_a_file_that_cannot_be_read_is_one_line(tmp_path):
     for path, problem in ((tmp_path, "Is a directory"), (tmp_path / "none.toml", "No such file")):
         with pytest.raises(PipelineError, match=problem) as raised:

@@ -39,14 +39,6 @@ def test_warp_s_bitmap_of_a_board_has_a_limit():
         bitmap_shape(board("30"))
 
 
-def test_distractors_may_touch_share_an_id_and_stand_in_planes_of_their_own():
-    sheet = 0.05 * 8 / 6
-    apart = beside(x_m=0.5, y_m=0) + beside(x_m=0.5 + sheet, y_m=0) + "marker_id = 3"
-    above = beside(x_m=0, y_m=0, z_m=0.1) + beside(x_m=0.5, y_m=0, tilt_deg=20)
-    for board in (GRID + apart, apart, GRID + above, TABLE + above):
-        assert Pipeline.from_text(TEXT + board, []) is not None
-
-
 AXIS = """[axes]
 target = { zip = { kind = ["none", "charuco", "grid"], size_m = [0.1, 0.03, 0.05] } }
 """
@@ -78,12 +70,6 @@ def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind, kept):
     for each in (fixed, single):
         own = {name for name in each.given if axis.parameters[name].section == "board"}
         assert own == {"kind", *kept}
-
-
-def test_rows_of_a_grid_can_be_an_axis():
-    pipeline = Pipeline.from_text(TEXT + GRID, ["rows=[1,2,5]"])
-    boards = pipeline.experiment.scene_values([np.arange(3)])["board"].listed(3)
-    assert [len(board) for board in boards] == [7, 14, 35]
 
 
 def test_cells_of_smaller_boards_fit_the_largest_of_another_grid():

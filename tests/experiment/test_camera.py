@@ -76,17 +76,6 @@ def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
     assert pipeline(camera).facts.camera["square"]
 
 
-@pytest.mark.parametrize("camera", [
-    {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6, "width_px": 1280, "height_px": 720},
-    {"fx_px": 500, "fy_px": 600},
-])
-def test_pixels_that_are_not_square_are_said_to_be(camera):
-    fx, fy, _, _ = view(camera)
-    facts = pipeline(camera).facts
-    assert not facts.camera["square"]
-    assert f"pixels are not square: fy/fx = {fy / fx:.4g}" in facts.camera_line
-
-
 @pytest.mark.parametrize("focal_length", first_of([3.6, 12.5, 4.0, 6.0], 2))
 def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(focal_length):
     rng = np.random.default_rng(3)
@@ -96,36 +85,6 @@ def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(
         expected = [focal_length / 4.8 * (4 * k), focal_length / 3.6 * (3 * k)]
         sides = [{name: both[name] for name in given} for given in ((), both, ["sensor_width_mm"])]
         assert all(view(camera | given)[:2] == expected for given in sides)
-
-
-def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
-    axes = {
-        "hfov_deg": [40.0, 60.0], "width_px": [640, 1280], "height_px": [480, 720],
-        "side_px": [20.0, 50.0],
-    }
-    grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
-    lengths = [len(axis) for axis in grid.experiment.scene_axes]
-    values = grid.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
-    columns = [values[name].values for name in VIEW_PARAMETERS]
-    fx, fy, _, _ = intrinsics(*columns)
-    for k, chosen in enumerate(itertools.product(*axes.values())):
-        camera = dict(zip(("hfov_deg", "width_px", "height_px"), chosen[:3], strict=True))
-        assert [fx[k], fy[k]] == view(camera)[:2]
-        alone = Pipeline.from_dict(
-            {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
-        )
-        distance = alone.experiment.scene_values([])["distance_m"].values
-        assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
-
-
-def test_a_frame_size_on_an_axis_keeps_pixels_square():
-    assert pipeline({"fx_px": 500}, ["hfov_deg=[40, 50]"]).axis("hfov_deg").values == (40.0, 50.0)
-    grid = Pipeline.from_dict({
-        "pose": {"distance_m": 1}, "axes": {"width_px": [640, 1280], "height_px": [480, 720]},
-    })
-    facts = grid.facts.camera
-    assert facts["square"]
-    assert facts["fx_px"] == facts["fy_px"] == (4 / 4.8 * 640, 4 / 4.8 * 1280)
 
 
 # 2. --set and --at.
@@ -170,26 +129,6 @@ def test_sides_of_a_board_s_markers_are_their_own():
     })
     assert board.facts.camera["side_px"] == pytest.approx((3, 24))
     assert "the markers' sides are 3 to 24 px" in board.facts.camera_line
-
-
-def test_sides_of_poses_in_the_world_are_named():
-    # The camera looks along x; fx = 600.
-    world = Pipeline.from_dict({
-        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"camera_x_m": 1.0},
-        "axes": {"marker_x_m": [3.0, 2.0, 0.0]},
-    })
-    assert world.facts.camera["side_px"] == pytest.approx((600 * 0.1 / 2, 600 * 0.1 / 1))
-
-
-def test_facts_of_parameters_that_go_together_are_those_of_each_row():
-    together = Pipeline.from_dict({"pose": {"distance_m": 1}, "axes": {"resolution": {"zip": {
-        "width_px": [640, 1280], "height_px": [480, 720], "fx_px": [500.0, 1000.0],
-        "cx_px": [319.5, 639.5], "cy_px": [239.5, 359.5],
-    }}}})
-    facts = together.facts.camera
-    assert [facts[name] for name in ("aspect", "off_centre_x", "off_centre_y")] == [
-        (1, 1), (0, 0), (0, 0)]
-    assert facts["hfov_deg"] == pytest.approx((2 * math.degrees(math.atan(0.64)),) * 2)
 
 
 @pytest.mark.long
@@ -239,3 +178,23 @@ def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
     assert "HFOV 178.6°" in capfd.readouterr().err
     told = sweep.open(tmp_path / "s.zarr").attrs["camera_notes"]
     assert told.startswith("HFOV 178.6°")
+
+
+def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
+    axes = {
+        "hfov_deg": [40.0, 60.0], "width_px": [640, 1280], "height_px": [480, 720],
+        "side_px": [20.0, 50.0],
+    }
+    grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
+    lengths = [len(axis) for axis in grid.experiment.scene_axes]
+    values = grid.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
+    columns = [values[name].values for name in VIEW_PARAMETERS]
+    fx, fy, _, _ = intrinsics(*columns)
+    for k, chosen in enumerate(itertools.product(*axes.values())):
+        camera = dict(zip(("hfov_deg", "width_px", "height_px"), chosen[:3], strict=True))
+        assert [fx[k], fy[k]] == view(camera)[:2]
+        alone = Pipeline.from_dict(
+            {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
+        )
+        distance = alone.experiment.scene_values([])["distance_m"].values
+        assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]

@@ -94,15 +94,6 @@ def test_values_of_python_and_numpy_stand_for_those_of_toml(tmp_path):
         )
 
 
-def test_settings_replace_values_of_a_dictionary():
-    document = {"pose": {"distance_m": 1, "tilt_deg": 3}}
-    pipeline = Pipeline.from_dict(document, ["tilt_deg=[0, 45]", "title='two tilts'"])
-    assert pipeline.title == "two tilts"
-    assert pipeline.axis("tilt_deg").values == (0.0, 45.0)
-    assert document == {"pose": {"distance_m": 1, "tilt_deg": 3}}
-    assert Pipeline.from_text(pipeline.to_toml()) == pipeline
-
-
 def test_settings_replace_values_axes_and_distributions(tmp_path):
     path = tmp_path / "p.toml"
     path.write_text("# kept\n[pose]\ndistance_m = 1\n[axes]\ntilt_deg = [0, 1]")

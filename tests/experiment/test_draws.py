@@ -6,7 +6,7 @@ from scipy import stats
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.experiment.grid import Block, Blocks
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 
 DRAWN = """
@@ -53,11 +53,6 @@ def assert_same(table, expected):
         np.testing.assert_array_equal(table[name], expected[name], err_msg=name)
 
 
-def test_draws_are_distinct_over_all_cells_and_quantities():
-    every = np.concatenate([column.ravel() for column in drawn().values()])
-    assert len(np.unique(every)) == 4 * 3 * 3 * 2 * 4
-
-
 def test_draws_do_not_depend_on_the_order_of_axes():
     head, lines = DRAWN.split("[axes]\n")
     axes = lines.splitlines()
@@ -96,15 +91,6 @@ def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid():
 ], ids=",".join)
 def test_draws_do_not_depend_on_defaults_renderer_levels_detector_or_estimator(settings):
     assert_same(drawn(*settings), drawn())
-
-
-def test_draws_are_the_same_for_a_side_in_pixels_as_for_the_distance_it_stands_for():
-    fx = 4.0 / 4.8 * 640
-    text = DRAWN.replace(
-        "distance_m = [0.2, 0.5, 1.0]", f"side_px = {[fx * 0.04 / z for z in (0.2, 0.5, 1.0)]}"
-    )
-    order = ("marker_id", "side_px", "bearing_x_deg", "trial")
-    assert_same(drawn(text=text, order=order), drawn())
 
 
 @pytest.mark.parametrize(
@@ -170,20 +156,3 @@ def test_jitter_moves_the_undistorted_projection_of_the_centre_by_the_shift(dist
     np.testing.assert_array_equal(truth[:, 2], values["distance_m"].values)
     assert np.abs(shift).max() <= 0.5
     assert np.abs(shift).max() > 0.4
-
-
-def test_jitter_scales_with_its_half_width_and_is_absent_at_zero():
-    table = drawn("jitter_px=[0, 0.001, 30]", order=(*ORDER, "jitter_px"))["shift_u_px"]
-    assert (table[..., 0] == 0).all()
-    for k, half_width in ((1, 0.001), (2, 30)):
-        assert np.abs(table[..., k]).max() <= half_width
-        assert np.abs(table[..., k]).max() > 0.5 * half_width
-
-
-def test_results_of_a_block_are_those_of_the_whole_grid_cut():
-    pipeline = Pipeline.from_text(DRAWN, ["cornerRefinementMethod=['none', 'subpix']"])
-    expected = run_block(pipeline, whole(pipeline)).values
-    for block in Blocks(whole(pipeline).shape, (2, 1, 2, 3)):
-        part = tuple(slice(a, b) for a, b in zip(block.starts, block.stops, strict=True))
-        for name, column in run_block(pipeline, block).values.items():
-            np.testing.assert_array_equal(column, expected[name][part], err_msg=name)

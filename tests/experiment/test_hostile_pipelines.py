@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH, shown
+from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH
 
 POSE = "[pose]\ndistance_m = 1\n"
 AXES = POSE + "jitter_px = 1\n[axes]\n"
@@ -34,21 +34,14 @@ HOSTILE = {
     # Axes without end, in every form.
     "range": (AXES + "marker_id = { range = [0, 1000000000000] }", "at most 1,000,000,000 values"),
     "linspace": (AXES + "tilt_deg = { linspace = [0, 1, 1000000000000] }", "at most 1,000,000"),
-    "geom": (AXES + "size_m = { geom = [1, 2, 10000000] }", "at most 1,000,000 values"),
     "arange, least step": (AXES + "tilt_deg = { arange = [0, 1e299, 5e-324] }", "at most 1,000"),
     "trial": (AXES + "trial = 1000000000000", "from 1 to 1,000,000,000"),
     "axes that are long together": (
         AXES + "tilt_deg = { linspace = [0, 1, 600000] }\nroll_deg = { linspace = [0, 1, 600000] }",
         "axes.roll_deg = {linspace = [0, 1, 600000]}: expected at most 1,000,000 values, all axes",
     ),
-    "a product beyond all numbers": (
-        AXES + "".join(
-            f"{name} = {{ range = [1, 10000] }}\n" for name in (
-                "width_px", "height_px", "adaptiveThreshWinSizeStep", "minDistanceToBorder",
-                "cornerRefinementWinSize", "aprilTagMinClusterPixels", "minSideLengthCanonicalImg",
-            )
-        ),
-        "axes: 9.99e+27 poses: expected at most 1e+12",
+    "a product": (
+        AXES + "trial = 1000000000\nmarker_id = { range = [0, 50000] }", "poses: expected at most",
     ),
     "detector settings times estimators": (
         AXES + "minOtsuStdDev = { linspace = [0, 9, 1000] }\n"
@@ -63,13 +56,11 @@ HOSTILE = {
     "lists": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
     "tables, closed": (POSE + "tilt_deg = " + "{a=" * 200 + "1" + "}" * 200, "= {a = {a = "),
     "a dotted key": ("a" + ".a" * 100_000 + " = 1", "expected keys of at most 8 parts"),
-    "deep keys": ("".join(f"a{DEEP}{i} = 1\n" for i in MANY), "a: unknown key; expected a section"),
     "quotes, none a key": (POSE + "x = '" + '"\\' * 50_000 + "'", "pose.x: unknown key"),
     # Size.
     "text": ("# " + "x" * 10_000_000, "expected at most 250,000 bytes"),
     "unknown keys": (POSE + "".join(f"k{i} = 1\n" for i in MANY), "... and 1,980 faults more"),
     "a key": (POSE + "k" * 200_000 + " = 1", "kkk...: unknown key"),
-    "a string": (POSE + f'tilt_deg = "{"k" * 200_000}"', "kkk...: expected a number"),
     "values": (AXES + f"tilt_deg = [{'1,' * 100_000}]", "each value once (1.0 is repeated)"),
     "a title": (f'title = "{"k" * 1000}"\n' + POSE, "one line of at most 200 characters"),
     "a path": (POSE + f'[scene]\nbackground = "{"a/" * 100_000}"', "(File name too long)"),
@@ -81,8 +72,6 @@ HOSTILE = {
             ("a value", POSE + "tilt_deg = %s", "pose.tilt_deg = 0x1000"),
             ("a list", AXES + "tilt_deg = [%s]", "(not 0x1000"),
             ("a range", AXES + "marker_id = { range = [0, %s] }", "expected range ="),
-            ("a lens", POSE + "[camera]\ndistortion = [%s, 0, 0, 0]", "expected a list of 0, 4"),
-            ("a draw", "[pose]\ndistance_m = { uniform = [0, %s] }", "expected uniform ="),
         )
     },
     # What a terminal would obey, or take for a line of ours.
@@ -93,10 +82,6 @@ HOSTILE = {
         POSE + 'tilt_deg = "\\u009b31m\\u202e\\u2028\\n"',
         'tilt_deg = "\\u009b31m\\u202e\\u2028\\n": expected',
     ),
-    "control characters, a path": (
-        POSE + '[scene]\nbackground = "\\u001b[31mx.png"', '"\\u001b[31mx.png": expected a level',
-    ),
-    "control characters, the title": ('title = "\\u001b[2J"\n' + POSE, 'title = "\\u001b[2J"'),
     "half a character": (POSE + "# \ud800", "expected UTF-8"),
 }
 
@@ -108,8 +93,6 @@ def test_a_hostile_text_is_refused_in_short_lines(text, expected):
 
 SETTINGS = [
     ("tilt_deg=" + "[" * 50_000, "expected a TOML value", "expected a TOML value"),
-    ("tilt_deg={a" + ".a" * 50_000 + "=1}", "expected a TOML value", None),
-    ("tilt_deg=1" + "0" * 5000, "expected a TOML value", None),
     ("tilt_deg=0x1" + "0" * 5000, "tilt_deg = 0x1", "expected a number"),
     ("\x1b\nforged: x=3", "--set \\u001b\\nforged: x=3: unknown",
      "\\u001b\\nforged: x=3: unknown parameter"),
@@ -124,20 +107,6 @@ def test_a_hostile_setting_or_place_is_refused_in_short_lines(setting, expected,
     assert any(expected in line for line in faults_of(Pipeline.from_text, POSE, [setting]))
     if at is not None:
         assert any(at in line for line in faults_of(cell, Pipeline.from_text(POSE), setting))
-
-
-@pytest.mark.parametrize(
-    "text", [f"a{DEEP} = 1\n" + "\n" * 200_000, "[[a]]\n[a.b]\n" * 15_000,
-             POSE + f"k = [{'{a=1},' * 30_000}]"],
-    ids=["empty lines", "tables", "lists of tables"],
-)
-def test_a_hostile_text_is_refused_as_soon_where_a_setting_changes_it(text):
-    assert "unknown" in faults_of(Pipeline.from_text, text, ["tilt_deg=3"])[0]
-
-
-def test_a_list_of_lists_may_be_a_place():
-    assert cell(Pipeline.from_text(POSE), "distortion=[0.1, 0, 0, 0],tilt_deg=3").fixed[
-        "distortion"] == (0.1, 0.0, 0.0, 0.0)
 
 
 def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
@@ -168,16 +137,6 @@ def test_any_text_is_a_pipeline_or_is_refused(text):
             assert all(line.isprintable() and 0 < len(line) <= MAX_LINE_LENGTH for line in lines)
 
 
-@settings(derandomize=True, deadline=None, max_examples=50)
-@given(st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.dates(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
-))
-def test_any_value_is_shown_in_a_short_line(value):
-    assert shown(value).isprintable()
-    assert len(shown(value)) <= MAX_LINE_LENGTH
-
-
 # Files.
 
 def png(width, height, data):
@@ -201,18 +160,12 @@ JPEG = encoded(".jpg", NOISE)
 
 BROKEN_IMAGES = {
     "empty": (b"", "not an image"),
-    "text": (b"no image", "not an image"),
     "a header alone": (encoded(".png", NOISE)[:33], "not an image"),
-    "half a PNG": (encoded(".png", NOISE)[:2000], "not an image"),
     "half a JPEG": (JPEG[:1500], "not an image"),
-    "half a BMP": (encoded(".bmp", NOISE)[:2000], "not an image"),
-    "half a PGM": (encoded(".pgm", NOISE)[:2000], "not an image"),
     "too little data": (png(64, 48, b"\0" * 100), "not an image"),
     "no pixels": (png(0, 0, b""), "not an image"),
     "a TIFF": (encoded(".tiff", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
-    "a WebP": (encoded(".webp", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
     "another size": (encoded(".png", NOISE[:40]), "it is 64 x 40, but height_px = 48"),
-    "a turned frame": (encoded(".png", NOISE.T.copy()), "it is 48 x 64, but width_px = 64"),
 }
 
 
@@ -222,20 +175,6 @@ def test_an_image_that_is_none_is_refused(content, expected, tmp_path, capfd):
     lines = faults_of(Pipeline.from_text, FRAME % "image", folder=tmp_path)
     assert expected in lines[0]
     assert capfd.readouterr().err == ""
-
-
-IMAGES = {
-    **{ending: encoded(ending, np.dstack([NOISE] * 3)) for ending in (".png", ".jpg", ".bmp")},
-    **{ending: encoded(ending, NOISE) for ending in (".pgm", ".pbm")},
-    "16 bits": encoded(".png", NOISE.astype(np.uint16) * 256),
-    "alpha": encoded(".png", np.dstack([NOISE] * 4)),
-}
-
-
-@pytest.mark.parametrize("content", IMAGES.values(), ids=IMAGES)
-def test_an_image_of_the_frames_size_is_taken(content, tmp_path):
-    (tmp_path / "image").write_bytes(content)
-    assert list(Pipeline.from_text(FRAME % "image", folder=tmp_path).files) == ["image"]
 
 
 def test_special_files_are_refused_unread(tmp_path):
@@ -253,10 +192,3 @@ def test_special_files_are_refused_unread(tmp_path):
         for line, in (faults_of(Pipeline.from_toml, tmp_path / name),
                       faults_of(Pipeline.from_text, FRAME % name, folder=tmp_path)):
             assert expected in line
-
-
-def test_a_file_whose_name_forges_a_line_is_told_in_one(tmp_path):
-    line, = faults_of(Pipeline.from_toml, tmp_path / "a\nforged: \x1b[31m.toml")
-    assert "a\\nforged: \\u001b[31m.toml: cannot be read: No such file" in line
-    faults_of(Pipeline.from_toml, "x" * 5000)
-    faults_of(Pipeline.from_toml, "a\0b")

@@ -19,12 +19,6 @@ NEEDS = {
 }
 
 
-def test_every_pipeline_is_on_the_page():
-    assert {path.stem for path in FOLDER.glob("*.toml")} == NEEDS.keys()
-    page = (FOLDER / "README.md").read_text()
-    assert all(name in page for name in NEEDS)
-
-
 @pytest.mark.parametrize(("figure", "tilts", "shown", "not_shown"), [
     (3, [0], "error", "detection"), (4, [0, 45, 70], "detection", "error"),
 ])

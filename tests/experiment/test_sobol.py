@@ -93,18 +93,6 @@ def test_a_draw_depends_on_its_own_cell_and_trial_alone():
     assert len(set(ours["tilt_deg"].tolist())) == 128
 
 
-def test_what_a_calibration_gives_is_drawn_evenly_with_all_else():
-    grid = pipeline(camera={"fx_px": 600, "calibration_sd": [5, 5, 2, 2]},
-                    estimator={"believed": "calibration"})
-    index = np.zeros(64, dtype=int), np.arange(64)
-    values = grid.experiment.scene_values(index)
-    for replicate in range(REPLICATES):
-        for name, (mean, sd) in {"calibrated_fx_px": (600, 5), "tilt_deg": (None, None)}.items():
-            numbers = values[name].values[replicate::REPLICATES]
-            share = numbers / 60 if mean is None else stats.norm.cdf((numbers - mean) / sd)
-            assert sorted(np.floor(share * 4).tolist()) == [0, 1, 2, 3], name
-
-
 def test_replicates_are_independent():
     # The correlation of the means of two replicates over 4,000 cells is 0 to 0.08 but for a chance
     # below 1e-6 (normal, 1 / sqrt(4000) = 0.016).

@@ -56,11 +56,6 @@ def test_each_detector_and_solver_is_told_apart_by_its_own_settings_alone(pipeli
     assert sorted(texts) == sorted(map(" ".join, itertools.product(detectors, solvers)))
 
 
-def test_settings_are_kept_where_the_detector_is_not_chosen(pipeline):
-    made = pipeline(TEXT)
-    assert used_settings(made, {"steps": 3}) == {"steps": 3}
-
-
 def test_settings_of_a_fixed_detector_and_those_that_go_together(pipeline):
     fixed = pipeline('[pose]\nside_px = 40\n[detector]\ndetector = "own.py:B"\n[axes]\n'
                      "adaptiveThreshConstant = [5, 7]\n")

@@ -18,7 +18,6 @@ import sweep
 from support.blocks import run_block
 from support.clusters import Cluster
 from support.commands import command, started
-from support.here import calls_here
 from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
@@ -223,25 +222,6 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
     for key, content in bucket.content().items():
         assert not bucket.told_in(key)
         assert not bucket.told_in(content.decode("latin-1")), key
-
-
-@pytest.mark.evidence
-def test_remote_store_is_left_alone_and_reused(bucket, small, capsys):
-    url, grown = "s3://bucket/plain.zarr", "s3://bucket/grown.zarr"
-    outcomes = []
-    with calls_here():
-        for options in (
-            ("--store", url), ("--store", url),
-            ("--store", grown, "--reuse", url, "--set", "tilt_deg=[0, 50, 60]"),
-        ):
-            assert main(["run", str(small), "--json", *options]) == 0
-            told = capsys.readouterr()
-            assert told.err == ""
-            assert not bucket.told_in(told.out)
-            outcomes.append(json.loads(told.out)["computed_scenes"])
-    assert outcomes == [48, 0, 24]
-    see_expected(url)
-    see_expected(grown, SMALL.replace("tilt_deg = [0, 50]", "tilt_deg = [0, 50, 60]"))
 
 
 REFUSED = {

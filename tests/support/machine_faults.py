@@ -3,9 +3,6 @@
 import errno
 import itertools
 import os
-import pickle
-import resource
-from pathlib import Path
 
 import cv2
 from numba.core.errors import LoweringError
@@ -13,11 +10,6 @@ from zarr.storage import LocalStore
 
 from sweep.evaluation import block as cells
 from sweep.evaluation import search
-
-FAULTS = (
-    "cache", "compiler", "disk", "memory", "opencv memory", "import", "descriptors", "passing",
-)
-"""What may be at fault; "passing": a batch and a scene raise, and no repetition does."""
 
 _before = {}
 
@@ -29,13 +21,12 @@ def _no_memory():
 
 
 ERRORS = {
-    "cache": lambda: pickle.UnpicklingError("pickle data was truncated"),
     "compiler": lambda: LoweringError("no module"),
     "disk": lambda: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
     "memory": MemoryError,
     "opencv memory": _no_memory,
     "import": lambda: ImportError("libstdc++.so.6: file too short"),
-    "passing": lambda: RuntimeError("not like this"),
+    "passing": lambda: RuntimeError("not like this"),  # of a batch and a scene, and never again
 }
 
 PLACES = {
@@ -51,12 +42,7 @@ def inject(fault, place, at):
 
     What is written to a store fails by a fault of the disk, whatever the ``fault``.
     """
-    _before["limit"] = resource.getrlimit(resource.RLIMIT_NOFILE)
     _before.update({name: getattr(module, name) for name, module in PLACES.items()})
-    if fault == "descriptors":
-        used = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
-        resource.setrlimit(resource.RLIMIT_NOFILE, (used - 2, _before["limit"][1]))
-        return
     if place == "set":
         fault = "disk"
     real, calls = _before[place], itertools.count()
@@ -74,6 +60,5 @@ def inject(fault, place, at):
 def clear():
     """Mend the machine."""
     if _before:
-        resource.setrlimit(resource.RLIMIT_NOFILE, _before.pop("limit"))
         for name, module in PLACES.items():
             setattr(module, name, _before.pop(name))

@@ -15,7 +15,6 @@ from sweep.model import marker as tag_families
 from sweep.model.marker import (
     STAG_LIBRARIES,
     TAG_FAMILIES,
-    edges,
     marker_count,
     module_count,
     modules,
@@ -143,13 +142,6 @@ def test_stag_image_is_that_of_many_samples():
     sampled = level.reshape(120, samples, 120, samples).mean(axis=(1, 3))
     drawn = drawn[top : top + 120, left : left + 120]
     assert np.abs(drawn - sampled).max() < 255 / samples / 2
-
-
-def test_margins_of_families_with_data_outside():
-    pytest.importorskip("pyapriltags")
-    with_zone, without = edges("tagStandard41h12", 5, 3.0), edges("tagStandard41h12", 5, 2.0)
-    assert (with_zone.ends.min(), with_zone.ends.max()) == (-3, 8)
-    assert (without.ends.min(), without.ends.max()) == (-2, 7)
 
 
 @pytest.mark.parametrize("renderer", ["supersample-16", "warp"])

@@ -197,18 +197,3 @@ def test_wrong_ids_are_told():
     assert line.startswith("IDs are wrong in 32 of 32 scenes, always +1: ")
     (line,) = faults_of(lambda c: c, ids=lambda number: number if number % 4 else 700)
     assert line.startswith("IDs are wrong in 8 of 32 scenes: 700 for marker 8")
-
-
-def test_nothing_found_has_no_conventions():
-    assert conventions([[]] * 32, np.arange(32), truth()) is None
-
-
-def test_of_several_markers_the_one_with_the_right_id_counts():
-    corners, marker_id = truth(), np.arange(32)
-    found = [
-        [(99, quad + 1), (int(number), quad)]
-        for number, quad in zip(marker_id, corners, strict=True)
-    ]
-    result = conventions(found, marker_id, corners)
-    assert not result.ids
-    assert np.abs(result.offset_px).max() < 1e-9

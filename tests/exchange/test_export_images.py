@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from unittest import mock
 
 import cv2
 import numpy as np
@@ -174,15 +173,6 @@ def files_of(folder):
     }
 
 
-def test_several_processes_write_the_same_files(exported, pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr(exporting, "BATCH", 5)
-    pool = mock.MagicMock()
-    pool.return_value.__enter__.return_value.map = map
-    monkeypatch.setattr(exporting, "ProcessPoolExecutor", pool)
-    assert export(pipeline, tmp_path / "shared", workers=2).written == 18
-    assert files_of(tmp_path / "shared") == files_of(exported[0])
-
-
 def test_folders_of_others_are_refused_in_a_line(exported, pipeline, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     other = Pipeline.from_text(pipeline.text.replace("seed = 5", "seed = 6"), name="exported")
@@ -219,7 +209,7 @@ def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
                         "cornerRefinementMethod=none"])
     among = larger.experiment.image_keys(larger.experiment.all_scenes.indices(np.arange(36)))
     assert set(among.tolist()) & set(keys.tolist()) == set(keys[[3, 4, 5, 12, 13, 14]].tolist())
-    for other in ("seed=6", "noise_grey=3", "size_m=0.06", "background=100", "fx_px=151"):
+    for other in ("seed=6", "noise_grey=3", "size_m=0.06"):
         changed = Pipeline.from_text(pipeline.text, [other])
         among = changed.experiment.image_keys(changed.experiment.all_scenes.indices(np.arange(18)))
         assert not set(among.tolist()) & set(keys.tolist()), other

@@ -90,15 +90,10 @@ def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp
     dataset = sweep.run(pipeline, store=tmp_path / "labelled.zarr")
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
         assert opened.identical(dataset)
-    assert list(dataset.detection.dims) == [
-        "dictionary", "distance_m", "cornerRefinementMethod", "tilt_deg", "trial",
-    ]
     assert dataset.true_tvec_m.dims == ("dictionary", "distance_m", "tilt_deg", "trial", "xyz")
     assert dataset.distance_m.attrs["units"] == "m"
     assert dataset.detection.attrs["flag_meanings"].split()[:2] == ["not_run", "detected"]
     assert dataset.corner.to_numpy().tolist()[0] == "top_left"
-    found = dataset.sel(solver="ippe_square", cornerRefinementMethod="subpix")
-    assert float((found.detection == 1).mean()) > 0.85
     with xr.open_zarr(tmp_path / "labelled.zarr", group="cost") as cost:
         assert cost.estimation_s.dims == ("block", "cornerRefinementMethod", "solver")
         assert float(cost.detection_s.sum()) > 0

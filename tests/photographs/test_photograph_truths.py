@@ -242,13 +242,3 @@ def test_a_photograph_of_another_board_is_named(faulty, tmp_path):
     with pytest.raises(ArgumentError, match=r"other.png: less than 60 % of the markers") as caught:
         prepare([shots], faulty / "camera.json", board=faulty / "board.toml", home=tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_images_of_two_cameras_side_by_side_get_a_hint(faulty, tmp_path):
-    for number, pose in enumerate(POSES[:2]):
-        halves = [image(pose, number), image(pose, number + 5)]
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.hstack(halves))
-    path = tmp_path / "both.json"
-    path.write_text(camera((720, 270), (420.0, 420.0, 360.0, 132.0)))
-    with pytest.raises(ArgumentError, match=r"in both halves .* .--stereo FILE"):
-        prepare([tmp_path], path, board=faulty / "board.toml", home=tmp_path)

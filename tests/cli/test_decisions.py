@@ -1,0 +1,265 @@
+"""`sweep require` and `sweep size`: lines and exit statuses; bounds that no pose has."""
+
+import json
+
+import pytest
+
+from support.stores import by_hand
+from sweep import Pipeline, cli
+from sweep.cli import main
+from sweep.evaluation.block import bound_notes
+from sweep.execution.status import close
+from sweep.report.report_data import read_report_data
+from sweep.store.lifecycle import create_store
+
+TEXT = """
+seed = 5
+[pose]
+jitter_px = 0.5
+[require]
+all = ["detection >= 0.8"]
+per = ["side_px"]
+[axes]
+side_px = [11, 40]
+solver = ["ippe_square", "iterative"]
+trial = 60
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("require")
+    pipeline = Pipeline.from_text(TEXT, name="two")
+    create_store(str(folder / "begun.zarr"), pipeline, (2, 60))
+    close(by_hand(str(folder / "two.zarr"), pipeline))
+    bare = TEXT.partition("[require]")[0] + "[axes]" + TEXT.partition("[axes]")[2]
+    close(by_hand(str(folder / "bare.zarr"), Pipeline.from_text(bare)))
+    close(by_hand(str(folder / "drawn.zarr"), Pipeline.from_text(
+        "[pose]\ndistance_m = { uniform = [0.1, 0.3] }\n[axes]\ntrial = 2\n")))
+    close(by_hand(str(folder / "once.zarr"), Pipeline.from_text("[pose]\nside_px = 40\n")))
+    (folder / "other.toml").write_text(TEXT.replace("0.8", "0.01"))
+    return folder
+
+
+@pytest.fixture
+def require(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+
+    def run(*arguments):
+        code = cli.main(["require", *arguments])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_what_the_pipeline_requires_is_decided(require):
+    code, out, err = require("two.zarr")
+    assert (code, err) == (1, "")
+    first, second = (line.split() for line in out.splitlines() if line.startswith("not met"))
+    assert " ".join(first).startswith(
+        "not met detection_rate >= 0.8 solver=ippe_square 0.167 (0.0829")
+    assert " ".join(first).endswith("side_px=11 1 of 2 60")
+    assert "solver=iterative" in second
+    assert out.splitlines()[-1] == "next: sweep report two.zarr"
+
+
+@pytest.mark.parametrize(("arguments", "status"), [
+    (["detection >= 0.55"], 3), (["detection >= 0.3"], 0), (["detection >= 0.8"], 1),
+    (["detection >= 0.8", "--at", "side_px=40"], 0),
+    (["detection >= 0.995", "--at", "side_px=40"], 3),
+    (["detection >= 0.3", "rotation_p95_deg <= 0.0001", "--per", "side_px"], 1),
+    (["--pipeline", "other.toml", "--at", "side_px=40"], 0),
+])
+def test_the_status_is_that_of_the_decision(arguments, status, require):
+    code, out, err = require("two.zarr", *arguments, *(
+        [] if "--per" in arguments or "--pipeline" in arguments else ["--per", ""]))
+    assert (code, err) == (status, ""), out
+    if status == 3:
+        assert "draws, about" in out
+
+
+def test_json_is_one_object(require):
+    code, out, err = require("two.zarr", "rotation_p95_deg <= 3", "--json")
+    found = json.loads(out)
+    assert (code, err) == (1, "")
+    assert found["decision"] == "not_met"
+    worst = found["requirements"][0]
+    assert (worst["value"], worst["value_flag"]) == (None, "infinite")
+    assert worst["condition"] == {"side_px": 11.0}
+    told = json.loads(require("two.zarr", "rotation_p95_deg <= 0.001", "--per", "side_px",
+                              "--at", "solver=iterative", "--json")[1])["requirements"]
+    assert [len(each["failing"]) for each in told] == [2]
+    assert told[0]["failing"][0]["condition"] == {"side_px": 11.0}
+    assert {row["decision"] for row in told[0]["failing"]} == {"not_met"}
+
+
+def test_a_store_is_worse_than_another_and_not_than_itself(folder, require):
+    noisy = Pipeline.from_text(TEXT, ["noise_grey=8", "blur_px=1.5"])
+    close(by_hand(str(folder / "noisy.zarr"), noisy))
+    for name, requirement, status, words in (
+        ("noisy", "rotation_rmse_unflipped_deg <= 90", 1,
+         "worse      mean absolute rotation error"),
+        ("two", "detection >= 0.01", 0, "not worse  detection_rate"),
+    ):
+        code, out, _ = require(f"{name}.zarr", requirement, "--per", "", "--at", "side_px=40",
+                               "--against", "two.zarr")
+        assert code == status
+        assert any(line.startswith(words) for line in out.splitlines()), out
+
+
+@pytest.mark.parametrize(("arguments", "line"), [
+    (["begun.zarr"], "begun.zarr: unfinished: 0 of "),
+    (["none.zarr"], "none.zarr: "),
+    (["two.zarr", "detection"], "REQUIREMENT detection: expected NAME >= NUMBER"),
+    (["two.zarr", "detection >= 99 %"], "write 0.99"),
+    (["two.zarr", "nees <= 7"], "nees_mean: no pose of this store has such a number"),
+    (["drawn.zarr", "detection >= 0.5", "--per", "distance_m"], "is drawn in this store"),
+    (["two.zarr", "--per", "trial"], "intervals are over the draws"),
+    (["two.zarr", "--at", "side=40"], "--at side=40: unknown parameter; did you mean side_px?"),
+    (["two.zarr", "--at", "side_px=41"], "no such value; there are 11.0, 40.0"),
+    (["once.zarr", "detection >= 0.5"], "a single draw of each pose"),
+    (["once.zarr"], "has no section [require]"),
+    (["two.zarr", "--against", "once.zarr"], "not the same scenes"),
+])
+def test_a_mistake_is_told_in_a_line(arguments, line, require):
+    code, out, err = require(*arguments)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert line in err
+
+
+FILE = """
+pose.jitter_px = 0.5
+[axes]
+side_px = [4, 30, 60]
+tilt_deg = [0, 40]
+solver = ["ippe", "iterative"]
+[require]
+all = ["detection >= 0.5"{more}]
+[search]
+{choose}
+max_trials = {trials}
+"""
+
+
+def size(arguments, capsys):
+    status = main(["size", *map(str, arguments)])
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+def written(tmp_path, choose='smallest = "side_px"', more="", trials=100):
+    path = tmp_path / "marker.toml"
+    path.write_text(FILE.format(choose=choose, more=more, trials=trials))
+    return path
+
+
+@pytest.fixture
+def found(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path)
+    return size(["marker.toml", "--seconds", "0.2", "--json"], capsys)
+
+
+def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(found, capsys):
+    status, out, _ = found
+    answer = json.loads(out)
+    assert (status, answer["decision"], answer["answer"]["side_px"]) == (0, "met", 30.0)
+    assert answer["alternatives"][0]["next"] == 4.0
+    assert answer["alternatives"][0]["next_cause"]["value"] == 0.0
+    assert answer["poses"] <= answer["grid_poses"] <= 600
+    status, out, _ = size(["runs/marker.zarr", "--seconds", "0.2", "--markdown"], capsys)
+    assert status == 0
+    assert out.startswith("side\\_px=30, solver=")
+    assert "| solver | side\\_px | next | ms a frame | why not better |" in out
+    status, out, _ = size(["marker.toml", "--seconds", "0.2"], capsys)
+    assert "detection_rate >= 0.5 is not met: 0 (" in out
+    assert out.splitlines()[-1].startswith("next: sweep report runs/marker.zarr")
+
+
+def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, more=', "rotation_p95_deg <= 1e-6"')
+    status, out, _ = size([path, "--seconds", "0.2"], capsys)
+    assert status == 1
+    assert "nearest is side_px=60" in out
+    assert "rotation_p95_deg <= 1e-06 is not met" in out
+
+
+def test_a_pipeline_without_a_choice_is_told_what_to_write(tmp_path, capsys):
+    path = tmp_path / "plain.toml"
+    path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = 5\n")
+    status, _, err = size([path], capsys)
+    assert (status, err.count("\n")) == (2, 1)
+    assert 'expected what is chosen: [search] smallest = "size_m", max_trials = 5000' in err
+
+
+@pytest.mark.parametrize(("choose", "more", "line"), [
+    ('smallest = "solver"', "", "search.smallest"),
+    ('smallest = "side_px"', ', "budget_ms >= 2"', "expected milliseconds of a frame"),
+    ('smallest = "side_px"', ', "detection <= 0.2"', "no result can be both"),
+    ('smallest = "side_px"', ', "solved >= 0.999"', "search.max_trials = 100: expected at least"),
+    ("", "", "expected one of along, smallest"),
+])
+def test_what_cannot_be_searched_is_a_line_before_anything_runs(
+    choose, more, line, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = size([written(tmp_path, choose, more)], capsys)
+    assert status == 2
+    assert line in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("command", ["size", "limit"])
+def test_a_file_that_cannot_be_read_is_told_before_more_is_asked_for(
+    command, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, "missing.toml"]) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert line.startswith("missing.toml: cannot be read: No such file")
+
+
+BOUND = """
+[scene]
+noise_grey = 2
+bound = "known_blur"
+[pose]
+jitter_px = 0.5
+[axes]
+side_px = [8, 40]
+tilt_deg = [0, 89.9]
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe", "sqpnp", "iterative"]
+trial = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def bounded(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("told") / "two.zarr")
+    close(by_hand(url, Pipeline.from_text(BOUND, name="two")))
+    return url
+
+
+def test_a_bound_that_no_pose_has_is_a_line_of_every_command_and_of_the_report(bounded, capsys):
+    wanted = "no pose has a bound: clipped"
+    for command in ("run", "status", "plan"):
+        assert cli.main([command, bounded]) == 0
+        assert wanted in capsys.readouterr().out
+    assert any(wanted in line for line in read_report_data(bounded).warnings)
+
+
+@pytest.mark.parametrize(("settings", "reasons"), [
+    (["black=[0, 30]", "white=220", "background=200"], []), (["bound=none"], []),
+    (["black=30", "white={ uniform = [254, 255] }"], ["clipped"]),
+    (["noise_grey=[0.1, 4]"], ["no_noise", "clipped"]),
+    (["gain=2", "black=30", "white=220"], ["clipped"]), (["vignetting=0.3"], ["not_in_model"]),
+    (["bound=['none', 'known_blur']"], ["clipped"]),
+])
+def test_why_no_pose_has_a_bound_is_told(settings, reasons):
+    line = "".join(bound_notes(Pipeline.from_text(BOUND, settings)))
+    assert [name for name in ("no_noise", "clipped", "not_in_model") if f"{name}: " in line] == (
+        reasons)

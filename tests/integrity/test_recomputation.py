@@ -1,0 +1,291 @@
+"""Scenes computed again: repro, tolerances, and plug-ins whose answers change."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from scipy.spatial.transform import Rotation
+
+from support.here import Here
+from support.stores import by_hand
+from sweep import cli
+from sweep.cli import main
+from sweep.evaluation.results import Failure
+from sweep.execution.runner import execute
+from sweep.execution.status import close
+from sweep.experiment.grid import Block
+from sweep.experiment.pipeline import Pipeline
+from sweep.integrity.recomputation import compare
+from sweep.integrity.repair import repair
+from sweep.integrity.verification import verify
+from sweep.store.outcome import MAX_CHARACTERS, recorded
+
+TEXT = """
+title = "Scenes to be seen again"
+seed = 11
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+[scene]
+background = 128
+[axes]
+distance_m = [0.2, 0.4]
+cornerRefinementMethod = ["none", "subpix"]
+distortion = [[], [0.1, 0, 0, 0]]
+solver = ["ippe_square", "iterative"]
+trial = 3
+"""
+
+EXTENTS = (1, 1, 3)
+"""Block k has the scenes 3 k to 3 k + 2."""
+
+NEAR = "distance_m=0.2,distortion=[],cornerRefinementMethod=subpix,solver=iterative,trial=1"
+"""The scene 1, in which the marker is found."""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("seen") / "seen.zarr")
+    close(by_hand(url, Pipeline.from_text(TEXT, name="seen"), EXTENTS))
+    return Path(url)
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "copied.zarr"))
+
+
+def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, capsys):
+    out, pipeline = tmp_path / "scene.png", tmp_path / "seen.toml"
+    pipeline.write_text(TEXT)
+    assert main(["repro", str(finished), "--at", NEAR, "-o", str(out), "--plain"]) == 0
+    told = capsys.readouterr().out
+    assert "agrees with the store bit for bit" in told
+    assert str(out) in told
+    with xr.open_zarr(finished) as store:
+        cell = store.isel(distance_m=0, distortion=0, trial=1).sel(
+            cornerRefinementMethod="subpix", solver="iterative"
+        ).load()
+    lines = {line.split()[0]: line.split()[1:] for line in told.splitlines() if line.split()}
+    for name in ("rotation_error_deg", "reprojection_error_px", "marker_area_px"):
+        assert float(lines[name][0]) == pytest.approx(float(cell[name]), rel=1e-5), name
+    depth = float(cell["true_tvec_m"].sel(xyz="z"))
+    assert float(lines["true_tvec_m"][2]) == pytest.approx(depth, rel=1e-5)
+    assert re.search(r"^ *detection +detected *$", told, re.MULTILINE)
+    shown = tmp_path / "shown.png"
+    assert main(["show", str(pipeline), "--at", NEAR, "-o", str(shown), "--plain"]) == 0
+    image = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
+    assert image.ndim == 2
+    assert image.std() > 10
+    np.testing.assert_array_equal(image, cv2.imread(str(shown), cv2.IMREAD_UNCHANGED))
+
+
+def test_number_that_was_changed_is_named(copied, tmp_path, capsys):
+    array = zarr.open_array(f"{copied}/normal_error_deg", mode="r+")
+    assert array.shape == (2, 2, 2, 2, 3)
+    array[0, 1, 0, 1, 1] = np.nextafter(array[0, 1, 0, 1, 1], np.float32(1e9))
+    out = tmp_path / "drawn.png"
+    assert main(["repro", str(copied), "--at", NEAR, "-o", str(out)]) == 1
+    told = capsys.readouterr().out
+    assert re.search(r"^differs from the store: .*normal_error_deg", told, re.MULTILINE)
+    drawn = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
+    assert drawn.ndim == 3  # what was found is drawn on it, in colour
+
+
+def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback():
+    text = "first" + "x" * 10 * MAX_CHARACTERS + "last"
+    failures = [Failure(k, "scene", text, crashed=bool(k % 2)) for k in range(1000)]
+    rows = list(range(5000, 6000))
+    pipeline = Pipeline.from_text("[pose]\nside_px = 40\njitter_px = 1\n[axes]\ntrial = 6000")
+    block = Block((0,), (6000,))
+    kept = recorded(pipeline, block, failures, rows, {"failed": 1000, "crashed": 7})
+    assert len([one for one in kept if one.kind == "crashed"]) == 7
+    failed = [one for one in kept if one.kind == "failed"]
+    assert 0 < len(failed) <= 100
+    assert [one.at for one in failed] == [f"trial={5000 + 2 * k}" for k in range(len(failed))]
+    assert all(one.text.endswith("last") and len(one.text) <= 4000 for one in kept)
+    assert recorded(pipeline, block, failures, rows, {"failed": 0, "crashed": 0}) == ()
+
+
+TURN = Rotation.from_rotvec([0.3, -0.2, 0.1])
+
+
+def scene():
+    """Return the values of one scene under two estimators."""
+    return {
+        "true_rvec": np.array([3.0, 0.1, 0.2]),
+        "true_tvec_m": np.array([0.0, 0.3, 0.4]),
+        "marker_area_px": np.array(900.0),
+        "bound": np.array(1, dtype="u1"),
+        "bound_std": np.full(6, 1e-3, dtype="f4"),
+        "mirror_distance": np.array(np.nan, dtype="f4"),
+        "detection": np.array(1, dtype="u1"),
+        "corner_error_px": np.full((4, 2), 0.1, dtype="f4"),
+        "estimate": np.array([1, 3], dtype="u1"),
+        "translation_error_m": np.array([[1e-3, 0, 2e-3], [np.nan] * 3], dtype="f4"),
+        "rotation_error_rad": np.array([TURN.as_rotvec(), [np.nan] * 3], dtype="f4"),
+        "rotation_error_deg": np.array([21.4, np.nan], dtype="f4"),
+        "reprojection_error_px": np.array([0.2, np.nan], dtype="f4"),
+        "nees": np.array([5.0, np.nan], dtype="f4"),
+    }
+
+
+def found(name, change, *, same_processor=False):
+    """Return what differs where a variable is changed, to an array or by a number."""
+    values = scene()
+    changed = change(values[name]) if callable(change) else values[name] + change
+    values[name] = changed.astype(values[name].dtype)
+    return compare(values, scene(), same_processor=same_processor)
+
+
+def turned(angle_rad):
+    """Return the change by which the first estimate is turned further."""
+    def change(vectors):
+        further = TURN * Rotation.from_rotvec([0, angle_rad, 0])
+        return np.array([further.as_rotvec(), vectors[1]])
+
+    return change
+
+
+@pytest.mark.parametrize("name", scene())
+def test_every_bit_counts_on_the_same_processor(name):
+    values, stored = scene(), scene()
+    assert compare(values, stored, same_processor=True) == ""
+    flat = values[name].reshape(-1)
+    flat[0] = np.nextafter(flat[0], 9, dtype=flat.dtype) if flat.dtype.kind == "f" else 7
+    if np.isnan(flat[0]):
+        flat[0] = 0
+    assert compare(values, stored, same_processor=True).startswith(f"{name} ")
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "beyond"),
+    [
+        ("corner_error_px", 0.009, 0.011), ("reprojection_error_px", -0.009, 0.011),
+        # 1e-4 rad in degrees.
+        ("rotation_error_deg", 0.0055, -0.006),
+        # 1e-4 of 0.5 m, as the length of the difference.
+        ("translation_error_m", [2.5e-5, 3e-5, 2.5e-5], [3.5e-5, 3.5e-5, 3.5e-5]),
+        ("rotation_error_rad", turned(0.9e-4), turned(1.1e-4)),
+        ("detection", 0, 1), ("estimate", 0, [0, 1]),
+        # Of the truth each component, relative to the vector's length.
+        ("true_rvec", 2.9e-12, 3.3e-12), ("true_tvec_m", 0.4e-12, 0.6e-12),
+        ("marker_area_px", 8e-10, 10e-10), ("bound_std", 0.9e-9, 1.5e-9), ("bound", 0, 1),
+        # What one of the two alone has is a difference.
+        ("mirror_distance", 0, np.ones_like), ("reprojection_error_px", 0, np.ones_like),
+    ],
+)
+def test_scenes_of_another_processor_lie_within_their_tolerance(name, within, beyond):
+    assert found(name, within) == ""
+    assert found(name, beyond).startswith(f"{name} ")
+
+
+def test_variables_without_a_tolerance_are_compared_on_the_same_processor_alone():
+    assert found("nees", 1.0) == ""
+    assert found("nees", 1.0, same_processor=True).startswith("nees ")
+
+
+PLUGINS = """
+import itertools
+import cv2
+import numpy as np
+
+COUNT = itertools.count()
+SQUARE = 0.005 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+
+
+def shifted(shift):
+    def solve(detections):
+        rotations, translations = [], []
+        for row, corners in enumerate(detections.corners):
+            camera = detections.cameras.matrix(row)
+            _, rvec, tvec = cv2.solvePnP(
+                SQUARE, corners, camera, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+            rotations.append(cv2.Rodrigues(rvec)[0])
+            translations.append(tvec.ravel())
+        return np.array(rotations), np.array(translations) + shift()
+    return lambda settings: solve
+
+
+right = shifted(lambda: 0)
+counting = shifted(lambda: 1e-6 * next(COUNT))
+
+
+def search(settings, family):
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
+    inner = cv2.aruco.ArucoDetector(dictionary)
+    def find(image):
+        corners, ids, _ = inner.detectMarkers(image)
+        if ids is None:
+            return [], []
+        return np.concatenate(corners) + 1e-6 * next(COUNT), ids.ravel()
+    return find
+"""
+
+CHANGING = """
+[pose]
+side_px = {{ uniform = [40, 60] }}
+tilt_deg = 30
+azimuth_deg = 40
+[detector]
+detector = "{detector}"
+[axes]
+solver = {solvers}
+trial = 12
+"""
+
+
+@pytest.fixture
+def made(tmp_path):
+    def run(detector="opencv", *solvers):
+        (tmp_path / "mine.py").write_text(PLUGINS)
+        text = CHANGING.format(
+            detector=detector, solvers=json.dumps(list(solvers) or ["ippe_square"]))
+        (tmp_path / "grid.toml").write_text(text)
+        store = tmp_path / "grid.zarr"
+        execute(Pipeline.from_toml(tmp_path / "grid.toml"), store, workers=None)
+        return str(store)
+    with mock.patch("sweep.isolation.crash_isolation.Child", Here):
+        yield run
+
+
+@pytest.mark.parametrize(("detector", "solvers", "named"), [
+    ("opencv", ["mine:counting", "mine:right"], "mine:counting"),
+    ("mine:search", ["mine:right"], "mine:search"),
+])
+def test_what_changes_from_call_to_call_is_named_and_no_block_is_damaged(
+    detector, solvers, named, made, capsys
+):
+    store = made(detector, *solvers)
+    for report in (repair(store), verify(store)):  # they do not alternate
+        (finding,) = report.damage
+        assert finding.where == report.unstable == named
+        assert finding.what.startswith(f"not deterministic: {named}: ")
+        assert report.repaired == []
+    assert cli.main(["verify", store]) == 1
+    out = capsys.readouterr().out
+    assert f"not deterministic: {named}" in out
+    assert "damaged" not in out
+
+
+def test_a_changed_number_of_a_plug_in_that_is_deterministic_is_damage(made, monkeypatch):
+    store = made("opencv", "mine:right")
+    assert verify(store).damage == []
+    solve = cv2.solvePnP
+
+    def other(*arguments, **options):
+        done, rvec, tvec = solve(*arguments, **options)
+        return done, rvec, tvec * np.float64(1.001)
+
+    monkeypatch.setattr(cv2, "solvePnP", other)
+    report = verify(store)
+    assert report.damage
+    assert report.unstable == ""

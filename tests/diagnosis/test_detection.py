@@ -77,15 +77,12 @@ def test_a_factor_from_photographs_widens_the_covariance_to_their_errors():
         error_model(simulated, seen.isel(trial=slice(40)))
 
 
-def test_outside_what_was_simulated_nothing_is_known(model):
+def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
     frontal = [np.pi, 0.0, 0.0]
     found = model.at([frontal] * 3, [[0, 0, 2.0], [0, 0, 9.0], [3.0, 0, 2.0]], 0.1)
     assert found["known"].values.tolist() == [True, False, False]
     assert np.isnan(found["covariance"].values[1:]).all()
     assert np.isnan(found["flip_probability"].values[1:]).all()
-
-
-def test_model_is_the_same_from_its_json(model):
     other = DetectionModel.from_json(model.to_json())
     pose = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3)
     assert model.at(*pose).equals(other.at(*pose))

@@ -168,16 +168,15 @@ def test_causes_are_found_and_none_is_invented():
 
 
 @pytest.mark.evidence
-def test_thousand_observations():
+@pytest.mark.parametrize(("pairs", "count", "hits", "limits"), [
+    (False, 1000, "one cause", {"first": ("told", 0.95), "named": ("open", 0.95)}),
+    (True, 300, "two causes", {"first": ("told", 0.8)})], ids=["one", "two"])
+def test_a_thousand_observations(pairs, count, hits, limits, claim):
     """A rate at its limit fails by chance in 2.5 % (the upper end of Clopper and Pearson)."""
-    single = table([judged(seed) for seed in range(1000)])
-    double = table([judged(seed, pairs=True) for seed in range(1000, 1300)])
-    print("one cause or none:", single)
-    print("two causes:", double)
-    for counts, hits, of, limit in (
-            (single, "first", "told", 0.95), (single, "named", "open", 0.95),
-            (double, "first", "told", 0.8)):
-        low, high = clopper_pearson(counts[hits], counts[of])
-        print(hits, of, low, high)
-        assert high >= limit
-    assert single["alarms"] <= 0.05 * single["sound"]
+    counts = table([judged(1000 * pairs + seed, pairs=pairs) for seed in range(count)])
+    print(counts)
+    for found, (of, limit) in limits.items():
+        claim(f"{hits}: {found} of those that are {of}", "simulated observations",
+              100 * counts[found] / counts[of], "%")
+        assert clopper_pearson(counts[found], counts[of])[1] >= limit
+    assert counts["alarms"] <= 0.05 * counts["sound"]

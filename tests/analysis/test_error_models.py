@@ -21,7 +21,7 @@ from support.stores import by_hand
 from sweep.analysis import error_models, model_covariance, model_errors
 from sweep.analysis.error_models import Use, focal_size_of
 from sweep.analysis.poses import in_sight_frame, sight_rotation, viewing_angle_of
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import DatasetError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report.error_model_file import error_model_text

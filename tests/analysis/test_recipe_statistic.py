@@ -9,7 +9,7 @@ import pytest
 from support.small_datasets import mixed
 from sweep.analysis import error_statistics, estimator
 from sweep.analysis import summaries as registry
-from sweep.analysis.estimator import Output, PositiveMean, Quantiles
+from sweep.analysis.estimator import PositiveMean
 from sweep.analysis.summaries import ErrorStatistic
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus
@@ -27,31 +27,10 @@ MEAN_ABSOLUTE_ERROR = ErrorStatistic(
         lambda poses: quantity.norm(poses)[..., None], lambda poses: poses.solved))
 
 
-# A statistic of its own, of the column of a class that exists: the mean of the errors up to their
-# median.
-class TrimmedMean(Quantiles):
-    def outputs(self):
-        return [Output(self.name, self.meaning, self.units)]
-
-    def variables(self, columns, _design):
-        errors, used = self.column(columns)
-        halves = -(-used.sum(axis=(1, 2)) // 2)
-        ascending = np.sort(errors.reshape(len(errors), -1), axis=1)  # those not used are last
-        return {self.name: np.array([
-            some[:half].mean(dtype=float) for some, half in zip(ascending, halves, strict=True)])}
-
-
-TRIMMED_MEAN = ErrorStatistic(
-    {"trimmed": "mean of the smaller half of the errors"},
-    lambda quantity: TrimmedMean(
-        quantity.named("trimmed"), f"mean of the smaller half of the absolute {quantity.words}",
-        quantity.units, quantity.norm, lambda poses: poses.solved, lambda poses: poses.solved))
-
-
 @pytest.fixture(autouse=True)
 def _added(monkeypatch):
-    monkeypatch.setattr(registry, "ERROR_STATISTICS", (
-        *registry.ERROR_STATISTICS, MEAN_ABSOLUTE_ERROR, TRIMMED_MEAN))
+    monkeypatch.setattr(
+        registry, "ERROR_STATISTICS", (*registry.ERROR_STATISTICS, MEAN_ABSOLUTE_ERROR))
 
 
 def errors_of_solved(solver):
@@ -70,9 +49,6 @@ def test_an_added_statistic_is_that_of_plain_numpy():
         here = table.isel(solver=solver)
         assert here["rotation_mae_deg"] == pytest.approx(errors.mean(), rel=1e-12)
         assert here["rotation_mae_deg_low"] < errors.mean() < here["rotation_mae_deg_high"]
-        # Values are rounded to single precision.
-        half = errors[:-(-len(errors) // 2)].mean()
-        assert here["rotation_trimmed_deg"] == pytest.approx(half, rel=6e-8)
 
 
 def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
@@ -81,8 +57,7 @@ def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
         assert table[name].attrs["units"] == unit
         assert "mean absolute" in table[name].attrs["description"]
     assert ["*_mae_*", "error: mean absolute error of the solved"] in TABLES["statistics"]().rows
-    rows = errors_table(table, "").rows
-    assert "mean of the smaller half of the errors" in [row[0] for row in rows]
+    assert "mean absolute error of the solved" in [row[0] for row in errors_table(table, "").rows]
 
 
 def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(monkeypatch):

@@ -178,19 +178,6 @@ def test_resampled_quantiles_are_scipys():
         values, 0.9, method="inverted_cdf")
 
 
-def test_intervals_of_independent_values_are_clopper_and_pearsons_order_statistics():
-    rng = np.random.default_rng(10)
-    values = rng.normal(size=400)
-    low, high = interval(values[:, None], np.ones((400, 1), bool), 90)[1:]
-    # 400 photographs of one marker each: Student's quantile in the place of the normal one.
-    draws = 400 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 399)) ** 2 * 399 / 400
-    shares = (stats.beta.ppf(0.025, 0.9 * draws, 0.1 * draws + 1),
-              stats.beta.ppf(0.975, 0.9 * draws + 1, 0.1 * draws))
-    ascending = np.sort(values)
-    assert low == ascending[int(np.ceil(shares[0] * 400)) - 1]
-    assert high == ascending[int(np.floor(shares[1] * 400))]
-
-
 @pytest.mark.evidence
 @pytest.mark.parametrize(("photographs", "share", "correlation"), [
     (13, 0.5, 0.5), (13, 0.9, 0.1), (22, 0.9, 0.5)])

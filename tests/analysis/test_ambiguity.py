@@ -4,46 +4,32 @@ import math
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy import stats
 
+from support.small_datasets import perfect
 from sweep.analysis import ambiguity
 from sweep.analysis.ambiguities import THRESHOLDS, ThresholdChoice
 from sweep.errors import ArgumentError
-from sweep.experiment.schema import XYZ
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 
 def poses_of(ratio, flipped, solved=None, axes=("tilt_deg", "trial", "solver")):
     """Return results whose arrays (len(axes) dimensions) are these, of estimates at 1 m."""
     ratio = np.asarray(ratio, dtype=np.float64)
-    solved = np.ones(ratio.shape, dtype=bool) if solved is None else solved
-    scene = [name for name in axes if name != "solver"]
-    counts = [size for name, size in zip(axes, ratio.shape, strict=True) if name != "solver"]
-    seen = solved.any(axis=axes.index("solver")) if "solver" in axes else solved
-    vector = np.zeros((*ratio.shape, 3))
+    results = perfect(np.random.default_rng(1), dict(zip(axes, ratio.shape, strict=True)))
     with np.errstate(divide="ignore", invalid="ignore"):
         # A ratio of 1 is drawn as both 0, an infinite one as an alternative of 0.
-        error = np.where(ratio == 1, 0.0, 0.25)
         other = np.where(ratio == 1, 0.0, 0.25 / ratio)
-    return xr.Dataset(
-        {
-            "true_tvec_m": ((*scene, "xyz"), np.ones((*counts, 3))),
-            "detection": (scene, np.where(
-                seen, DetectionStatus.detected, DetectionStatus.no_candidate).astype("u1")),
-            "estimate": (axes, np.where(
-                solved, EstimateStatus.solved, EstimateStatus.solver_failed).astype("u1")),
-            "flipped": (axes, np.select(
-                [solved & flipped, solved], [Flipped.flipped, Flipped.not_flipped],
-                Flipped.no_estimate).astype("u1")),
-            "rotation_error_rad": ((*axes, "xyz"), vector),
-            "translation_error_m": ((*axes, "xyz"), vector),
-            "reprojection_error_px": (axes, error),
-            "alternative_reprojection_error_px": (axes, other),
-        },
-        {name: np.arange(size) for name, size in zip(axes, ratio.shape, strict=True)}
-        | {"xyz": list(XYZ)},
-    )
+    results = results.assign(
+        reprojection_error_px=(axes, np.where(ratio == 1, 0.0, 0.25)),
+        alternative_reprojection_error_px=(axes, other))
+    results["flipped"].values[flipped] = Flipped.flipped
+    if solved is not None:
+        results["estimate"].values[~solved] = EstimateStatus.solver_failed
+        results["flipped"].values[~solved] = Flipped.no_estimate
+    if solved is not None and not solved.any():
+        results["detection"].values[...] = DetectionStatus.no_candidate
+    return results
 
 
 RATIOS = [np.nan, 0.0, 0.125, 0.25, 0.5, 1.0, 1.5, np.inf]

@@ -306,41 +306,6 @@ def test_other_scenes_and_other_draws_are_not_compared():
 # Limit of detection.
 
 
-def expected_limit(sides, rates, wanted):
-    """Return limit flag, side and next smaller side of (side, rate) in any order."""
-    ladder = sorted(zip(sides, rates, strict=True), reverse=True)
-    good = list(itertools.takewhile(lambda step: step[1] >= wanted, ladder))
-    if not good:
-        return 2, math.inf, ladder[0][0]
-    if len(good) == len(ladder):
-        return 3, good[-1][0], math.nan
-    return 1, good[-1][0], ladder[len(good)][0]
-
-
-@pytest.mark.parametrize("per", [(), ("tilt_deg",), ("noise_grey", "tilt_deg")])
-def test_limits_are_those_of_the_pooled_rates(per):
-    rng = np.random.default_rng(14)
-    sizes = {"side_px": 5, "tilt_deg": 3, "noise_grey": 2, "marker_id": 2, "trial": 30}
-    chance = np.array([0.1, 0.4, 0.8, 0.95, 1.0]).reshape(5, 1, 1, 1, 1)
-    results = with_detected(perfect(rng, sizes), rng.random(tuple(sizes.values())) < chance)
-    results["detection"].values[rng.random(tuple(sizes.values())) < 0.1] = (
-        DetectionStatus.not_visible
-    )
-    rates = detection_rate(results, (*per, "side_px")).compute()
-    for rate_ in (0.5, 0.75, 0.9):
-        answer = detection_limit(results, rate_, per=per).compute()
-        assert tuple(answer["side_px"].dims) == per
-        for index in np.ndindex(*(sizes[name] for name in per)):
-            at = dict(zip(per, index, strict=True))
-            flag, side, below = expected_limit(
-                results["side_px"].values, rates["detection_rate"].isel(at).values, rate_)
-            here = answer.isel(at)
-            assert here["limit"] == flag
-            np.testing.assert_allclose(here["side_px"], side, rtol=1e-12)
-            if flag == 1:
-                assert here["side_px_below"] == below
-
-
 @pytest.mark.parametrize("settings", [2, 3])
 def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
     # Some of a draw's settings were not run: a draw is no whole number of poses.

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from support.comparisons import with_detected
+from support.small_datasets import perfect
 from sweep.analysis import compare, detection_rate, error_statistics, marker_ranking
 from sweep.errors import DatasetError
 from sweep.experiment.draws import sobol_uniform
@@ -30,29 +32,13 @@ def dataset(sims, trials=TRIALS, *, sobol=True, cells=1, dims=("sim", "trial")):
     z = 0.01 * (u - 0.3) + 0.02 * v + 0.01 * noise[1]
     found = chance < 1 / (1 + np.exp(-6 * (u + v - 0.6)))
     shape = (sims, trials) if cells == 1 else (cells, sims, trials)
-    rotation = np.zeros((*shape, 3))
-    rotation[..., 0] = np.radians(error.reshape(shape))
-    position = np.zeros((*shape, 3))
-    position[..., 2] = z.reshape(shape)
-    lost = ~found.reshape(shape)
-    rotation[lost], position[lost] = np.nan, np.nan
-    truth = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
-    vectors = (*dims, "xyz")
-    results = xr.Dataset(
-        {
-            "detection": (dims, np.where(lost, 4, 1).astype("u1")),
-            "estimate": (dims, np.where(lost, 2, 1).astype("u1")),
-            "flipped": (dims, np.where(lost, 3, 1).astype("u1")),
-            "rotation_error_rad": (vectors, rotation),
-            "translation_error_m": (vectors, position),
-            "true_tvec_m": (vectors, truth),
-        },
-        {"trial": np.arange(trials), "xyz": ["x", "y", "z"]},
-        {"sweep": {"fingerprint": {"seed": 1, **({"sampling": "sobol"} if sobol else {})}}},
-    )
-    return results.assign_coords({
-        name: np.arange(results.sizes[name], dtype=float) for name in dims if name != "trial"
-    })
+    rotation, position = np.zeros((2, *shape, 3))
+    rotation[..., 0], position[..., 2] = np.radians(error.reshape(shape)), z.reshape(shape)
+    results = perfect(np.random.default_rng(7), dict(zip(dims, shape, strict=True)),
+                      rotation=rotation, position=position)
+    results["true_tvec_m"].values[...] = [0.0, 0.0, 1.0]
+    return with_detected(results, found.reshape(shape)).assign_attrs(
+        sweep={"fingerprint": {"seed": 1, **({"sampling": "sobol"} if sobol else {})}})
 
 
 def true_values():
@@ -155,7 +141,7 @@ def test_parts_of_replicates_are_refused_and_whole_ones_are_not():
 
 def test_what_needs_independent_draws_says_so():
     results = dataset(1, 64, dims=("marker_id", "trial")).isel(marker_id=[0, 0])
-    results = results.assign_coords(marker_id=[0, 1])
+    results = results.assign_coords(marker_id=[3, 4])
     assert np.isnan(marker_ranking(results).p_value).all()
     other = dataset(1, 64, dims=("marker_id", "trial"), sobol=False)
     with pytest.raises(DatasetError, match="sampling sobol and independent"):

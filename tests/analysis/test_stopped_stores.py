@@ -5,6 +5,8 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from support.comparisons import with_detected
+from support.small_datasets import perfect
 from sweep.analysis import (
     ambiguity,
     compare,
@@ -37,30 +39,17 @@ axes = { side_px = [10, 20, 30], solver = ["ippe", "iterative"] }
 def full():
     """Return the store of all trials, with errors that grow with the side."""
     rng = np.random.default_rng(5)
-    shape = (3, TRIALS, 2)
     seen = rng.random((3, TRIALS)) < RATES[:, None]
-    solved = seen[..., None] & np.ones(2, bool)
-    error = rng.normal(size=(*shape, 3)) * 0.01 * np.array([1, 2, 3])[:, None, None, None]
-    error[~solved] = np.nan
-    flipped = rng.random(shape) < 0.1
-    dims = ("side_px", "trial", "solver")
-    return xr.Dataset(
-        {
-            "detection": (dims[:2], np.where(
-                seen, DetectionStatus.detected, DetectionStatus.no_candidate).astype(np.uint8)),
-            "estimate": (dims, np.where(
-                solved, EstimateStatus.solved, EstimateStatus.no_detection).astype(np.uint8)),
-            "flipped": (dims, np.where(~solved, Flipped.no_estimate, np.where(
-                flipped, Flipped.flipped, Flipped.not_flipped)).astype(np.uint8)),
-            "rotation_error_rad": ((*dims, "xyz"), error),
-            "translation_error_m": ((*dims, "xyz"), error),
-            "true_tvec_m": ((*dims[:2], "xyz"), np.ones((3, TRIALS, 3))),
-            "reprojection_error_px": (dims, np.where(solved, 0.1, np.nan)),
-            "alternative_reprojection_error_px": (dims, np.where(solved, 0.4, np.nan)),
-        },
-        {"side_px": [10, 20, 30], "trial": np.arange(TRIALS), "solver": ["ippe", "iterative"],
-         "xyz": ["x", "y", "z"]},
-    )
+    error = rng.normal(size=(3, TRIALS, 2, 3)) * 0.01 * np.array([1, 2, 3])[:, None, None, None]
+    results = with_detected(perfect(
+        rng, {"side_px": 3, "trial": TRIALS, "solver": 2}, rotation=error, position=error), seen)
+    results["true_tvec_m"].values[...] = 1.0
+    flips = (rng.random((3, TRIALS, 2)) < 0.1) & (results["flipped"] == Flipped.not_flipped)
+    results["flipped"] = results["flipped"].where(~flips, Flipped.flipped)
+    solved = results["estimate"] == EstimateStatus.solved
+    return results.assign(
+        reprojection_error_px=solved * 0.1, alternative_reprojection_error_px=solved * 0.4,
+    ).assign_coords(side_px=[10, 20, 30]).drop_attrs()
 
 
 @pytest.fixture(scope="module")

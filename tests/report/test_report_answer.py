@@ -37,19 +37,10 @@ side_px = [8, 40]
 cornerRefinementMethod = ["none", "subpix"]
 trial = 4
 """
-TARGETS = f"""{CAMERA}
-[pose]
-jitter_px = 0.5
-[scene]
-noise_grey = 2
-[axes]
-dictionary = ["DICT_4X4_50", "DICT_6X6_250"]
-side_px = [15, 20, 40]
-trial = 20
-"""
+
 STORES = {
     "tutorial": (TUTORIAL, ["distance_m=[1, 3, 5]", "tilt_deg=[30, 60]", "trial=12"]),
-    "targets": (TARGETS, []),
+
     "one pose": (f"{CAMERA}[pose]\nside_px = 40\n", []),
 }
 
@@ -104,10 +95,10 @@ def numbers_of(results):
 
 def configurations_of(results, name):
     """Return the configurations of a store, by label."""
-    axis = {"tutorial": "cornerRefinementMethod", "targets": "dictionary"}.get(name)
-    if axis is None:
+    if name != "tutorial":
         return {"as set": results}
-    return {str(value): results.sel({axis: value}) for value in results[axis].values}
+    return {value: results.sel(cornerRefinementMethod=value)
+            for value in results["cornerRefinementMethod"].values.tolist()}
 
 
 def value_of(cell):

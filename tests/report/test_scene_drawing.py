@@ -5,7 +5,6 @@ import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report import scenes as scene_drawing
 from sweep.report.scenes import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
 
 FRAME = {
@@ -44,22 +43,6 @@ def test_what_is_drawn_in_place_stays_in_place(at):
     else:
         assert scene.detection.name != "detected"
         assert share_of(picture, DETECTED, (0, 0, 1600, 1200)) == 0
-
-
-def test_the_caption_names_what_was_drawn_and_fits_its_picture(monkeypatch):
-    said = []
-    caption = scene_drawing._caption
-    monkeypatch.setattr(scene_drawing, "_caption", lambda *given: (
-        said.append(given), caption(*given))[1])
-    scene = inspected("side_px=60", whole_frame=False)
-    picture = draw_scene(scene, ", ".join(f"axis_{k} {k}" for k in range(30)))
-    (text, legend, width), = said
-    assert picture.shape[1] <= 1.1 * width
-    words = f"{text} {legend}"
-    assert f"drawn: azimuth_deg {float(scene.values['azimuth_deg']):.5g}" in words
-    for expected in ("axis_29 29", "true outline", "detected corners (dot: the first)",
-                     "estimated x", "detected, area", "rotation error"):
-        assert expected in words
 
 
 def test_a_cut_is_the_marker_with_its_surroundings_within_the_window():

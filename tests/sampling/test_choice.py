@@ -4,14 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
 
-import sweep
 from support.searches import DOCUMENT, changed, flags_of
 from support.small_datasets import perfect
 from sweep.analysis.decisions import answers, choice_cells
 from sweep.analysis.requirements import Decision, ErrorShares
-from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule, not_continued
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -133,23 +130,6 @@ def test_pipelines_are_read_again_from_their_text_and_others_are_told_apart():
     assert not_continued(rule, pipeline.stopping) == (
         "search.max_trials: the store has 400, this run 500")
     assert not not_continued(rule, rule)
-
-
-@pytest.mark.long
-def test_a_search_is_the_same_with_one_or_two_workers_and_other_blocks(tmp_path):
-    """The stores of a search are equal value for value, and cost less than the whole grid."""
-    document = changed(axes={"size_m": [0.01, 0.02, 0.03, 0.06]}, search={"max_trials": 200})
-    stores = []
-    for number, options in enumerate((
-            {"workers": 1}, {"workers": 2}, {"workers": 1, "block_s": 0.01})):
-        stores.append(tmp_path / f"{number}.zarr")
-        execute(Pipeline.from_dict(document), str(stores[-1]), **options)
-    first, *others = map(sweep.open, stores)
-    for other in others:
-        xr.testing.assert_identical(
-            first.load().drop_attrs(), other.load().drop_attrs())
-    needed = (first["detection"] != DetectionStatus.not_needed).mean()
-    assert 0.2 < float(needed) < 0.8
 
 
 def test_answers_name_the_next_size_and_what_it_fails_by():

@@ -97,33 +97,6 @@ def test_every_wanted_cell_is_of_the_condition_alone():
 
 
 @pytest.mark.long
-def test_limits_are_those_of_plain_intervals():
-    rng = np.random.default_rng(3)
-    curves = special.expit((SIDES - rng.uniform(12, 35, (6, 1))) / 2)
-    curves[2, 3] = 0.5  # a dip
-    limits = searched(curves, SIDES, "detection >= 0.9", 400, seed=1)
-    pipeline = pipeline_of(curves, SIDES, "detection >= 0.9", 400)
-    assert (limits["poses"] < 0.5 * 400 * len(SIDES)).all()
-    assert limits.attrs["harder"] == "downwards"
-    looks = len(pipeline.stopping.ends)
-    tail = 0.025 / looks_factor(looks)
-    for k in range(len(curves)):
-        one = limits.isel(tilt_deg=k)
-        met = one["keeps"].values
-        count = len(SIDES) if met.all() else int(np.argmin(met))
-        assert one["value"].item() == SIDES[count - 1]
-        # The decisions beside the limit, from counts alone: the rule stopped where they are sure.
-        assert one["decision"].values[0] == 1
-        trials = one["trials"].values
-        assert trials.min() == 40
-        assert trials.max() <= 400
-    assert limits["met_beyond"].values[2] > 0
-    # 40 of 40 do not show 0.9 at this level, 80 of 80 do.
-    assert stats.beta.ppf(tail, 40, 1) < 0.9 < stats.beta.ppf(tail, 80, 1)
-    assert limits["trials"].values[:, 0].min() == 80
-
-
-@pytest.mark.long
 @pytest.mark.parametrize(("rate", "shape"), [
     (0.9, "slow"), (0.9, "dip"), (0.9, "at the limit"), (0.99, "at the limit")])
 def test_intervals_cover_the_limit(rate, shape, claim):

@@ -170,66 +170,66 @@ PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
 
 RECORDS: tuple[Check, ...] = (
     *(absent((name,), _without(*others, *RIVALS.get(name, ())),
-                f"{' or '.join(others)} beside it", active=True)
+             f"{' or '.join(others)} beside it", active=True)
       for name, others in PARTNERS.items()),
     apart(("marker_id", "dictionary"),
-         lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
-         lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
-         f"{dictionary} has"),
+          lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
+          lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
+          f"{dictionary} has"),
     apart(("noise_table",), _is_no_noise_table,
-         "level, standard deviation, level, standard deviation, ...: levels that ascend from 0 "
-         f"to {MAX_LEVEL:g}, deviations of at least 0"),
+          "level, standard deviation, level, standard deviation, ...: levels that ascend from 0 "
+          f"to {MAX_LEVEL:g}, deviations of at least 0"),
     apart(("adaptiveThreshWinSizeMax", "adaptiveThreshWinSizeMin"),
-         lambda largest, smallest: largest < smallest, "at least adaptiveThreshWinSizeMin"),
+          lambda largest, smallest: largest < smallest, "at least adaptiveThreshWinSizeMin"),
     apart(("height_px", "width_px"), lambda height, width: height * width > MAX_PIXELS,
-         f"a frame of at most {MAX_PIXELS:,} pixels"),
+          f"a frame of at most {MAX_PIXELS:,} pixels"),
     # Renderers.
     apart(("renderer", "dictionary"),
-         lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
-         "exact for STag's markers, which have circles"),
+          lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
+          "exact for STag's markers, which have circles"),
     apart(("renderer", "kind", "distractors"),
-         lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
-         f"{RENDERERS}, for boards"),
+          lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
+          f"{RENDERERS}, for boards"),
     apart(("renderer", "markers", "distractors"),
-         lambda renderer, *listed: renderer != "exact" and _in_planes(*listed),
-         f"exact, {SEVERAL_PLANES}"),
+          lambda renderer, *listed: renderer != "exact" and _in_planes(*listed),
+          f"exact, {SEVERAL_PLANES}"),
     absent(GEOMETRIC, lambda reading: {*reading.values_of("renderer")} - {"exact"},
-              "renderer = exact beside it, which alone has it", active=True),
+           "renderer = exact beside it, which alone has it", active=True),
     absent(("curvature_per_m", "occlusion"),
-              lambda reading: _in_planes(
-                  *reading.values_of("markers"), *reading.values_of("distractors")),
-              f"it absent, {SEVERAL_PLANES}: it is of one sheet", active=True),
+           lambda reading: _in_planes(
+               *reading.values_of("markers"), *reading.values_of("distractors")),
+           f"it absent, {SEVERAL_PLANES}: it is of one sheet", active=True),
     # Cameras, and what estimators believe of them.
     absent(OTHER_WAYS, lambda reading: reading.stated,
-              "no other camera beside camera_file; delete it, or camera_file"),
+           "no other camera beside camera_file; delete it, or camera_file"),
     absent(
         ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px",
          "believed_focal_scale", "believed_distortion"), _is_calibrated,
         "no other belief about the camera beside believed = calibration; delete one of them"),
     # Photographs, which have their own poses and light.
     absent((SIMULATED,), _without(PHOTOGRAPHS),
-              "photographs beside it, whose poses are taken", active=True),
+           "photographs beside it, whose poses are taken", active=True),
     absent(("kind",), lambda reading: PHOTOGRAPHS in reading.given and reading.shows_boards,
-              "no board beside photographs, whose board `sweep photos` knows; delete it"),
+           "no board beside photographs, whose board `sweep photos` knows; delete it"),
     apart(("believed", PHOTOGRAPHS), lambda believed, file: file and believed == "calibration",
-         "truth, for photographs"),
+          "truth, for photographs"),
     # Boards.
     absent(("points", "refine", "refineDetectedMarkers", "minMarkers"),
-              lambda reading: not reading.shows_boards, "a board: give kind under [board]"),
+           lambda reading: not reading.shows_boards, "a board: give kind under [board]"),
     absent(("ids",), lambda reading: "marker_id" in reading.given,
-              "ids, or marker_id of the first; not both", active=True),
+           "ids, or marker_id of the first; not both", active=True),
     apart(("points", "detector"),
-         lambda points, detector: points == "chessboard" and is_recording(detector),
-         "markers beside recorded detections, which have no corners of chessboards"),
+          lambda points, detector: points == "chessboard" and is_recording(detector),
+          "markers beside recorded detections, which have no corners of chessboards"),
     apart(("refineDetectedMarkers", "detector"),
-         lambda refine, detector: refine and is_recording(detector),
-         "false beside recorded detections: no image is searched"),
+          lambda refine, detector: refine and is_recording(detector),
+          "false beside recorded detections: no image is searched"),
     apart(("refineDetectedMarkers", "markers"),
-         lambda refine, listed: refine and is_solid(listed), f"false, {SEVERAL_PLANES}"),
+          lambda refine, listed: refine and is_solid(listed), f"false, {SEVERAL_PLANES}"),
     apart(("solver", "points", "markers"),
-         lambda solver, points, listed: is_solid(listed) and solver in SOLVERS
-         and SOLVERS[solver].planar_only and points in ("markers", "chessboard"),
-         f"one of iterative, sqpnp, epnp, photometric, {SEVERAL_PLANES}"),
+          lambda solver, points, listed: is_solid(listed) and solver in SOLVERS
+          and SOLVERS[solver].planar_only and points in ("markers", "chessboard"),
+          f"one of iterative, sqpnp, epnp, photometric, {SEVERAL_PLANES}"),
 )
 
 # --------------------------------------------------------------------------------------------------
@@ -431,15 +431,12 @@ def targets_are_solved(reading: Reading) -> None:
     plugged = [each.name for each in reading.plugins if each.of_boards]
     if not reading.shows_boards:
         apart(("solver",), lambda solver: solver in plugged,
-             "a solver of single markers, or a board: give kind under [board]")(reading)
+              "a solver of single markers, or a board: give kind under [board]")(reading)
         return
     if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & {
             *reading.values_of("kind")}:
         reading.refuse_value(
             "points", "chessboard", "kind = charuco or diamond, which have a chessboard")
-    if "solver" not in reading.given:
-        reading.note("estimator.solver", f"missing; a board needs one of {BOARD_SOLVERS}")
-        return
 
     def is_of_boards(solver: str, points: str) -> bool:
         known = SOLVERS.get(solver)
@@ -447,13 +444,13 @@ def targets_are_solved(reading: Reading) -> None:
             known.of_boards or (points == "largest_marker" and known.corners_alone))
 
     apart(("solver", "points"), lambda *chosen: not is_of_boards(*chosen),
-         f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "
-         "corners alone; plug-ins with of_boards=True")(reading)
+          f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "
+          "corners alone; plug-ins with of_boards=True")(reading)
     for name, whole in (("points", "markers"), ("refine", "none")):
         apart((name, "solver"), lambda chosen, solver, whole=whole: (
-                 chosen != whole and solver in ("photometric", *plugged)),
-             lambda _, solver, whole=whole: (
-                 f"{whole} beside solver = {solver}, which chooses by itself"))(reading)
+                  chosen != whole and solver in ("photometric", *plugged)),
+              lambda _, solver, whole=whole: (
+                  f"{whole} beside solver = {solver}, which chooses by itself"))(reading)
 
 
 # --------------------------------------------------------------------------------------------------

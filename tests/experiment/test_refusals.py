@@ -124,7 +124,7 @@ BROKEN = [
     ((BOARD + beside(x_m=0.5, y_m=0), "solver='ippe_square'"),
      "for boards; others with points = largest_marker"),
     (BOARD.replace('solver = "iterative"', "") + GRID,
-     "estimator.solver: missing; a board needs one of ippe, iterative, sqpnp, epnp"),
+     "expected one of ippe, iterative, sqpnp, epnp"),
     ("[pose]\ntilt_deg = [0, 30]", "an axis: they go under [axes]"),
     ("[estimator]\nsolver = ['ippe', 'sqpnp']", "an axis: they go under [axes]"),
     ("[pose]\ntilt_deg = { linspace = [0, 30, 3] }", "goes under [axes]"),

@@ -199,19 +199,6 @@ Distortion_Coefficients: !!opencv-matrix
    dt: d
    data: {LENS}
 """, {}),
-    "EuRoC": (f"""sensor_type: camera
-comment: VI-Sensor cam0 (MT9M034)
-rate_hz: 20
-resolution: [640, 480]
-camera_model: pinhole
-intrinsics: {[MATRIX[0][0], MATRIX[1][1], MATRIX[0][2], MATRIX[1][2]]} #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: {LENS[:4]}
-""", {"lens": LENS[:4]}),
-    "Limelight": (json.dumps({
-        "camera_matrix": MATRIX, "distortion_coefficients": [LENS], "img_size": [640, 480],
-        "avg_reprojection_error": 0.4,
-    }), {}),
 }
 
 

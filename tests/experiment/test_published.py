@@ -19,18 +19,6 @@ NEEDS = {
 }
 
 
-@pytest.mark.parametrize(("figure", "tilts", "shown", "not_shown"), [
-    (3, [0], "error", "detection"), (4, [0, 45, 70], "detection", "error"),
-])
-def test_a_figure_of_the_paper_has_its_tilts_and_its_title(figure, tilts, shown, not_shown):
-    """Of Poroykov et al., 2020: the error against the area, and the probability of detection."""
-    pipeline = Pipeline.from_toml(FOLDER.parent / f"paper_fig{figure}.toml")
-    assert list(pipeline.values_of("tilt_deg")) == tilts
-    assert shown in pipeline.title.lower()
-    assert not_shown not in pipeline.title.lower()
-    assert f"figure {figure}" in pipeline.title
-
-
 @pytest.mark.parametrize("name", NEEDS)
 def test_the_pipelines_can_be_read(name):
     for module in NEEDS[name]:

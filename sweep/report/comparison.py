@@ -141,9 +141,11 @@ class Comparison:
     def line(self) -> str:
         """The best configuration against the one that comes nearest to it, in one line."""
         known = self.known
-        others = [k for k in known.order if k != self.best and not known.wrong[k]]
+        others = [k for k in known.order if k != self.best]
         if not others:
             return ""
+        # What a wrong belief costs is the question if nothing else varies.
+        others = [k for k in others if not known.wrong[k]] or others
         rival = min(others, key=lambda k: (self.verdict(k), known.order.index(k)))
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
@@ -167,11 +169,12 @@ class Comparison:
         caption = "Configurations, with 95 % intervals"
         if not known.several:
             return Table.of(caption, [CONFIGURATION, *headings], rows)
-        beaten = any(self.verdict(k) < 0 and not known.wrong[k] for k in range(len(rows)))
+        best = all(self.verdict(k) > 0 or known.wrong[k]
+                   for k in range(len(rows)) if k != self.best)
         for k, pair in enumerate(self.differences):
             rows[k] += [each.numbers for each in pair] or [None] * len(PAIRED)
             rows[k].insert(1, verdict_words(pair) if k != self.best else
-                           "named" if beaten else "best")
+                           "best" if best else "named")
         few = any(each.quantity == UNFLIPPED.words for pair in self.differences for each in pair)
         return Table.of(
             f"{caption}; differences, ratios and verdict: {self.name} against each, on the same "

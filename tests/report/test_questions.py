@@ -18,7 +18,7 @@ ANSWERS = {
     "which": (["distance_m=[0.5, 2]"], " against "),
     "which_size": (["size_m=[0.06, 0.4]", "tilt_deg=[0, 60]"], "0.4 m"),
     "flips": (["tilt_deg=[5, 30]"], "along tilt_deg"),
-    "focal_length": (["distance_m=[0.5, 1.5]"], "Detected in 100 %"),
+    "focal_length": (["distance_m=[0.5, 1.5]"], " against believed_focal_scale 0.99 (wrong): "),
     "field_of_view": (["hfov_deg=[30, 110]", "tilt_deg=[0, 60]"], "up to 30"),
     "blur": (["blur_px=[0, 3]"], "along blur_px: up to 0 px"),
     "dictionary": (["side_px=[15, 40]"], "down to 40 px"),

@@ -35,6 +35,7 @@ PLANE = [0, 2, 4]
 QUICK = {
     "REFINEMENTS": ("subpix",),
     "SETTINGS": ('cornerRefinementMethod=["subpix"]', "trial=180"),
+    "FORMS": {},
 }
 
 

@@ -11,6 +11,7 @@ of ``--stored`` committed blocks, of which only receipts are made: processor sec
 
 import argparse
 import asyncio
+import contextlib
 import functools
 import json
 import math
@@ -28,6 +29,8 @@ import psutil
 from distributed import Client, Worker
 
 import sweep
+from support.clusters import Cluster
+from support.commands import started
 from sweep.execution import on_cluster
 from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
@@ -35,7 +38,7 @@ from sweep.execution.runner import compute
 from sweep.execution.status import status
 from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Interrupts
+from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
 from sweep.store.blocks import committed, receipts
 from sweep.store.files import write_files
 from sweep.store.layout import RECEIPTS
@@ -145,35 +148,21 @@ def simulated(count, waves, folder):
     # By default as in a run of 100,000 blocks.
     block_s = BLOCK_S or block_work_s(1e5 * max(2.0, count / 75), count)
     store = created(count * waves, f"{folder}/{count}.zarr")
-    address = Path(folder) / f"{count}.json"
-    environment = {
-        **os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }
-    started = functools.partial(
-        subprocess.Popen, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        preexec_fn=many_files)  # no threads yet that hold locks
-    children = [started(
-        [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port",
-         "0", "--no-dashboard", "--scheduler-file", str(address)])]
-    try:
-        while not address.exists():
-            time.sleep(0.1)
-        url = json.loads(address.read_text())["address"]
-        script = f"import asyncio, {__name__} as us; asyncio.run(us.live({url!r}, {{}}))"
-        children += [
-            started([sys.executable, "-c", script.format(count // PROCESSES)])
-            for _ in range(PROCESSES)]
-        with Client(url, set_as_default=False) as client, Interrupts() as interrupts:
-            client.wait_for_workers(count // PROCESSES * PROCESSES, timeout=300)
-            return {
-                "workers": count, "blocks": len(store.blocks), "block_s": round(block_s, 2),
-                **measured(store, client, block_s, interrupts, psutil.Process(children[0].pid)),
-            }
-    finally:
-        for child in reversed(children):
-            child.kill()
-            child.wait()
+    environment = {**SINGLE_THREADED, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with contextlib.ExitStack() as stack:
+        cluster = stack.enter_context(Cluster(Path(folder) / str(count), environment=environment))
+        script = (f"import asyncio, {__name__} as us; "
+                  f"asyncio.run(us.live({cluster.address!r}, {count // PROCESSES}))")
+        for _ in range(PROCESSES):
+            stack.enter_context(started(
+                ["-c", script], env=os.environ | environment, stderr=subprocess.DEVNULL))
+        client = stack.enter_context(Client(cluster.address, set_as_default=False))
+        interrupts = stack.enter_context(Interrupts())
+        client.wait_for_workers(count // PROCESSES * PROCESSES, timeout=300)
+        return {
+            "workers": count, "blocks": len(store.blocks), "block_s": round(block_s, 2),
+            **measured(store, client, block_s, interrupts, psutil.Process(cluster.scheduler.pid)),
+        }
 
 
 def measured(store, client, block_s, interrupts, scheduler):

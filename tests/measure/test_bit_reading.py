@@ -79,12 +79,16 @@ def test_worked_example_is_lost_at_4_samples_a_cell_and_found_at_8():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [0, 7])
-def test_dips_of_sweeps_held_back_are_where_and_as_deep_as_was_written_down(number, tmp_path):
+@pytest.mark.parametrize("number", [0, 4])
+def test_dips_of_sweeps_held_back_are_where_and_as_deep_as_was_written_down(
+    number, tmp_path, claim
+):
     one = sweeps.HELD_BACK[number]
     truth = sweeps.measured(one, sweep.run(one.pipeline(), store=tmp_path / "held_back.zarr"))
     model = one.rates(sweeps.written_down()[one.title][:, None])
     off = np.abs(model.mean - truth.mean)
+    claim("detection rates of small markers, from their bits",
+          "sweeps of which the model knew nothing", off.max())
     assert off.max() <= 0.1
     for mine, its in dips.pairs(model, truth):
         if mine is None or its is None:

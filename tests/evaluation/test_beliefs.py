@@ -43,9 +43,9 @@ def whole(pipeline):
     return Block((0,) * len(shape), shape)
 
 
-def run(text, settings=()):
+def run(document, settings=()):
     """Return the values of a pipeline's whole grid."""
-    pipeline = Pipeline.from_text(text, settings)
+    pipeline = Pipeline.from_dict(document, settings)
     result = run_block(pipeline, whole(pipeline))
     assert not result.failures
     return result.values
@@ -57,8 +57,8 @@ class Estimated:
     By the kernel's own stages but for image and detection.
     """
 
-    def __init__(self, text, settings=(), noise=0.0):
-        pipeline = Pipeline.from_text(text, settings)
+    def __init__(self, document, settings=(), noise=0.0):
+        pipeline = Pipeline.from_dict(document, settings)
         block = whole(pipeline)
         values = pipeline.experiment.scene_values(block.indices())
         self.scenes = scenes = build_scenes(values, len(block))
@@ -87,34 +87,25 @@ class Estimated:
 
 # 1. Size.
 
-ANYWHERE = f"""
-seed = 1
-[marker]
-size_m = 0.1
-[camera]
-fx_px = 600
-fy_px = 550
-distortion = [-0.2, 0.05, 0.001, -0.002]
-[pose]
-distance_m = {{ uniform = [0.3, 3] }}
-tilt_deg = {{ uniform = [0, 70] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-15, 15] }}
-bearing_y_deg = {{ uniform = [-15, 15] }}
-[axes]
-trial = 20
-solver = {list(GUARDED)}
-"""
+ANYWHERE = {
+    "seed": 1, "marker": {"size_m": 0.1},
+    "camera": {"fx_px": 600, "fy_px": 550, "distortion": [-0.2, 0.05, 0.001, -0.002]},
+    "pose": {
+        "distance_m": {"uniform": [0.3, 3]}, "tilt_deg": {"uniform": [0, 70]},
+        "azimuth_deg": {"uniform": [0, 360]}, "roll_deg": {"uniform": [0, 360]},
+        "bearing_x_deg": {"uniform": [-15, 15]}, "bearing_y_deg": {"uniform": [-15, 15]},
+    },
+    "axes": {"trial": 20, "solver": list(GUARDED)},
+}
 
 
 @lengths(20, 200)
 @pytest.mark.parametrize("noise", [0.0, 0.3], ids=["exact corners", "noisy corners"])
 def test_wrong_size_scales_the_translation_and_leaves_the_rotation_alone(count, noise):
     sizes = [0.001, 0.05, 0.0999, 0.101, 7.0]
-    text = ANYWHERE.replace("trial = 20", f"trial = {count}")
-    truths = Estimated(text, noise=noise)
-    wrong = Estimated(text, [f"believed_size_m={sizes}"], noise)
+    trials = f"trial={count}"
+    truths = Estimated(ANYWHERE, [trials], noise)
+    wrong = Estimated(ANYWHERE, [trials, f"believed_size_m={sizes}"], noise)
     for (truth, right), at in zip(truths, range(len(GUARDED)), strict=True):
         assert (right.status == EstimateStatus.solved).all()
         for k, size in enumerate(sizes):
@@ -133,21 +124,11 @@ def test_wrong_size_scales_the_translation_and_leaves_the_rotation_alone(count, 
 
 # 2. Camera and size, of a marker parallel to the image plane.
 
-PARALLEL = f"""
-[marker]
-size_m = 0.1
-[camera]
-fx_px = 600
-fy_px = 550
-[pose]
-azimuth_deg = 20
-[axes]
-bearing_x_deg = [0, 12]
-bearing_y_deg = [0, -9]
-roll_deg = [0, 30, 45, 100, 180, 275]
-distance_m = [0.3, 2.0]
-solver = {list(GUARDED)}
-"""
+PARALLEL = {
+    "marker": {"size_m": 0.1}, "camera": {"fx_px": 600, "fy_px": 550}, "pose": {"azimuth_deg": 20},
+    "axes": {"bearing_x_deg": [0, 12], "bearing_y_deg": [0, -9], "distance_m": [0.3, 2.0],
+             "roll_deg": [0, 30, 45, 100, 180, 275], "solver": list(GUARDED)},
+}
 
 
 def parallel_law(scenes, fx, fy, cx, cy, size):
@@ -185,15 +166,10 @@ def test_a_wrong_camera_moves_a_parallel_marker_as_the_law_says_and_does_not_tur
 
 # 3. Lenses.
 
-CENTRED = f"""
-[marker]
-size_m = 0.1
-[camera]
-fx_px = 600
-[axes]
-roll_deg = [20, 30, 45, 100]
-solver = {list(GUARDED)}
-"""
+CENTRED = {
+    "marker": {"size_m": 0.1}, "camera": {"fx_px": 600},
+    "axes": {"roll_deg": [20, 30, 45, 100], "solver": list(GUARDED)},
+}
 
 
 def radial(lens, r):
@@ -224,29 +200,17 @@ def test_lens_that_is_not_believed_scales_the_distance_of_a_centred_marker(lens)
 
 # What beliefs must not touch.
 
-EVERYTHING = """
-seed = 13
-[camera]
-fx_px = 610.1
-fy_px = 598.7
-cx_px = 333.3
-distortion = [-0.11, 0.02, 0.001, -0.0007]
-[marker]
-size_m = 0.0731
-[pose]
-side_px = 45
-jitter_px = 0.5
-tilt_deg = { uniform = [0, 60] }
-azimuth_deg = { normal = [0, 40] }
-[scene]
-background = 90
-[axes]
-bearing_x_deg = [0, 21]
-trial = 8
-cornerRefinementMethod = ["none", "subpix"]
-solver = ["ippe_square", "ippe", "iterative", "sqpnp", "p3p", "ap3p", "epnp"]
-guarded = [true, false]
-"""
+EVERYTHING = {
+    "seed": 13, "marker": {"size_m": 0.0731}, "scene": {"background": 90},
+    "camera": {"fx_px": 610.1, "fy_px": 598.7, "cx_px": 333.3,
+               "distortion": [-0.11, 0.02, 0.001, -0.0007]},
+    "pose": {"side_px": 45, "jitter_px": 0.5, "tilt_deg": {"uniform": [0, 60]},
+             "azimuth_deg": {"normal": [0, 40]}},
+    "axes": {
+        "bearing_x_deg": [0, 21], "trial": 8, "cornerRefinementMethod": ["none", "subpix"],
+        "solver": list(OPENCV_SOLVERS), "guarded": [True, False],
+    },
+}
 TRUTH = {
     "believed_fx_px": "610.1", "believed_fy_px": "598.7", "believed_cx_px": "333.3",
     "believed_cy_px": "239.5", "believed_size_m": "0.0731",

@@ -8,7 +8,6 @@ from support.board_pictures import (
     KINDS,
     NAME,
     SIZE_M,
-    board_toml,
     clipped_frame,
     parts,
 )
@@ -21,31 +20,16 @@ from sweep.model.renderers import marker_levels
 LEVELS = {"black": 20.3, "white": 230.1, "background": 90.4}
 SIZE = (96, 80)
 
-TEXT = f"""
-seed = 3
-[camera]
-width_px = {SIZE[0]}
-height_px = {SIZE[1]}
-fx_px = 110
-fy_px = 105
-[marker]
-dictionary = "{NAME}"
-size_m = {SIZE_M}
-[scene]
-black = {LEVELS["black"]}
-white = {LEVELS["white"]}
-background = {LEVELS["background"]}
-[estimator]
-solver = "iterative"
-[pose]
-distance_m = 0.2
-"""
+MARKER = {
+    "seed": 3, "marker": {"dictionary": NAME, "size_m": SIZE_M}, "scene": LEVELS,
+    "camera": {"width_px": SIZE[0], "height_px": SIZE[1], "fx_px": 110, "fy_px": 105},
+    "estimator": {"solver": "iterative"}, "pose": {"distance_m": 0.2},
+}
 
 
-def board_text(name):
-    """The pipeline's text with a board of ``KINDS``, or of what a dictionary says."""
-    kind = KINDS[name] if isinstance(name, str) else name
-    return TEXT + board_toml(kind)
+def board_of(name):
+    """A pipeline with a board of ``KINDS``, or with one as declared."""
+    return MARKER | {"board": KINDS[name] if isinstance(name, str) else name}
 
 
 def drawn(count, seed):
@@ -94,14 +78,14 @@ def exact_levels(scenes, areas=None):
 def test_every_pixel_of_a_board_is_its_clipped_area(name, count, claim):
     compared, worst = 0, 0.0
     for settings in drawn(4 * count, 1):
-        scenes = scenes_of(settings, board_text(name))
+        scenes = scenes_of(settings, board_of(name))
         if not shown(scenes) or compared == count:
             continue
         compared += 1
         # The plain image (one call for all its scenes), and the levels before quantisation.
         clipped = expected(name, scenes)
         worst = max(worst, np.abs(exact_levels(scenes) - clipped).max())
-        image = image_of(settings, text=board_text(name))
+        image = image_of(settings, text=board_of(name))
         off = np.abs(image - clipped)
         assert off.max() < 0.5 + 255e-9
     claim("pixels of a board (seven layouts, one with distractors)", "polygon clipping, 280 poses",
@@ -118,7 +102,7 @@ def test_an_occluded_board_is_its_clipped_parts_and_the_sheet(name, count):
     for pose in drawn(4 * count, 2):
         share, angle = rng.choice([0.1, 0.3, 0.7]), float(rng.choice([0.0, 90.0, 37.0, -140.0]))
         settings = [*pose, f"occlusion={share}", f"occlusion_deg={angle}", "occluder=150"]
-        scenes = scenes_of(settings, board_text(name))
+        scenes = scenes_of(settings, board_of(name))
         if not shown(scenes) or compared == count:
             continue
         compared += 1
@@ -146,7 +130,7 @@ def test_an_image_behind_a_board_shows_beside_it_and_alone_where_there_is_none(t
     noise = np.random.default_rng(5).integers(0, 256, (SIZE[1], SIZE[0])).astype(np.uint8)
     path = tmp_path / "behind.png"
     cv2.imwrite(str(path), noise)
-    behind, text = f"background='{path}'", board_text("charuco")
+    behind, text = f"background='{path}'", board_of("charuco")
     facing = ["distance_m=0.25", *ROUND]
     found, plain = image_of([*facing, behind], text=text), image_of(facing, text=text)
     # 126 mm of sheet at 0.25 m: 55.4 px wide about 47.5, 52.9 px high about 39.5.
@@ -177,8 +161,8 @@ def test_a_board_of_one_marker_is_that_marker_to_the_bit(settings, kind):
     poses = [["distance_m=0.06", "tilt_deg=40", "azimuth_deg=70", "roll_deg=200"],
              ["distance_m=0.1", "bearing_x_deg=20", "tilt_deg=10"]]
     for pose in poses:
-        single = image_of([*pose, *settings], text=TEXT)
-        board = image_of([*pose, *settings], text=board_text(SINGLE[kind]))
+        single = image_of([*pose, *settings], text=MARKER)
+        board = image_of([*pose, *settings], text=board_of(SINGLE[kind]))
         assert np.ptp(single) > 100
         np.testing.assert_array_equal(board, single)
 
@@ -190,7 +174,7 @@ def test_a_warped_board_has_the_levels_of_its_exact_image(name, tmp_path):
     cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8))
     for behind in ([], [f"background='{path}'"]):
         exact, warped = (
-            image_of([*pose, *behind, renderer], text=board_text(name)).astype(float)
+            image_of([*pose, *behind, renderer], text=board_of(name)).astype(float)
             for renderer in ("renderer='exact'", "renderer='warp'")
         )
         # Interpolation takes a point of each pixel, not its mean: right on average alone.
@@ -198,22 +182,15 @@ def test_a_warped_board_has_the_levels_of_its_exact_image(name, tmp_path):
         assert np.abs(cv2.blur(exact - warped, (7, 7))).max() < 45
 
 
-TABLE = """
-[[board.markers]]
-marker_id = {number}
-x_m = {x}
-y_m = 0.0
-z_m = {z}
-"""
-
-
 @pytest.mark.parametrize("settings", [["blur_px=0.8", "bayer=RGGB"], ["tilt_deg=60"]])
 @pytest.mark.parametrize("z", [0.0, 0.004])
 def test_markers_outside_the_frame_widen_no_window(settings, z):
     """The image is that of the frame's marker alone, and so is the box, up to 3 px."""
-    alone = TEXT + '[board]\nkind = "markers"\n' + TABLE.format(number=0, x=0.0, z=0.0)
-    many = alone + "".join(
-        TABLE.format(number=k, x=x, z=z) for k, x in enumerate((-3.6, -0.4, 0.4, 0.8, 3.2), 1)
+    alone, many = (
+        board_of({"kind": "markers", "markers": [
+            {"marker_id": k, "x_m": x, "y_m": 0.0, "z_m": z if k else 0.0}
+            for k, x in enumerate(places)
+        ]}) for places in ((0.0,), (0.0, -3.6, -0.4, 0.4, 0.8, 3.2))
     )
     one, several = (marker_boxes(scenes_of(settings, each))[0] for each in (alone, many))
     assert np.abs(one - several).max() <= 3

@@ -16,7 +16,6 @@ from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 
 DICTIONARIES = {"DICT_4X4_50": cv2.aruco.DICT_4X4_50, "DICT_6X6_250": cv2.aruco.DICT_6X6_250}
-IDS = (0, 7, 42)
 REFINEMENTS = {"none": 0, "subpix": 1, "contour": 2, "apriltag": 3}
 SOLVERS = {
     name: getattr(cv2, f"SOLVEPNP_{name.upper()}")
@@ -30,28 +29,19 @@ DETECTED, WRONG_ID, REJECTED, NO_CANDIDATE, NOT_VISIBLE = 1, 2, 3, 4, 5
 SOLVED, NO_DETECTION, SOLVER_FAILED = 1, 2, 3
 NOT_FLIPPED, FLIPPED, NO_ESTIMATE = 1, 2, 3
 
-GRID = f"""
-seed = 77
-[marker]
-size_m = {SIZE_M}
-[pose]
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-29, 29] }}
-bearing_y_deg = {{ uniform = [-22, 22] }}
-[scene]
-background = 90
-[estimator]
-guarded = false
-[axes]
-dictionary = {list(DICTIONARIES)}
-marker_id = {list(IDS)}
-tilt_deg = [0, 25, 55, 75]
-distance_m = [0.12, 0.4, 1.3]
-trial = 2
-cornerRefinementMethod = {list(REFINEMENTS)}
-solver = {list(SOLVERS)}
-"""
+GRID = {
+    "seed": 77, "marker": {"size_m": SIZE_M}, "scene": {"background": 90},
+    "pose": {
+        "azimuth_deg": {"uniform": [0, 360]}, "roll_deg": {"uniform": [0, 360]},
+        "bearing_x_deg": {"uniform": [-29, 29]}, "bearing_y_deg": {"uniform": [-22, 22]},
+    },
+    "estimator": {"guarded": False},
+    "axes": {
+        "dictionary": list(DICTIONARIES), "marker_id": [0, 7, 42], "tilt_deg": [0, 25, 55, 75],
+        "distance_m": [0.12, 0.4, 1.3], "trial": 2, "cornerRefinementMethod": list(REFINEMENTS),
+        "solver": list(SOLVERS),
+    },
+}
 
 
 def corners_in_space(size_m):
@@ -126,7 +116,7 @@ def plain_loop(trials):
     (n, refinement, solver, 7) as rvec, tvec and RMS; NaN where there is none. Of the package,
     only the poses and the images are taken.
     """
-    pipeline = Pipeline.from_text(GRID, [f"trial={trials}", "window=full"])
+    pipeline = Pipeline.from_dict(GRID, [f"trial={trials}", "window=full"])
     block = whole(pipeline)
     scenes = build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
     boxes = marker_boxes(scenes)
@@ -173,7 +163,7 @@ def whole(pipeline):
 @pytest.mark.parametrize("window", ["full", "auto"])
 def test_kernel_gives_what_a_plain_opencv_loop_gives(count, window, claim):
     flags, corners, statuses, poses = plain_loop(count)
-    pipeline = Pipeline.from_text(GRID, [f"trial={count}", f"window={window}"])
+    pipeline = Pipeline.from_dict(GRID, [f"trial={count}", f"window={window}"])
     block = whole(pipeline)
     result = run_block(pipeline, block)
     assert not result.failures

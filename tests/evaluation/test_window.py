@@ -18,30 +18,26 @@ from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_rea
 from sweep.measure.flags import DetectionStatus
 from sweep.model.scene import build_scenes
 
-SCENES = """
-seed = 11
-[camera]
-width_px = {width}
-height_px = {height}
-[marker]
-[pose]
-tilt_deg = {{ uniform = [0, 80] }}
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
-bearing_x_deg = {{ uniform = [-33, 33] }}   # half the field of view is 31 by 24 degrees
-bearing_y_deg = {{ uniform = [-26, 26] }}
-[axes]
-dictionary = ["DICT_4X4_50", "DICT_5X5_50", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
-background = [0, 128, 255]
-marker_id = [3, 17]
-side_px = {{ geom = [6, 400, 24] }}
-trial = 20
-"""
+SCENES = {
+    "seed": 11,
+    "pose": {
+        "tilt_deg": {"uniform": [0, 80]}, "azimuth_deg": {"uniform": [0, 360]},
+        "roll_deg": {"uniform": [0, 360]},
+        # Half the field of view is 31 by 24 degrees.
+        "bearing_x_deg": {"uniform": [-33, 33]}, "bearing_y_deg": {"uniform": [-26, 26]},
+    },
+    "axes": {
+        "dictionary": ["DICT_4X4_50", "DICT_5X5_50", "DICT_6X6_250", "DICT_APRILTAG_36h11"],
+        "background": [0, 128, 255], "marker_id": [3, 17],
+        "side_px": {"geom": [6, 400, 24]}, "trial": 20,
+    },
+}
 
 
 def visible_scenes(count, width=640, height=480, settings=()):
     """Return ``count`` scenes of the grid, each visible at least in part."""
-    pipeline = Pipeline.from_text(SCENES.format(width=width, height=height), settings)
+    document = SCENES | {"camera": {"width_px": width, "height_px": height}}
+    pipeline = Pipeline.from_dict(document, settings)
     shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
     order = np.random.default_rng(5).permutation(int(np.prod(shape)))
 

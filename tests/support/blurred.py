@@ -25,27 +25,41 @@ def sharp_of(value, box, plane=None):
     return mean + (1 - share) * value["background"]
 
 
+def finer(value):
+    """The scene in a camera that has FINE x FINE pixels for each."""
+    fine = value | {name: FINE * value[name] for name in ("fx_px", "width_px", "height_px")}
+    return fine | {f"c{axis}_px": FINE * value[side] / 2 - 0.5
+                   for axis, side in (("x", "width_px"), ("y", "height_px"))}
+
+
+def finer_box(low, high, pad):
+    """The box of finer pixels from ``low`` to ``high``, and ``pad`` pixels around."""
+    return tuple(FINE * at for at in (low[0] - pad, low[1] - pad, high[0] + pad, high[1] + pad))
+
+
+def through_gaussian(levels, pad, sigma, columns=None, rows=None):
+    """What pixels (rows, columns) see of finer levels through a Gaussian of ``sigma`` px.
+
+    By default of all but the ``pad`` pixels around; beyond these is 0.
+    """
+    def shares(at, count):
+        at = np.arange(count // FINE - 2 * pad) if at is None else np.asarray(at)
+        fine = (np.arange(count) + 0.5) / FINE - 0.5 - pad
+        upper, lower = (ndtr((at[:, None] + half - fine) / sigma) for half in (0.5, -0.5))
+        return (upper - lower) / FINE
+
+    return shares(rows, levels.shape[0]) @ levels @ shares(columns, levels.shape[1]).T
+
+
 class FineImage:
     """The exact image of a scene, ``pad`` pixels around the frame too."""
 
     def __init__(self, value, pad):
-        self.shape = value["height_px"], value["width_px"]
+        box = finer_box((0, 0), (value["width_px"], value["height_px"]), pad)
         self.background, self.pad = value["background"], pad
-        fine = value | {"fx_px": FINE * value["fx_px"]}
-        for size, centre in (("width_px", "cx_px"), ("height_px", "cy_px")):
-            fine |= {size: FINE * value[size], centre: FINE * value[size] / 2 - 0.5}
-        height, width = (FINE * (side + pad) for side in self.shape)
-        self.levels = sharp_of(fine, (-FINE * pad, -FINE * pad, width, height)) - self.background
+        self.levels = sharp_of(finer(value), box) - self.background
 
     def seen(self, sigma, columns=None, rows=None):
         """Levels (rows, columns) through a Gaussian of ``sigma`` px, by default of all pixels."""
-        def shares(at, side, count):
-            at = np.arange(side) if at is None else np.asarray(at)
-            fine = (np.arange(count) + 0.5) / FINE - 0.5 - self.pad
-            ends = ((at[:, None] + half - fine) / sigma for half in (0.5, -0.5))
-            upper, lower = map(ndtr, ends)
-            return (upper - lower) / FINE
-
-        down = shares(rows, self.shape[0], self.levels.shape[0])
-        across = shares(columns, self.shape[1], self.levels.shape[1])
-        return down @ self.levels @ across.T + self.background
+        seen = through_gaussian(self.levels, self.pad, sigma, columns, rows)
+        return seen + self.background

@@ -1,6 +1,5 @@
 """Boards as lists of convex parts, laid out by OpenCV, and their images by polygon clipping."""
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -36,19 +35,6 @@ KINDS: dict[str, Mapping[str, Any]] = {
     ]},
 }
 """Name -> what a pipeline has under [board]; markers of 5 x 5 bits from ID 0 on."""
-
-
-def board_toml(kind):
-    """Return the text of [board] of a pipeline."""
-    values = "".join(
-        f"{key} = {json.dumps(value)}\n" for key, value in kind.items()
-        if key not in ("markers", "distractors")
-    )
-    tables = "".join(
-        f"[[board.{name}]]\n" + "".join(f"{key} = {json.dumps(v)}\n" for key, v in row.items())
-        for name in ("markers", "distractors") for row in kind.get(name, [])
-    )
-    return f"[board]\n{values}{tables}"
 
 
 def square_corners(x, y, size, roll):

@@ -30,7 +30,8 @@ background = 90.4
 
 
 def scenes_of(settings=(), text=SMALL):
-    pipeline = Pipeline.from_text(text, list(settings))
+    read = Pipeline.from_text if isinstance(text, str) else Pipeline.from_dict
+    pipeline = read(text, list(settings))
     first = [np.array([0])] * len(pipeline.experiment.scene_axes)
     return build_scenes(pipeline.experiment.scene_values(first), 1)
 

@@ -195,7 +195,7 @@ def test_bound_is_that_of_differences_of_the_exact_image(count, claim):
     pytest.param(False, {"distortion": LENSES[2], "max_tilt": 70}, marks=pytest.mark.long),
     pytest.param(True, {"blur_px": 2.0, "sides": (14, 30)}, marks=pytest.mark.long),
 ], ids=str)
-@lengths(2, 8)
+@lengths(1, 8)
 def test_bound_under_a_lens_or_blurred_is_that_of_differences(count, unknown_blur, given, claim):
     blurred = "blur_px" in given
     scenes = drawn(count, 4, **({"sides": (8, 14)} if blurred else {}) | given)

@@ -92,16 +92,6 @@ def test_several_axes_pool_what_has_the_same_side():
     assert by_size["distance_m"].values.tolist() == [1.0, 2.0]
 
 
-def test_parameters_that_go_together_are_one_axis():
-    results = dataset({"camera": ["a", "b", "c"]}, [0.0, 1.0, 1.0], camera="")
-    results = results.assign_coords(
-        fx_px=("camera", [300.0, 600.0, 900.0], {"units": "px"}),
-        fy_px=("camera", [300.0, 600.0, 900.0], {"units": "px"}))
-    answer = detection_limit(results, rate=0.9)
-    assert (answer["side_px"].item(), answer["fx_px"].item()) == (36.0, 600.0)
-    assert answer["fx_px"].attrs["units"] == "px"
-
-
 def test_drawn_distances_are_taken_by_bins():
     rng = np.random.default_rng(5)
     results = dataset({"tilt_deg": [0.0]}, [1.0], pose="distance_m = { uniform = [1, 5] }")

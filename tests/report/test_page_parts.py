@@ -4,12 +4,10 @@ import html
 import re
 
 import numpy as np
-import pytest
 from matplotlib.figure import Figure
 
 from sweep.report.answer import Answer, Tile
 from sweep.report.figure import Figure as ReportFigure
-from sweep.report.figure import Panel, Series
 from sweep.report.scenes import Scene
 from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
 from sweep.report.write_report import page
@@ -116,14 +114,3 @@ def test_names_are_rows_of_dots_never_joined_and_marked_ones_are_diamonds():
         assert {line.get_linestyle() for line in dots} == {"None"}
         assert [(line.get_marker(), line.get_xdata().tolist()) for line in dots] == [
             ("o", [10.0]), ("D", [30.0])]
-
-
-@pytest.mark.parametrize(("values", "scale"), [
-    (np.geomspace(0.05, 1, 8), "log"), (np.linspace(3, 57, 10), "linear"),
-    (np.linspace(0, 60, 4), "linear"), (np.array([1.0, 10.0]), "log"),
-    (np.array([10.0, 12.0, 14.0]), "linear"),
-], ids=["geom", "bins of a tilt", "with 0", "two", "short"])
-def test_values_that_grow_by_factors_are_on_a_logarithmic_axis(values, scale):
-    axes = Figure().subplots()
-    Panel("", [Series.of("", values, np.ones(len(values)))], "x", RATE).draw(axes)
-    assert axes.get_xscale() == scale

@@ -6,7 +6,6 @@ import html
 import re
 import shutil
 import xml.etree.ElementTree as ET
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -54,51 +53,27 @@ def page(full, tmp_path_factory):
     return output.read_text(encoding="utf-8")
 
 
-class Page(HTMLParser):
-    """A page's tags, what they refer to, and the rows of its tables by caption."""
+def texts(tags, part):
+    """Return the texts of elements with some tags in a part of a page."""
+    found = re.findall(rf"<(?:{tags})\b[^>]*>(.*?)</(?:{tags})>", part, re.DOTALL)
+    return [html.unescape(re.sub(r"<.*?>", "", text)).strip() for text in found]
 
-    VOID = frozenset({"meta", "img", "br", "link", "input"})
-    REFERRING = ("src", "href", "xlink:href", "action", "data", "poster", "srcset")
 
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.ids, self.references, self.tables, self.images = [], [], [], {}, []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        named = dict(attrs)
-        self.references += [named[name] for name in self.REFERRING if name in named]
-        self.ids += [named["id"]] if "id" in named else []
-        assert tag != "th" or named["scope"] in {"col", "row"}
-        if tag == "img":
-            self.images.append(named)
-        if tag == "table":
-            self.rows, self.caption = [], None
-        if tag == "tr":
-            self.rows.append([])
-        if tag not in self.VOID:
-            self.open.append(tag)
-        self.text = ""
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-        if tag in {"th", "td"}:
-            self.rows[-1].append(self.text)
-        if tag == "caption":
-            self.caption = self.text
-        if tag == "table":
-            self.tables.setdefault(self.caption, self.rows)
-
-    def handle_data(self, data):
-        self.text = getattr(self, "text", "") + data
+def tables_of(page):
+    """Return the rows of a page's tables by caption: the texts of their cells."""
+    tables = re.findall(r"<table.*?</table>", page, re.DOTALL)
+    return {texts("caption", table)[0]: [
+        texts("th|td", row) for row in re.findall(r"<tr.*?</tr>", table, re.DOTALL)]
+        for table in tables}
 
 
 def test_the_page_needs_nothing_else(page, full):
-    read = Page(page)
-    assert all(value.startswith(("data:", "#")) for value in read.references)
-    assert {value[1:] for value in read.references if value.startswith("#")} <= set(read.ids)
-    assert len(read.ids) == len(set(read.ids))
+    ids = re.findall(r' id="([^"]*)"', page)
+    references = re.findall(
+        r' (?:src|href|xlink:href|action|data|poster|srcset)="([^"]*)"', page)
+    assert all(value.startswith(("data:", "#")) for value in references)
+    assert {value[1:] for value in references if value.startswith("#")} <= set(ids)
+    assert len(ids) == len(set(ids))
     assert not re.search(r"url\((?!#|data:|['\"]data:)", page)
     assert not re.search(r"<script|@import|javascript:|\son\w+=", page)
     assert "default-src 'none'" in html.unescape(page)
@@ -108,15 +83,15 @@ def test_the_page_needs_nothing_else(page, full):
 
 
 def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
-    read = Page(page)
+    images = re.findall(r"<img\b[^>]*>", page)
     assert '<html lang="en">' in page
     assert "<title>All &lt;axes&gt; &amp; &#34;kinds&#34; of $figures$</title>" in page
     assert page.count("<h1>") == 1
     assert "<svg" not in page
-    assert len(read.images) > 9
-    assert all(image["alt"] for image in read.images)
-    assert len(read.tables) > 9
-    assert None not in read.tables
+    assert len(images) > 9
+    assert all(re.search(r' alt="[^"]', image) for image in images)
+    assert len(tables_of(page)) > 9
+    assert all('scope="' in heading for heading in re.findall(r"<th\b[^>]*>", page))
 
 
 @pytest.mark.parametrize("name", ODD)
@@ -126,12 +101,11 @@ def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
     assert command("report", url, "-o", output)[::2] == (0, "")
     text = output.read_text(encoding="utf-8")
     assert not re.search(r"\bnan\b|\binf\b", re.sub(r"<pre.*?</pre>", "", text))
-    Page(text)
     assert {path.name for path in tmp_path.iterdir()} == {"odd.zarr", "report.html"}
 
 
 def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
-    tables, results = Page(page).tables, open_dataset(full)
+    tables, results = tables_of(page), open_dataset(full)
     one = results.sel(cornerRefinementMethod="none", solver="photometric")
     first = re.search("the weakest first: (\\w+)", page)[1]
     weakest = results.sel(cornerRefinementMethod=first)

@@ -48,7 +48,6 @@ from sweep.model.camera import (
 )
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.model.exposure import hidden, not_modelled, outside_frame
-from sweep.model.marker import module_count
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
 from sweep.plugins import EffectPlugin, RendererPlugin
@@ -455,9 +454,6 @@ MAX_CORNERS = 200
 OFF_CENTRE = 0.15
 """Distance of the principal point from the frame's centre, as a share of its side, that is told."""
 
-WIDE_DEG = 150.0
-"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
-
 MIN_SHARE = 0.01
 """Share of poses that is told."""
 
@@ -572,14 +568,9 @@ class Facts:
         } | dict(zip(("farthest_side_px", "nearest_side_px"), self.camera["side_px"] or (),
                      strict=False))
 
-    @cached_property
-    def camera_notes(self) -> list[str]:
+    @property
+    def camera_notes(self) -> Iterator[str]:
         """A line for each property of the camera that may surprise."""
-        wide = [f"HFOV {_text(self.camera['hfov_deg'], 4)}°: is a focal length in another unit?"
-                ] * (self.camera["hfov_deg"][1] > WIDE_DEG)
-        return [*wide, *self._centre_notes(), *self._side_notes()]
-
-    def _centre_notes(self) -> Iterator[str]:
         for axis in "xy":
             centre = f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}"
             off = max(map(abs, self.camera[f"off_centre_{axis}"]))
@@ -594,17 +585,6 @@ class Facts:
                    f"pixel's centre, as here, the middle is {x - 0.5:g}, {y - 0.5:g}: subtract 0.5 "
                    "if the program that gave them has its corner there "
                    "(pipelines/half_pixel/README.md)")
-
-    def _side_notes(self) -> Iterator[str]:
-        """Yield a line if no marker of the grid is of a size that can be detected."""
-        far, near = self.camera["side_px"] or (0.0, math.inf)
-        units = "" if "side_px" in self.grid.given else (
-            "; are size_m and the distances in metres?")
-        if near < min(map(module_count, self.grid.values_of("dictionary"))):
-            yield (f"{self._whose} at most {near:.4g} px, less than a pixel a module: too small to "
-                   f"be read{units}")
-        elif far > max(self.camera["width_px"][1], self.camera["height_px"][1]):
-            yield f"{self._whose} at least {far:.4g} px, more than the frame's{units}"
 
     # The poses.
 

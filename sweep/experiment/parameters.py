@@ -15,7 +15,6 @@ from sweep.errors import PluginError
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import BoardDetectorSetting, DetectorChoice, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
-from sweep.messages import MAX_FAULTS
 from sweep.model.board_kinds import BoardValues
 from sweep.model.camera import Camera
 from sweep.model.effects import Effects
@@ -209,8 +208,6 @@ def read_plugins(
         if (kind, name) in declared:
             continue
         declared.add((kind, name))
-        if len(faults) == MAX_FAULTS:
-            break  # no more are told
         try:
             if known is not None:
                 raise PluginError("a plug-in that the store has recorded")
@@ -259,11 +256,4 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
             if gathered.setdefault(name, parameter) != parameter:
                 raise PluginError(f"its setting {name} to be declared as that of another plug-in, "
                                   "or another name")
-            try:
-                if setting.default is not None:
-                    parameter.check(setting.default)
-            except ValueError as error:
-                raise PluginError(
-                    f"a default of its setting {name} that is allowed: {error}"
-                ) from None
     return gathered

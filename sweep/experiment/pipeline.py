@@ -643,22 +643,17 @@ def _assigned(
     return chosen
 
 
-def displaced_by(chosen: Collection[str]) -> set[str]:
-    """Return the parameters that give way to chosen ones: other ways to say the same.
-
-    >>> sorted(displaced_by(["distance_m"])), sorted(displaced_by(["side_px", "distance_m"]))
-    (['side_px'], [])
-    """
-    others = {name for each in chosen for name in ALTERNATIVES.get(each, ())}
-    return others.difference(chosen)
-
-
-def _displaced(chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]) -> set[str]:
-    """Return the keys of a document that give way to chosen values.
+def displaced_by(chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]) -> set[str]:
+    """Return the parameters that give way to chosen values.
 
     They are other ways to say the same, and parameters of boards that chosen kinds do not use.
+
+    >>> sorted(displaced_by({"distance_m": 1}, PARAMETERS))
+    ['side_px']
+    >>> displaced_by({"side_px": 20, "distance_m": 1}, PARAMETERS)
+    set()
     """
-    names = displaced_by(chosen)
+    names = {name for each in chosen for name in ALTERNATIVES.get(each, ())}.difference(chosen)
     if "kind" in chosen:
         kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
         used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
@@ -674,7 +669,7 @@ def apply_settings(
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
     makes the parameter fixed or drawn. What the chosen values displace goes.
     """
-    displaced = _displaced(chosen, parameters)
+    displaced = displaced_by(chosen, parameters)
     for table in document.values():
         if isinstance(table, dict):
             for name in table.keys() & displaced:
@@ -987,7 +982,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
         chosen |= axis.at(index or 0)
     chosen |= named
     trial = chosen.pop(TRIAL, 0)
-    for other in displaced_by(named):
+    for other in displaced_by(named, pipeline.parameters):
         chosen.pop(other, None)
     document = _document(pipeline.text, "--at")
     for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing

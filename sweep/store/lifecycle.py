@@ -287,7 +287,7 @@ def root_attributes(
 ) -> dict[str, Any]:
     """Return the attributes of a store's root: texts and numbers, which netCDF can hold."""
     coordinates = [array.path for array in planned if array.coordinate]
-    surprising = pipeline.facts.camera_notes
+    surprising = [*pipeline.facts.camera_notes]
     attributes = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,

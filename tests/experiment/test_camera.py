@@ -143,13 +143,6 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
     ({"camera": {"cx_px": 640, "cy_px": 360, "fx_px": 500}}, "cx_px = 640: outside the frame of"),
     ({"camera": {"width_px": 1280, "height_px": 720, "cx_px": 320, "fx_px": 500}},
      "cx_px = 320: far from the centre of the frame of 1280 x 720 px; is it that of another frame"),
-    ({"camera": {"fx_px": 4.0}}, "HFOV 178.6°: is a focal"),
-    ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 60}},
-     "more than the frame's; are size_m and the distances in metres?"),
-    ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 0.06}, "pose": {"distance_m": 300}},
-     "at most 0.1109 px, less than a pixel a module: too small to be read; are size_m"),
-    ({"camera": {"hfov_deg": 60}},
-     "less than a pixel a module: too small to be read; are size_m"),
     ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},
      "cx_px = 319.5: far from the centre of the frame of 640 to 1280 x 480 px"),
 ])
@@ -161,10 +154,10 @@ def test_what_may_surprise_of_a_camera_is_told(sections, line):
 
 def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
     with calls_here():
-        execute(pipeline({"fx_px": 4}), tmp_path / "s.zarr")
-    assert "HFOV 178.6°" in capfd.readouterr().err
+        execute(pipeline({"fx_px": 400, "cx_px": 700}), tmp_path / "s.zarr")
+    assert "cx_px = 700: outside the frame" in capfd.readouterr().err
     told = sweep.open(tmp_path / "s.zarr").attrs["camera_notes"]
-    assert told.startswith("HFOV 178.6°")
+    assert told.startswith("cx_px = 700: outside the frame")
 
 
 def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():

@@ -120,14 +120,6 @@ class Settings:
     tilt_deg: float = parameter(0.0, "ours")
 D = DetectorPlugin(make=print, settings=Settings)
 """, "another name for its setting tilt_deg: the pipeline has this one"),
-    ("""
-from dataclasses import dataclass
-from sweep.plugins import DetectorPlugin, parameter
-@dataclass
-class Settings:
-    strength: int = parameter(7, "outside", low=0, high=5)
-D = DetectorPlugin(make=print, settings=Settings)
-""", "a default of its setting strength that is allowed: a whole number from 0 to 5"),
 ])
 def test_a_plug_in_that_cannot_be_used_is_one_line(tmp_path, source, told):
     (tmp_path / "mine.py").write_text(source)

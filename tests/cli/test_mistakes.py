@@ -25,7 +25,6 @@ def stores(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mistakes")
     (folder / "small.toml").write_text(TEXT)
     (folder / "few.toml").write_text(TEXT.replace(", trial = 2", ""))
-    (folder / "pipelines").mkdir()
     pipeline = Pipeline.from_toml(folder / "small.toml")
     close(by_hand(str(folder / "runs/small.zarr"), pipeline))
     by_hand(str(folder / "runs/unfinished.zarr"), pipeline)

@@ -12,6 +12,7 @@ import pytest
 
 import sweep
 from support.flags_and_numbers import contradictions
+from support.here import calls_here
 from support.poison import Poison, poisoned, raising
 from support.store_files import edit_receipt, edit_root, editable, files, see_same
 from support.stores import by_hand
@@ -105,7 +106,7 @@ def sound(pipeline, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sound")
     url = str(folder / "sound.zarr")
     store = create_store(url, pipeline, EXTENTS)
-    with raising([FAILED], folder / "notes.jsonl"):
+    with calls_here(), raising([FAILED], folder / "notes.jsonl"):
         for block in store.blocks:
             compute_block(url, store.run_id, block)
     close(store)
@@ -308,7 +309,7 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
 ):
     edit_values(copied, "rotation_error_rad", lambda values: 1.01 * values, receipts_too=True)
     assert verify(str(copied), 0).damage == []
-    with raising([FAILED], tmp_path / "notes.jsonl"):
+    with calls_here(), raising([FAILED], tmp_path / "notes.jsonl"):
         damage = verify(str(copied), 40).damage
     assert damage
     assert all(one.where.startswith("--at ") and "rotation_error_rad" in one.what

@@ -3,6 +3,7 @@
 import shlex
 
 import pytest
+from matplotlib.figure import Figure
 
 import sweep
 from support.stores import by_hand
@@ -110,7 +111,9 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
         ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
     ],
 )
-def test_every_command_ends_with_what_to_do_next(line, command, capsys):
+def test_every_command_ends_with_what_to_do_next(line, command, monkeypatch, capsys):
+    if line.startswith("report"):
+        monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
     code, out, _ = told(capsys, line)
     assert code == 0
     last = out.splitlines()[-1]

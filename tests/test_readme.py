@@ -54,4 +54,4 @@ def test_plan_says_what_a_run_takes(capsys):
     told = capsys.readouterr().out
     assert re.search(r"distance_m +2 +scene +0.2 ... 0.3 m", told)
     assert re.search(r"poses +240", told)
-    assert re.search(r"time +\S+ (s|min)", told)
+    assert re.search(r"time +(over )?\S+ (s|min|h)", told)

@@ -4,13 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from support.board_pictures import (
-    KINDS,
-    NAME,
-    SIZE_M,
-    clipped_frame,
-    parts,
-)
+from support.board_pictures import KINDS, NAME, SIZE_M, clipped_frame, parts
 from support.lengths import first_of, lengths
 from support.small_scenes import image_of, scenes_of
 from sweep.model.board import extent_of, in_space

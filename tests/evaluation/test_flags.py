@@ -18,13 +18,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.board import single_marker
 from sweep.model.scene import Targets
 
-PLAIN = """
-seed = 9
-[pose]
-side_px = 60
-[scene]
-background = 128
-"""
+PLAIN = {"seed": 9, "pose": {"side_px": 60}, "scene": {"background": 128}}
 
 
 def run(pipeline):
@@ -36,7 +30,7 @@ def run(pipeline):
 
 def flags(*settings, folder="."):
     """Return the flags of detection over the whole grid, in its order."""
-    return run(Pipeline.from_text(PLAIN, settings, folder=folder))["detection"].ravel().tolist()
+    return run(Pipeline.from_dict(PLAIN, settings, folder=folder))["detection"].ravel().tolist()
 
 
 SCENES = {

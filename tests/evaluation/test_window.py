@@ -10,9 +10,7 @@ from support.windows import corners_of, outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import visibility_flags
-from sweep.experiment.grid import (
-    Block,
-)
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason
 from sweep.measure.flags import DetectionStatus

@@ -435,17 +435,10 @@ def checked(found):
     return BoundStatus(status)
 
 
-TOLD = """
-seed = 5
-[pose]
-side_px = 50
-tilt_deg = 30
-[scene]
-black = 40
-white = 220
-background = 120
-"""
-
+TOLD = {
+    "seed": 5, "pose": {"side_px": 50, "tilt_deg": 30},
+    "scene": {"black": 40, "white": 220, "background": 120, "bound": "known_blur"},
+}
 FLAGS = {
     BoundStatus.given: [
         [], ["noise_grey=0.5"], ["noise_grey=17.5"], ["gain=0.5"], ["blur_px=1"],
@@ -471,15 +464,6 @@ FLAGS = {
         ["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=36", "side_px=120"],
     ],
 }
-COLUMNS = ("bound_std", "bound_kappa", "mirror_distance")
-
-
-def told(*settings):
-    """The columns of a cell's bound: flag, deviations, kappa and the mirror's distance."""
-    result = run_cells(Pipeline.from_text(TOLD, settings), [])
-    assert not result.failures
-    assert all(len(result.columns[name]) == 1 for name in ("bound", *COLUMNS))
-    return [result.columns[name][0][0] for name in ("bound", *COLUMNS)]
 
 
 @pytest.mark.parametrize(
@@ -492,7 +476,9 @@ def told(*settings):
 def test_every_flag_stands_beside_its_scenes_and_a_number_beside_given_only(expected, settings):
     if not any(setting.startswith("noise_grey") for setting in settings):
         settings = [*settings, "noise_grey=2"]
-    flag, *numbers = told("bound=known_blur", *settings)
+    columns = run_cells(Pipeline.from_dict(TOLD, settings), []).columns
+    flag, *numbers = (columns[name][0][0] for name in (
+        "bound", "bound_std", "bound_kappa", "mirror_distance"))
     assert BoundStatus(flag) == expected
     if expected == BoundStatus.given:
         assert np.isfinite(numbers[0]).all()

@@ -17,11 +17,7 @@ from support.lengths import lengths
 from sweep.measure.estimation import pose_error
 from sweep.model import lens
 from sweep.model.exposure import areas_px
-from sweep.model.pose import (
-    angle_between,
-    rotation_of_vector,
-    vector_of_rotation,
-)
+from sweep.model.pose import angle_between, rotation_of_vector, vector_of_rotation
 from sweep.model.scene import build_scenes
 
 ANGLES = ("tilt_deg", "azimuth_deg", "roll_deg", "bearing_x_deg", "bearing_y_deg")

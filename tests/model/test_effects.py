@@ -12,13 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.blurred import FineImage, sharp_of
-from support.exact_image import (
-    LENSES,
-    modules_of,
-    plane_of,
-    values,
-    visible,
-)
+from support.exact_image import LENSES, modules_of, plane_of, values, visible
 from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
@@ -354,26 +348,17 @@ def test_uneven_light_and_vignetting_are_their_closed_forms(gradient, degrees, p
 
 # Absent effects.
 
-PLAIN = """
-seed = 4
-[camera]
-width_px = 160
-height_px = 120
-[pose]
-jitter_px = 0.5
-tilt_deg = { uniform = [0, 60] }
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 100
-[axes]
-side_px = [12, 30, 60]
-trial = 3
-"""
+PLAIN = {
+    "seed": 4, "camera": {"width_px": 160, "height_px": 120}, "scene": {"background": 100},
+    "pose": {"jitter_px": 0.5, "tilt_deg": {"uniform": [0, 60]},
+             "azimuth_deg": {"uniform": [0, 360]}},
+    "axes": {"side_px": [12, 30, 60], "trial": 3},
+}
 
 
-def images(text, settings=()):
+def images(*settings):
     """Whole frames of every scene of a grid of (side_px, trial) and what else varies, in order."""
-    pipeline = Pipeline.from_text(text, settings)
+    pipeline = Pipeline.from_dict(PLAIN, settings)
     axes = [axis for axis in pipeline.axes if axis.name != "cornerRefinementMethod"]
     shape = tuple(len(axis) for axis in axes)
     indices = [grid.ravel() for grid in np.indices(shape)]
@@ -394,8 +379,8 @@ def images(text, settings=()):
 )
 @pytest.mark.parametrize("distortion", ["[]", "[-0.2, 0.05, 0, 0]"])
 def test_neutral_entry_of_an_axis_is_the_image_without_it_bit_for_bit(axis, neutral, distortion):
-    before, _, _ = images(PLAIN, [f"distortion={distortion}"])
-    after, names, _ = images(PLAIN, [f"distortion={distortion}", axis])
+    before, _, _ = images(f"distortion={distortion}")
+    after, names, _ = images(f"distortion={distortion}", axis)
     position = names.index(axis.partition("=")[0])
     assert np.array_equal(np.take(after, neutral, axis=position), before)
     if not axis.startswith("bit_depth"):

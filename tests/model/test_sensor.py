@@ -25,18 +25,6 @@ FAR = 5.5
 
 # A frame of one level: its marker is 8 px in the middle, and left out.
 
-FLAT = """
-seed = {seed}
-[camera]
-width_px = 1000
-height_px = {height}
-[pose]
-side_px = 8
-tilt_deg = {tilt_deg}
-[scene]
-background = {level}
-"""
-
 
 def scenes_of(pipeline, trial=0):
     axes = pipeline.experiment.scene_axes
@@ -51,10 +39,13 @@ def image_of(pipeline, trial=0, window=None):
 
 def flat(level, *settings, seed=1, trial=0, tilt_deg=0, height=720):
     """Pixels (height - 20, 1000) of a frame of one level, the marker's rows cut out."""
-    text = FLAT.format(level=level, seed=seed, tilt_deg=tilt_deg, height=height)
     if trial:
         settings = (*settings, f"trial={trial + 1}")
-    image = image_of(Pipeline.from_text(text, settings), trial)
+    document = {
+        "seed": seed, "camera": {"width_px": 1000, "height_px": height},
+        "pose": {"side_px": 8, "tilt_deg": tilt_deg}, "scene": {"background": level},
+    }
+    image = image_of(Pipeline.from_dict(document, settings), trial)
     middle = height // 2
     return np.concatenate([image[: middle - 10], image[middle + 10 :]])
 
@@ -180,21 +171,13 @@ def test_full_well_and_saturation_clip():
 # Quantisation.
 
 def test_quantisation_is_rounding_half_up_clipped_and_seen_in_8_bits():
-    text = """
-[camera]
-width_px = 64
-height_px = 48
-[pose]
-side_px = 300
-tilt_deg = 20
-roll_deg = 33
-[scene]
-black = 30.3
-white = 201.7
-background = 90.4
-"""
+    document = {
+        "camera": {"width_px": 64, "height_px": 48}, "pose": {"tilt_deg": 20, "roll_deg": 33},
+        "scene": {"black": 30.3, "white": 201.7, "background": 90.4},
+    }
     for gain, bits in itertools.product((0.01, 0.7, 1.0, 5.0, 1e6), range(8, 17)):
-        pipeline = Pipeline.from_text(text, [f"gain={gain}", f"bit_depth={bits}", "side_px=20"])
+        pipeline = Pipeline.from_dict(
+            document, [f"gain={gain}", f"bit_depth={bits}", "side_px=20"])
         mean, share = marker_levels(scenes_of(pipeline), 0, (0, 0, 64, 48))
         most = 2**bits - 1
         scaled = gain * (mean + (1 - share) * 90.4) * most / 255

@@ -92,8 +92,7 @@ def test_detections_of_a_plain_opencv_loop_are_scored_as_a_run(exchanged):
     assert (ran["estimate"] == EstimateStatus.solved).all()
 
 
-@pytest.mark.parametrize("form", ["beside the corners", "alone"])
-def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, form, tmp_path):
+def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, tmp_path):
     folder, ran = exchanged
     places = {(row["image"], row["id"]): row for row in rows_of(folder / "truth.csv")}
     found = {}
@@ -113,21 +112,15 @@ def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, fo
         pose = dict(zip(("rx", "ry", "rz", "tx", "ty", "tz"),
                         map(repr, [*rvec.ravel().tolist(), *tvec.ravel().tolist()]), strict=True))
         answers.append({"image": image, "id": "", **dict.fromkeys(corner_names, ""), **pose})
-        if form == "beside the corners":
-            answers += [row | dict.fromkeys(pose, "") for row in rows]
     write(tmp_path / "poses.csv", answers)
-    ready = prepare(folder, [tmp_path / "poses.csv"], names=[form.replace(" ", "-")])
+    ready = prepare(folder, [tmp_path / "poses.csv"], names=["poses"])
     assert ready.pipeline.fixed["solver"] == "recorded"
     scored = results_of(ready.pipeline)
     assert (scored["estimate"] == EstimateStatus.solved).all()
     # The places in OpenCV's own frame, by a rotation vector: rounding, and the last step.
     for name in ("translation_error_m", "rotation_error_rad"):
         np.testing.assert_allclose(scored[name], ran[name], atol=2e-7, err_msg=name)
-    if form == "beside the corners":
-        np.testing.assert_array_equal(
-            scored["marker_corner_error_px"], ran["marker_corner_error_px"])
-    else:  # the corners are the image of the pose
-        assert np.nanmax(scored["reprojection_error_px"]) < 1e-9
+    assert np.nanmax(scored["reprojection_error_px"]) < 1e-9  # the corners are the pose's image
 
 
 def test_truth_of_a_charuco_has_its_chessboard(tmp_path):

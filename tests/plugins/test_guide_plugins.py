@@ -8,12 +8,9 @@ import cv2
 import numpy as np
 
 from support.blocks import run_cells
-from support.solving import of_markers
 from sweep.evaluation.inspection import scene_image
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.scene import build_scenes
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
 
@@ -75,14 +72,3 @@ def test_the_effect_is_that_of_plain_numpy():
     expected = np.clip(np.floor(plain * wave + 0.5 + 1e-9), 0, 255)
     np.testing.assert_array_equal(bands[flat], expected[flat])
     assert abs(bands - plain * wave).max() <= 0.5 + 0.5 * 1.25
-
-
-def test_the_solver_finds_the_pose_of_perfect_corners():
-    text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
-    pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
-    scenes = build_scenes(pipeline.experiment.scene_values([np.arange(3)]), 3)
-    found = build(pipeline.experiment.estimators[0])(of_markers(
-        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), [scenes.targets[0]] * 3))
-    np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
-    np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)
-    assert found.reprojection_px.max() < 1e-4

@@ -48,13 +48,13 @@ from sweep.experiment.experiment import Experiment
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.bound import bounds, outside_model
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus
+from sweep.measure.likelihood import bounds, outside_model
 from sweep.model.calibration import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras, Column
-from sweep.model.lens import pack, pack_once
+from sweep.model.lens import pack
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
 from sweep.typing import Floats, Masks
@@ -93,7 +93,7 @@ def assumed_cameras(
     if (coefficients := estimator.believed_distortion) is not None:
         packed = [pack(coefficients)] * len(scenes)
     elif drawn := [each for name in COEFFICIENTS if (each := assumed(name)) is not None]:
-        packed = [pack_once(tuple(row)) for row in np.stack(drawn, axis=1).tolist()]
+        packed = [pack(tuple(row)) for row in np.stack(drawn, axis=1).tolist()]
     if packed is not None:
         lenses = np.array(packed)
         distorted = np.asarray(lenses[:, :14].any(axis=1))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from sweep.evaluation.search import SceneBatch, SearchResult
 from sweep.experiment.parameters import Stage
 from sweep.experiment.schema import BOARD_SCHEMA, PHOTOGRAPH_SCHEMA, SCHEMA
-from sweep.measure.bound import Bounds
 from sweep.measure.classify import TargetScenes
 from sweep.measure.estimation import (
     Estimates,
@@ -26,6 +25,7 @@ from sweep.measure.estimation import (
     squared_deviations,
 )
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.likelihood import Bounds
 from sweep.model.exposure import areas_px
 from sweep.model.polygon import signed_areas
 from sweep.model.pose import vector_of_rotation, viewing_angle

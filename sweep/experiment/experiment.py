@@ -28,7 +28,6 @@ from sweep.experiment.grid import TRIAL, Axis, Block, Grid, combinations
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
-from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import (
     OPENCV,
     AnyDetectorSetting,
@@ -36,6 +35,7 @@ from sweep.measure.detectors import (
     DetectorSetting,
 )
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
+from sweep.measure.likelihood import BoundSetting
 from sweep.model.board_kinds import ARRANGING, arranged_board
 from sweep.model.camera import (
     VIEW_PARAMETERS,
@@ -200,7 +200,7 @@ class Experiment:
             if plugin.kind == "effect":
                 effect = cast("EffectPlugin", plugin.record(self.grid.folder))
                 applied = checked_effect(plugin.name, effect.apply)
-                effects.append(effect_of(plugin).applying(applied))
+                effects.append(dataclasses.replace(effect_of(plugin), apply=applied))
             elif plugin.kind == "renderer":
                 renderer = cast("RendererPlugin", plugin.record(self.grid.folder))
                 renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)

@@ -12,9 +12,9 @@ from typing import Any
 
 from sweep.declaration import Declared, converted, declared_fields
 from sweep.errors import PluginError
-from sweep.measure.bound import BoundSetting
 from sweep.measure.detectors import BoardDetectorSetting, DetectorChoice, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
+from sweep.measure.likelihood import BoundSetting
 from sweep.model.board_kinds import BoardValues
 from sweep.model.camera import Camera
 from sweep.model.effects import Effects

@@ -441,7 +441,7 @@ def targets_are_solved(reading: Reading) -> None:
     def is_of_boards(solver: str, points: str) -> bool:
         known = SOLVERS.get(solver)
         return solver in plugged if known is None else (
-            known.of_boards or (points == "largest_marker" and known.corners_alone))
+            known.of_boards or (points == "largest_marker" and known.method is not None))
 
     apart(("solver", "points"), lambda *chosen: not is_of_boards(*chosen),
           f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.photograph import add_plane, slope_space
-from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.measure.photograph import add_plane, system
+from sweep.measure.surroundings import BoardMarker, clear_modules, ring_modules, surroundings
 from sweep.model.board import Board
 from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image
@@ -104,7 +104,7 @@ class Drawn(NamedTuple):
 def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float) -> Drawn:
     """Return the image (height, width) of edges in pixels, (E, 2, 2), through a point spread."""
     height, width = size
-    space = slope_space(height, width)
+    space = system(height, width)
     edges = MarkerEdges(np.ascontiguousarray(ends.reshape(-1, 4)), sides)
     add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px, PANEL_PX)
     steps = space.rates.reshape(height, width + 1, 4)[:, :width]
@@ -116,9 +116,6 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
 
 # --------------------------------------------------------------------------------------------------
 # What is fitted of photographs: the pixels of some markers, well spread over each frame.
-
-RING_MODULES = 1.5
-"""Widest part of the quiet zone that is fitted, in modules."""
 
 MODELLED_PX = 10.0
 """Pixels around the fitted ones within which print is in the model: what blur and sharpening
@@ -241,11 +238,9 @@ def marker_view(
     if board is not None and marker_id in board.marker_ids:
         on_board = BoardMarker(board, board.marker_ids.index(marker_id))
     clear = marker.margin or 0.0 if on_board is None else clear_modules(on_board)
-    ring = min(max(clear, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
+    ring = ring_modules(marker, on_board)
     extent = np.ceil(4.0 * (ring + MODELLED_PX / module_px)) / 4.0
-    edges = (
-        edges_alone(marker, extent) if on_board is None else surroundings(on_board, extent)
-    )
+    edges = surroundings(on_board or marker, float(extent))
 
     def pixels(points: Floats) -> Floats:
         """Return the true images (n, 2) of columns and rows (n, 2) in modules."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
@@ -297,67 +297,51 @@ class SearchOutput(NamedTuple):
     chessboard_px: Floats = np.zeros((0, 2))
 
 
-@dataclass(frozen=True, slots=True)
-class BoardDetector:
-    """What OpenCV does with markers when it knows the board, by one setting.
+def completed(
+    image: NDArray[np.uint8], board: Board, markers: DetectorOutput,
+    setting: BoardDetectorSetting, of_markers: DetectorSetting,
+) -> SearchOutput:
+    """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
 
-    Attributes
-    ----------
-    setting
-        How it uses the board.
-    markers
-        The detector of markers, of which it takes the refinement of corners.
+    ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and ``cv2.aruco.CharucoDetector.detectBoard``
+    are called without a camera: their homographies are local. ``of_markers`` is the detector whose
+    refinement of corners they take.
     """
-
-    setting: BoardDetectorSetting
-    markers: DetectorSetting
-    _made: dict[Any, Any] = field(default_factory=dict)
-
-    def complete(
-        self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
-    ) -> SearchOutput:
-        """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
-
-        ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and
-        ``cv2.aruco.CharucoDetector.detectBoard`` are called without a camera: their homographies
-        are local.
-        """
-        corners, ids, rejected = markers
-        if ids is None or not len(ids):
-            return SearchOutput(*markers)
-        if self.setting.refineDetectedMarkers and rejected:
-            corners, ids, rejected, _ = self._refining(board.dictionary).refineDetectedMarkers(
-                image, _opencv_board(board), list(corners), ids, list(rejected)
-            )
-            corners, rejected = list(corners), list(rejected)
-        output = SearchOutput(corners, ids, rejected)
-        if board.chessboard is None:
-            return output
-        pixels, found, _, _ = self._charuco(board).detectBoard(
-            image, markerCorners=list(corners), markerIds=ids
+    corners, ids, rejected = markers
+    if ids is None or not len(ids):
+        return SearchOutput(*markers)
+    if setting.refineDetectedMarkers and rejected:
+        refining = _refining(board.dictionary, of_markers)
+        corners, ids, rejected, _ = refining.refineDetectedMarkers(
+            image, _opencv_board(board), list(corners), ids, list(rejected)
         )
-        if found is None or not len(found):
-            return output
-        return output._replace(
-            chessboard_ids=np.asarray(found, dtype=np.int64).ravel(),
-            chessboard_px=np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
-        )
+        corners, rejected = list(corners), list(rejected)
+    output = SearchOutput(corners, ids, rejected)
+    if board.chessboard is None:
+        return output
+    pixels, found, _, _ = _interpolating(board, setting.minMarkers, of_markers).detectBoard(
+        image, markerCorners=list(corners), markerIds=ids
+    )
+    if found is None or not len(found):
+        return output
+    return output._replace(
+        chessboard_ids=np.asarray(found, dtype=np.int64).ravel(),
+        chessboard_px=np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+    )
 
-    def _refining(self, dictionary: str) -> Any:
-        if dictionary not in self._made:
-            self._made[dictionary] = cv2.aruco.ArucoDetector(
-                opencv_dictionary(dictionary), opencv_parameters(self.markers)
-            )
-        return self._made[dictionary]
 
-    def _charuco(self, board: Board) -> Any:
-        if board not in self._made:
-            parameters = cv2.aruco.CharucoParameters()
-            parameters.minMarkers = self.setting.minMarkers
-            self._made[board] = cv2.aruco.CharucoDetector(
-                charuco_board(board), parameters, opencv_parameters(self.markers)
-            )
-        return self._made[board]
+@lru_cache(maxsize=64)
+def _refining(dictionary: str, of_markers: DetectorSetting) -> Any:
+    return cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), opencv_parameters(of_markers))
+
+
+@lru_cache(maxsize=64)
+def _interpolating(board: Board, min_markers: int, of_markers: DetectorSetting) -> Any:
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.minMarkers = min_markers
+    return cv2.aruco.CharucoDetector(
+        charuco_board(board), parameters, opencv_parameters(of_markers)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -541,14 +525,6 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
         return _find_nothing
     record: DetectorPlugin = setting.record()
     return PluggedDetector(setting.plugin.name, record, setting.instance()).find
-
-
-def make_board_detector(
-    setting: AnyDetectorSetting, board_setting: BoardDetectorSetting
-) -> BoardDetector:
-    """Return what finds corners by means of a board, beside the detector of a setting."""
-    of_opencv = setting if isinstance(setting, DetectorSetting) else DetectorSetting()
-    return BoardDetector(board_setting, of_opencv)
 
 
 def _find_nothing(

@@ -348,18 +348,6 @@ def _point_covariance(
     return covariance
 
 
-def covariance_elsewhere(covariance: Floats, arm: Floats) -> Floats:
-    """Return a covariance (6, 6) of a pose for another point of the same body.
-
-    ``arm`` (3,) leads to it from the pose's origin, in the camera frame: a turn by a small ω moves
-    it by ω x arm.
-    """
-    x, y, z = arm.tolist()
-    moves = np.eye(POSE)
-    moves[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-    return np.asarray(moves @ covariance @ moves.T)
-
-
 def squared_deviations(
     rotation_error: Floats, translation_error: Floats, covariance: Floats
 ) -> Floats:

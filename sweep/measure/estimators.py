@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,7 +19,7 @@ from sweep.measure.estimation import (
 )
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photometric import Photometric, PhotometricReal
-from sweep.measure.solver import OPENCV_SOLVERS, OpenCVSolver, PointSolver
+from sweep.measure.solver import OPENCV_SOLVERS, Solver
 from sweep.model.lens import COUNTS
 from sweep.plugins import EstimatorPlugin, Poses
 from sweep.plugins.declared import PluginSetting
@@ -147,10 +146,7 @@ class RecordedPose:
 
     reprojection_limit: float
 
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images: no."""
-        return False
+    needs_images = False
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses; solver_failed where there is none, or none in front of the camera."""
@@ -163,55 +159,8 @@ class RecordedPose:
 # --------------------------------------------------------------------------------------------------
 # The solvers: one record each, the estimator's settings, and from a setting to its estimator.
 
-@dataclass(frozen=True, slots=True)
-class Solver:
-    """One choice of ``solver`` in pipeline files.
-
-    Attributes
-    ----------
-    meaning
-        One line for the reference.
-    build
-        Makes its estimator from an :class:`EstimatorSetting`; called once for each configuration
-        and process.
-    needs_images
-        Whether it uses the pixels: the detections' images are kept for it.
-    guarded
-        Whether the setting ``guarded`` applies to it.
-    planar_only
-        Whether it works for coplanar points alone.
-    recorded
-        Whether it estimates nothing, and takes poses of recorded detections.
-    of_boards
-        Whether it estimates the pose of a board from all its points, too.
-    corners_alone
-        Whether it estimates the pose of a marker from its corners alone.
-    """
-
-    meaning: str
-    build: Callable[[EstimatorSetting], PoseEstimator]
-    needs_images: bool = False
-    guarded: bool = False
-    planar_only: bool = False
-    recorded: bool = False
-    of_boards: bool = False
-    corners_alone: bool = False
-
-
-def _of_opencv(each: OpenCVSolver) -> Solver:
-    return Solver(
-        each.meaning,
-        lambda setting: PointSolver(
-            setting.solver, setting.guarded, setting.reprojection_limit, setting.corner_noise_px,
-            setting.points, setting.refine,
-        ),
-        guarded=each.guarded, planar_only=each.planar_only, of_boards=each.any_points,
-        corners_alone=True,
-    )
-
-
 SOLVERS: dict[str, Solver] = {
-    **{name: _of_opencv(each) for name, each in OPENCV_SOLVERS.items()},
+    **OPENCV_SOLVERS,
     "photometric": Solver(
         "maximum likelihood on the pixels, started from ippe",
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
@@ -332,8 +281,9 @@ class PluggedEstimatorSetting(EstimatorSetting):
     own: PluginSetting
 
 
+@lru_cache(maxsize=1024)
 def build(setting: EstimatorSetting) -> PoseEstimator:
-    """Return the estimator that a setting describes; those of plug-ins are kept by the process.
+    """Return the estimator that a setting describes; kept by the process.
 
     Raises
     ------
@@ -341,13 +291,8 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
         If a plug-in cannot be used.
     """
     if isinstance(setting, PluggedEstimatorSetting):
-        return _kept_plugin(setting)
+        return PluggedEstimator(
+            setting.solver, setting.own.record(), setting.own.instance(),
+            setting.reprojection_limit, setting.corner_noise_px,
+        )
     return SOLVERS[setting.solver].build(setting)
-
-
-@lru_cache(maxsize=1024)
-def _kept_plugin(setting: PluggedEstimatorSetting) -> PluggedEstimator:
-    return PluggedEstimator(
-        setting.solver, setting.own.record(), setting.own.instance(), setting.reprojection_limit,
-        setting.corner_noise_px,
-    )

@@ -25,11 +25,11 @@ from sweep.measure.likelihood import (
     plane_of,
     solve_positive,
 )
-from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.measure.surroundings import BoardMarker, ring_modules, surroundings
 from sweep.model.board import Board
 from sweep.model.coverage import NODES, POSE, WEIGHTS, MarkerEdges
 from sweep.model.lens import jacobian, undistort
-from sweep.model.marker import module_count, overhang
+from sweep.model.marker import module_count
 from sweep.model.polygon import (
     ModuleEdge,
     Optics,
@@ -91,8 +91,8 @@ def _normal(at: float, distance: float, sigma: float) -> tuple[float, float, flo
     )
 
 
-class Slopes(NamedTuple):
-    """A box's image and its slopes; all are 0 between calls.
+class System(NamedTuple):
+    """Scratch space of a box; ``rates`` and ``outside`` are 0 between calls.
 
     Attributes
     ----------
@@ -101,28 +101,35 @@ class Slopes(NamedTuple):
         slopes by x and by y, and that by the point spread's variance.
     outside
         (height, width + 1) steps of the area outside.
+    images
+        (6, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance
+        and the area outside, all as shares of the contrast.
     """
 
     rates: Floats
     outside: Floats
+    images: Floats
 
 
 @compiled
-def slope_space(height: int, width: int) -> Slopes:
+def system(height: int, width: int) -> System:
     """Return the scratch space for a box."""
-    return Slopes(np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)))
+    return System(
+        np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)),
+        np.empty((6, height, width)),
+    )
 
 
 @compiled
 def _add_segment(
-    out: Slopes, jump: float, outside: float, sigma: float, shortest: float,
+    out: System, jump: float, outside: float, sigma: float, shortest: float,
     xa: float, ya: float, xb: float, yb: float,
 ) -> None:
     """Add a straight segment from (xa, ya) to (xb, yb) px of the box.
 
     ``jump`` is the image's step across it, ``outside`` that of the area outside.
     """
-    rates, outsides = out
+    rates, outsides = out.rates, out.outside
     height, width = outsides.shape[0], outsides.shape[1] - 1
     reach = REACH * sigma + 0.5
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
@@ -191,7 +198,7 @@ def _add_segment(
 
 @compiled
 def add_plane(
-    out: Slopes, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
+    out: System, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
     shortest: float,
 ) -> None:
     """Add the edges of a printed plane to ``out``.
@@ -254,6 +261,9 @@ def add_plane(
 MOVED, LINEAR = POSE + 1, 4
 """Parameters that are moved, the pose's and the point spread's variance, and the linear ones."""
 
+SIZE = MOVED + LINEAR
+"""All parameters."""
+
 MAX_TONE = 5.0
 """Largest tone, as a share of the contrast, for which slopes are computed."""
 
@@ -302,35 +312,10 @@ class PhotographView(NamedTuple):
     toned: bool
 
 
-class System(NamedTuple):
-    """Scratch space of a fit.
-
-    Attributes
-    ----------
-    slopes
-        As :func:`slope_space` returns it.
-    images
-        (6, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance
-        and the area outside, all as shares of the contrast.
-    """
-
-    slopes: Slopes
-    images: Floats
-
-
-@compiled
-def system(height: int, width: int) -> System:
-    """Return the scratch space for a box."""
-    return System(slope_space(height, width), np.empty((6, height, width)))
-
-
 @compiled
 def pixel_count(view: PhotographView) -> int:
     """Return how many pixels are fitted."""
-    total = 0
-    for i in range(len(view.spans)):
-        total += view.spans[i, 1] - view.spans[i, 0]
-    return total
+    return int((view.spans[:, 1] - view.spans[:, 0]).sum())
 
 
 @compiled
@@ -373,10 +358,10 @@ def rays_of(optics: Optics, height: int, width: int) -> Floats:
 @compiled
 def draw(view: PhotographView, state: Floats, work: System) -> None:
     """Write the images of a state to ``work.images``."""
-    (rates, outsides), images = work.slopes, work.images
+    rates, outsides, images = work
     height, width = view.levels.shape
     add_plane(
-        work.slopes, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
+        work, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
         Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
         view.panel_px,
     )
@@ -522,15 +507,14 @@ def _squares_of_photograph(
 ) -> float:
     """As :func:`sweep.measure.likelihood.squared_residuals`, by the model of photographs."""
     draw(view, state, work)
-    end = MOVED + LINEAR
-    matrix, linear = np.empty((end + 1, end + 1)), np.zeros(LINEAR)
+    matrix, linear = np.empty((SIZE + 1, SIZE + 1)), np.zeros(LINEAR)
     normal_equations(view, state, work, matrix)
     outside = MOVED + 2
     if matrix[outside, outside] < MIN_OUTSIDE_PX:
         matrix[outside, :] = 0.0
         matrix[:, outside] = 0.0
-    squares = matrix[end, end] - eliminate(
-        matrix[:end, :end], matrix[end, :end], linear, information, gradient
+    squares = matrix[SIZE, SIZE] - eliminate(
+        matrix[:SIZE, :SIZE], matrix[SIZE, :SIZE], linear, information, gradient
     )
     black, contrast, change, toned = linear[0], linear[1], linear[2], linear[3]
     # The level outside was in the image, as a share of the contrast.
@@ -558,9 +542,6 @@ MODELS[PhotographView] = _squares_of_photograph
 
 # --------------------------------------------------------------------------------------------------
 # The box of a photograph that is fitted: its pixels, and the same of half the resolution.
-
-RING_MODULES = 1.5
-"""Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
 
 PADDING_PX = 2
 """Pixels around the fitted ones in the box."""
@@ -594,13 +575,11 @@ def photograph_view(
     toned
         Whether the tone curve is estimated.
     """
-    dictionary, margin = marker.dictionary, marker.margin or 0.0
-    modules = module_count(dictionary)
+    modules = module_count(marker.dictionary)
     with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
         square = from_unit_square(corners[None])[0]
     side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
-    ring = margin if on_board is None else clear_modules(on_board)
-    ring = min(max(ring, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
+    ring = ring_modules(marker, on_board)
     if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
         return None
     to_pixels = square / [modules, modules, 1.0]
@@ -633,12 +612,9 @@ def photograph_view(
     local[2:] -= low
     optics = Optics(local, optics.lens, optics.distorted)
     extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
-    around = (
-        edges_alone(marker, extent) if on_board is None else surroundings(on_board, extent)
-    )
     known = MarkerView(
-        around, np.repeat([-extent, modules + extent], 2), float(modules), float(size_m), optics,
-        0.0, MIN_SPREAD_PX, FLAT,
+        surroundings(on_board or marker, extent), np.repeat([-extent, modules + extent], 2),
+        float(modules), float(size_m), optics, 0.0, MIN_SPREAD_PX, FLAT,
     )
     to_modules[:, 2] += to_modules[:, :2] @ low
     at, spans = _fitted_pixels(
@@ -747,6 +723,13 @@ CORRELATED = 1.0
 squared errors of poses on photographs of boards are about those expected; if shifts were
 independent, they would be two to three times that."""
 
+_NODES = np.array([divmod(k, SHIFT_NODES) for k in range(SHIFT_NODES**2)])
+_CORRELATIONS = np.kron(np.array([
+    [math.exp(-2.0 / (SHIFT_NODES - 1) * math.hypot(*apart) / CORRELATED) for apart in _NODES - at]
+    for at in _NODES
+]), np.eye(2)).astype(np.float64)
+"""(n, n) correlations of the components of the nodes' shifts: x and y of each node."""
+
 LARGEST_SHIFT_PX = 1.0
 """Standard deviation of shifts before the residuals are seen; keeps what they do not tell small."""
 
@@ -770,10 +753,15 @@ def _node(at: float) -> int:
 
 
 @compiled
-def _component(cell: int, k: int) -> int:
-    """Return the number, among all components, of the k-th of those that a cell holds."""
-    row, column = cell // (SHIFT_NODES - 1), cell % (SHIFT_NODES - 1)
-    return 2 * ((row + k // 4) * SHIFT_NODES + column + k // 2 % 2) + k % 2
+def _column(cell: int, k: int) -> int:
+    """Return the number, among all columns, of the k-th of those that a cell has.
+
+    Columns are those by the parameters, the level, and those by the nodes' components.
+    """
+    if k <= SIZE:
+        return k
+    row, column, k = cell // (SHIFT_NODES - 1), cell % (SHIFT_NODES - 1), k - SIZE - 1
+    return SIZE + 1 + 2 * ((row + k // 4) * SHIFT_NODES + column + k // 2 % 2) + k % 2
 
 
 @compiled
@@ -811,35 +799,29 @@ def _run_of_a_cell(view: PhotographView, i: int, first: int, last: int) -> tuple
 
 @compiled
 def _write_cell(
-    view: PhotographView, state: Floats, images: Floats, i: int, first: int,
-    size: int, columns: Floats,
+    view: PhotographView, state: Floats, images: Floats, i: int, first: int, columns: Floats
 ) -> tuple[int, int]:
-    """Write the columns of a row's pixels of one cell: by parameters, the level, by shifts.
+    """Write the columns of a row's pixels of one cell.
 
     ``first`` is the first pixel. Returns the cell, and the pixel after the last.
     """
     cell, stop = _run_of_a_cell(view, i, first, view.spans[i, 1])
     group = columns[: stop - first]
     write_columns(view, state, state[WHITE] - state[BLACK], images, i, first, group)
-    _write_shifts(view, state, images, i, first, cell, group, size + 1)
+    _write_shifts(view, state, images, i, first, cell, group, SIZE + 1)
     return cell, stop
 
 
 @compiled
-def _products(
-    view: PhotographView, state: Floats, images: Floats, size: int
-) -> Floats:
-    """Return the products (cells, n, n) of the columns of each cell's pixels.
-
-    Columns are those by the ``size`` parameters, the level, and those by the nodes' components.
-    """
-    tiles = (size + 1 + HELD + TILE - 1) // TILE
+def _products(view: PhotographView, state: Floats, images: Floats) -> Floats:
+    """Return the products (cells, n, n) of the columns of each cell's pixels: lower triangles."""
+    tiles = (SIZE + 1 + HELD + TILE - 1) // TILE
     sums = np.zeros(((SHIFT_NODES - 1) ** 2, TILE * tiles, TILE * tiles))
     columns = np.zeros((GROUP, TILE * tiles))
     for i in range(len(view.spans)):
         first, last = view.spans[i]
         while first < last:
-            cell, stop = _write_cell(view, state, images, i, first, size, columns)
+            cell, stop = _write_cell(view, state, images, i, first, columns)
             add_products(columns, stop - first, sums[cell])
             first = stop
     return sums
@@ -858,34 +840,26 @@ def _correlated_products(
     above, pairs = np.zeros((width, WIDE)), np.zeros((width, WIDE))
     passed, sums = np.empty((width, POSE)), np.zeros((WIDE, WIDE))
     for i in range(height):
-        row = field[i]
-        a = b = c = d = e = f = 0.0
+        row, carried = field[i], np.zeros(POSE)
         for j in range(width):
             at, before = row[j], passed[j]
-            before[0], before[1], before[2], before[3], before[4], before[5] = a, b, c, d, e, f
-            a, b, c = across * (a + at[0]), across * (b + at[1]), across * (c + at[2])
-            d, e, f = across * (d + at[3]), across * (e + at[4]), across * (f + at[5])
-        a = b = c = d = e = f = 0.0
+            for m in range(POSE):
+                before[m] = carried[m]
+                carried[m] = across * (carried[m] + at[m])
+        carried = np.zeros(POSE)
         for j in range(width - 1, -1, -1):
             at, before, sum_above, pair = row[j], passed[j], above[j], pairs[j]
-            a, b, c, d, e, f = a + at[0], b + at[1], c + at[2], d + at[3], e + at[4], f + at[5]
-            before[0], before[1], before[2] = before[0] + a, before[1] + b, before[2] + c
-            before[3], before[4], before[5] = before[3] + d, before[4] + e, before[5] + f
-            a, b, c = across * a, across * b, across * c
-            d, e, f = across * d, across * e, across * f
             for m in range(POSE):
+                total = carried[m] + at[m]
+                carried[m] = across * total
                 weighted = along * sum_above[m]
-                sum_above[m] = weighted + before[m]
-                pair[m] = 2.0 * weighted + before[m]
+                sum_above[m] = weighted + (before[m] + total)
+                pair[m] = 2.0 * weighted + (before[m] + total)
         first, last = view.spans[i]
         for k in range(0, WIDE, TILE):
             for m in range(0, WIDE, TILE):
                 add_tile(row[first:last], k, pairs[first:last], m, last - first, sums)
-    products = np.empty((POSE, POSE))
-    for k in range(POSE):
-        for m in range(POSE):
-            products[k, m] = 0.5 * (sums[k, m] + sums[m, k])
-    return products
+    return 0.5 * (sums + sums.T)[:POSE, :POSE]
 
 
 @compiled
@@ -911,21 +885,6 @@ def _ratio(lagged: float, variance: float) -> float:
 
 
 @compiled
-def _correlations() -> Floats:
-    """Return the correlations (n, n) of the components of the nodes' shifts."""
-    count = 2 * SHIFT_NODES * SHIFT_NODES
-    correlations = np.zeros((count, count))
-    for a in range(count):
-        for b in range(count):
-            if a % 2 == b % 2:
-                across = a // 2 % SHIFT_NODES - b // 2 % SHIFT_NODES
-                down = a // 2 // SHIFT_NODES - b // 2 // SHIFT_NODES
-                distance = 2.0 / (SHIFT_NODES - 1) * math.sqrt(across**2 + down**2)
-                correlations[a, b] = math.exp(-distance / CORRELATED)
-    return correlations
-
-
-@compiled
 def judge(
     view: PhotographView, state: Floats, work: System, covariance: Floats
 ) -> float:
@@ -936,42 +895,28 @@ def judge(
 
     """
     draw(view, state, work)
-    size = MOVED + LINEAR
     height, width = view.levels.shape
     pixels, nodes = pixel_count(view), 2 * SHIFT_NODES * SHIFT_NODES
-    sums = _products(view, state, work.images, size)
-    matrix, levels = np.zeros((size, size)), np.zeros((size, 1))
-    crossed, inner, pull = np.zeros((size, nodes)), np.zeros((nodes, nodes)), np.zeros((nodes, 1))
+    sums = _products(view, state, work.images)
+    total, mean_square = np.zeros((SIZE + 1 + nodes, SIZE + 1 + nodes)), 0.0
     for cell in range(len(sums)):
-        of_cell = sums[cell]
-        for k in range(size):
-            levels[k, 0] += of_cell[size, k]
-            for m in range(size):
-                matrix[k, m] += of_cell[max(k, m), min(k, m)]
-        for a in range(HELD):
-            at = _component(cell, a)
-            row = of_cell[size + 1 + a]
-            pull[at, 0] += row[size]
-            for k in range(size):
-                crossed[k, at] += row[k]
-            for b in range(HELD):
-                inner[at, _component(cell, b)] += of_cell[
-                    size + 1 + max(a, b), size + 1 + min(a, b)
-                ]
-    inverse = np.eye(size)
-    for k in range(size):
+        mean_square += sums[cell, SIZE, SIZE] / pixels
+        for k in range(SIZE + 1 + HELD):
+            for m in range(SIZE + 1 + HELD):
+                total[_column(cell, k), _column(cell, m)] += sums[cell, max(k, m), min(k, m)]
+    matrix, levels = total[:SIZE, :SIZE].copy(), total[:SIZE, SIZE : SIZE + 1].copy()
+    crossed, pull = total[:SIZE, SIZE + 1 :].copy(), total[SIZE + 1 :, SIZE : SIZE + 1].copy()
+    inverse = np.eye(SIZE)
+    for k in range(SIZE):
         matrix[k, k] = matrix[k, k] * (1.0 + 1e-9) if matrix[k, k] > 0.0 else 1.0
-    freedom = pixels - size - nodes
+    freedom = pixels - SIZE - nodes
     if freedom < 1 or not solve_positive(matrix, inverse):
         return math.nan
     influence, fitted = _product(inverse, crossed), _product(inverse, levels)
-    schur = inner - _product(crossed.T, influence)
+    schur = total[SIZE + 1 :, SIZE + 1 :] - _product(crossed.T, influence)
     pull -= _product(crossed.T, fitted)
     shifts, ridged = pull.copy(), schur.copy()
-    mean_square = 0.0
-    for cell in range(len(sums)):
-        mean_square += sums[cell, size, size] / pixels
-    for k in range(size):
+    for k in range(SIZE):
         mean_square -= fitted[k, 0] * levels[k, 0] / pixels
     for k in range(nodes):
         ridged[k, k] += max(mean_square, 0.0) / LARGEST_SHIFT_PX**2 + 1e-12
@@ -992,22 +937,15 @@ def judge(
     raised = 0.0
     for m in range(POSE):
         raised += covariance[m, m] / (variance * inverse[m, m] * POSE) if variance > 0.0 else 0.0
-    correlations = _correlations()
     spread = _product(schur, schur)
-    noise_pull = expected = trace = square_trace = 0.0
-    for a in range(nodes):
-        noise_pull += pull[a, 0] ** 2
-        trace += schur[a, a]
-        for b in range(nodes):
-            expected += correlations[a, b] * spread[a, b]
-            square_trace += schur[a, b] ** 2
+    square_trace = (schur * schur).sum()
     # The noise alone gives a pull of that mean, and of this standard deviation.
-    excess = noise_pull - raised * variance * trace
+    excess = (pull * pull).sum() - raised * variance * np.trace(schur)
     chance = SIGNIFICANT * raised * variance * math.sqrt(2.0 * square_trace)
-    shift_variance = excess / expected if excess > chance else 0.0
+    shift_variance = excess / (_CORRELATIONS * spread).sum() if excess > chance else 0.0
     misfit = math.sqrt(excess / square_trace) if excess > chance else 0.0
     of_pose = influence[:POSE]
-    shifted = _product(of_pose, _product(correlations, of_pose.T))
+    shifted = _product(of_pose, _product(_CORRELATIONS, of_pose.T))
     distance = abs(state[DEPTH])
     for m in range(POSE):
         for k in range(POSE):
@@ -1021,34 +959,28 @@ def _write_residuals(
     view: PhotographView, state: Floats, images: Floats, inverse: Floats,
     fitted: Floats, shifts: Floats, field: Floats,
 ) -> None:
-    """Write the pose's changes by the pixels' levels, and residuals, to ``field``."""
-    size = len(fitted)
-    columns, weights = np.empty((GROUP, size + 1 + HELD)), np.zeros((size + 1, WIDE))
+    """Write the pose's changes by the pixels' levels, and residuals, to ``field``, which is 0."""
+    columns, weights = np.empty((GROUP, SIZE + 1 + HELD)), np.zeros((SIZE + 1, WIDE))
     of_cell = np.empty(HELD)
-    weights[size, RESIDUAL] = 1.0
-    for k in range(size):
+    weights[SIZE, RESIDUAL] = 1.0
+    for k in range(SIZE):
         weights[k, RESIDUAL] = -fitted[k, 0]
         for m in range(POSE):
             weights[k, m] = inverse[k, m]
     for i in range(len(view.spans)):
         first, last = view.spans[i]
         while first < last:
-            cell, stop = _write_cell(view, state, images, i, first, size, columns)
+            cell, stop = _write_cell(view, state, images, i, first, columns)
             for a in range(HELD):
-                of_cell[a] = shifts[_component(cell, a), 0]
+                of_cell[a] = shifts[_column(cell, SIZE + 1 + a) - SIZE - 1, 0]
             for j in range(stop - first):
                 column, out = columns[j], field[i, first + j]
-                s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-                for k in range(size + 1):
+                for k in range(SIZE + 1):
                     value, weight = column[k], weights[k]
-                    s0, s1 = s0 + value * weight[0], s1 + value * weight[1]
-                    s2, s3 = s2 + value * weight[2], s3 + value * weight[3]
-                    s4, s5 = s4 + value * weight[4], s5 + value * weight[5]
-                    s6, s7 = s6 + value * weight[6], s7 + value * weight[7]
+                    for m in range(WIDE):
+                        out[m] += value * weight[m]
                 for a in range(HELD):
-                    s6 -= column[size + 1 + a] * of_cell[a]
-                out[0], out[1], out[2], out[3] = s0, s1, s2, s3
-                out[4], out[5], out[6], out[7] = s4, s5, s6, s7
+                    out[RESIDUAL] -= column[SIZE + 1 + a] * of_cell[a]
             first = stop
 
 

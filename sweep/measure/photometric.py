@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sweep.compilation import compiled
-from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere
+from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
@@ -19,6 +19,7 @@ from sweep.measure.likelihood import (
     DEPTH,
     GREY_LEVELS,
     MIN_NOISE,
+    MODELS,
     NEARLY_SETTLED,
     POSITION,
     SETTLED,
@@ -28,18 +29,17 @@ from sweep.measure.likelihood import (
     MarkerView,
     Pixels,
     binned_view,
+    covariance_elsewhere,
     descend,
     halve,
     is_before_camera,
     marker_view,
     middle_m,
     mirrored_state,
-    moved_state,
     noise_variance,
     overwrite,
     pose_covariance,
     rotation_of,
-    solve_positive,
     squared_residuals,
     squares,
     state_of,
@@ -47,8 +47,8 @@ from sweep.measure.likelihood import (
     unit_of,
 )
 from sweep.measure.photograph import (
-    LINEAR,
     MOVED,
+    SIZE,
     PhotographView,
     binned_photograph,
     judge,
@@ -64,13 +64,11 @@ from sweep.measure.solver import (
     poses_of_each_marker,
     reprojection_px,
 )
-from sweep.measure.surroundings import BoardMarker
-from sweep.model.board import Board, box_corners, extent_of, own_sheets, sheets_m, unit_m
-from sweep.model.camera import Cameras
-from sweep.model.coverage import LEVELS, POSE, known_pixels, work_space
+from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
+from sweep.model.coverage import LEVELS, POSE, Work, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.typing import Floats, Grey, Integers, Masks
+from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------
 # The best minimum and the next one, from several starts.
@@ -114,18 +112,6 @@ EXACT = Search(NEARLY_SETTLED, SETTLED, 100.0)
 REAL = Search(4.0, 16.0, 50.0)
 """Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
 Fits of all pixels chose the mirror at an excess of at most 44."""
-
-
-@compiled
-def least(values: Floats) -> float:
-    """Return the least of some values; NaN if one is NaN."""
-    lowest = values[0]
-    for value in values:
-        if not value >= lowest:
-            lowest = value
-        if math.isnan(lowest):
-            break
-    return float(lowest)
 
 
 @compiled
@@ -183,7 +169,7 @@ def locate(
 
     def most_of(levels: Floats) -> float:
         """Return the sum of squares from which a coarse fit is hopeless."""
-        lowest = least(levels)
+        lowest = float(levels.min())
         return lowest + search.hopeless * unit_of(coarse.marker, lowest, coarse_freedom)
 
     levels = np.full(count, math.inf)
@@ -247,7 +233,7 @@ def locate_exactly(
     image: Floats, starts: Floats, view: MarkerView, information: Floats
 ) -> tuple[Floats, float, bool, Floats, int]:
     """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
-    freedom = known_pixels(image) - len(information) - LEVELS
+    freedom = int((~np.isnan(image)).sum()) - len(information) - LEVELS
     small = np.empty((image.shape[0] // 2, image.shape[1] // 2))
     halve(image, 0.25, small)
     found = locate(
@@ -259,50 +245,54 @@ def locate_exactly(
     return *found, freedom
 
 
-SIGHTS = 40
-"""How often at most it is determined what is seen of a target in several planes."""
+class InSight(NamedTuple):
+    """As :class:`sweep.measure.likelihood.Pixels`, of a target in several planes.
+
+    What sheets hide of others depends on the pose: ``seen_from`` determines it again at each state;
+    of ``marker`` only what does not depend on it is used.
+    """
+
+    levels: Floats
+    square_sum: float
+    marker: MarkerView
+    seen_from: Callable[[Pose], MarkerView]
+
+
+def _squares_in_sight(
+    seen: InSight, state: Floats, work: Work, information: Floats, gradient: Floats
+) -> float:
+    """As :func:`sweep.measure.likelihood.squared_residuals`, with what is seen at the state."""
+    view = seen.seen_from((rotation_of(state), state[POSITION]))
+    pixels = Pixels(seen.levels, seen.square_sum, view)
+    return squared_residuals(pixels, state, work, information, gradient)
+
+
+MODELS[InSight] = _squares_in_sight
+
+_descend_in_sight = getattr(descend, "py_func", descend)
+"""The same steps without compilation: what is seen is determined in Python."""
 
 
 def locate_in_sight(
     image: Floats, starts: Floats, seen_from: Callable[[Pose], MarkerView], information: Floats
 ) -> tuple[Floats, float, bool, Floats, int]:
-    """Return what :func:`locate_exactly` does of a target in several planes.
-
-    Levenberg-Marquardt from each start. What sheets hide of others depends on the pose: it is
-    determined again, by ``seen_from``, at each state that is tried.
-    """
+    """Return what :func:`locate_exactly` does of a target in several planes, from each start."""
     free, square_sum, work = len(information), squares(image), work_space(*image.shape)
-    freedom = known_pixels(image) - free - LEVELS
-    missing = np.full(STATE_LENGTH, math.nan)
+    freedom = int((~np.isnan(image)).sum()) - free - LEVELS
+    missing, found = np.full(STATE_LENGTH, math.nan), np.empty((free, free))
     fits = [(missing, math.inf, False), (missing, math.inf, False)]
-    found, gradient = np.empty((free, free)), np.empty(free)
     for start in starts:
-        trial, state, lowest, damping = start, start, math.inf, 1e-3
-        matrix, downhill, reached = found, gradient, False
-        for _ in range(SIGHTS):
-            view = seen_from((rotation_of(trial), trial[POSITION]))
-            if is_before_camera(trial, view):
-                level = squared_residuals(
-                    Pixels(image, square_sum, view), trial, work, found, gradient
-                )
-                if level < lowest:
-                    state, lowest, damping = trial, level, 0.1 * damping
-                    matrix, downhill = found.copy(), gradient.copy()
-                else:
-                    damping = max(10.0 * damping, 1e-3)
-            newton = downhill.reshape(free, 1).copy()
-            if not (lowest < math.inf and solve_positive(matrix, newton)):
-                break
-            if downhill @ newton[:, 0] < SETTLED * view.variance:
-                reached = True
-                break
-            step = downhill.reshape(free, 1).copy()
-            solve_positive(matrix + damping * np.diag(np.diag(matrix)), step)
-            trial = moved_state(state, step[:, 0], view.least_spread_px)
-        if lowest < fits[0][1]:
-            information[:] = matrix
+        state, level, reached = start.copy(), math.inf, False
+        view = seen_from((rotation_of(start), start[POSITION]))
+        if is_before_camera(state, view):
+            level, reached = _descend_in_sight(
+                InSight(image, square_sum, view, seen_from), state, work, freedom, FINE_STEPS,
+                SETTLED, math.inf, found,
+            )
+        if level < fits[0][1]:
+            information[:] = found
         if all(not turn_between(state, each[0]) < SAME_TURN_RAD for each in fits):
-            fits.append((state, lowest, reached))
+            fits.append((state, level, reached))
         fits = sorted(fits, key=lambda fit: fit[1])
     (state, level, reached), (other, _, _), *_ = fits
     return state, level, reached, other, freedom
@@ -317,7 +307,7 @@ def locate_photograph(
     ``covariance`` (6, 6) gets that of the pose in radians and metres; the misfit is NaN if there is
     none.
     """
-    freedom = pixel_count(view) - MOVED - LINEAR
+    freedom = pixel_count(view) - SIZE
     coarse = binned_photograph(view)
     work = system(view.levels.shape[0], view.levels.shape[1])
     state, level, reached, other = locate(
@@ -340,102 +330,51 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
 
 
 # --------------------------------------------------------------------------------------------------
-# What was found of a target, marker or board: a marker is a board of one square.
+# First poses of one target, marker or board, and the part of the image that is fitted.
 
-class Found(NamedTuple):
-    """One target, and what was found of it.
-
-    Attributes
-    ----------
-    key, size_m, middle_m
-        What is printed, its first marker's side, and the middle (3,) of it in its own frame.
-    objects_m, corners
-        (k, 4, 3) corners of the markers that were found in the target's frame, and (k, 4, 2) px.
-    cameras, noise_grey, blur_px
-        The camera, and what is assumed of its pixels.
-    image, origin, beside
-        The window that was searched, its first pixel in the frame, and which pixels show something
-        beside the target.
-    on_board, planar
-        Of a marker that of a board which it is, None for one alone, and both planar solutions.
-    """
-
-    key: Board
-    size_m: float
-    middle_m: Floats
-    objects_m: Floats
-    corners: Floats
-    cameras: Cameras
-    noise_grey: float
-    blur_px: float
-    image: Grey
-    origin: Integers
-    beside: Masks | None = None
-    on_board: BoardMarker | None = None
-    planar: tuple[Pose, ...] = ()
-
-
-def found_targets(detections: Detections) -> Iterator[Found]:
-    """Yield what was found of each target."""
-    planar = both_planar_solutions(
-        detections.corners, detections.cameras, detections.size_m
-    ) if detections.targets.are_markers else None
-    for i, target in enumerate(detections.targets):
-        one, scale = detections.take(np.array([i])), float(detections.scale[i])
-        size_m = scale * unit_m(target) * module_count(target.dictionary)
-        yield Found(
-            target, float(one.size_m[0]) if target.is_marker else size_m,
-            scale * middle_m(target), one.objects_m, one.corners, one.cameras,
-            float(one.noise_grey[0]), float(one.blur_px[0]), one.images[0], one.origins[0],
-            one.beside[0] if len(one.beside) else None,
-            None if one.on_board is None else one.on_board[0],
-            () if planar is None else tuple(zip(*(each[i] for each in planar), strict=True)),
-        )
-
-
-def first_poses(found: Found, *, refined: bool) -> list[Pose]:
+def first_poses(one: Detections, planar: Sequence[Pose], *, refined: bool) -> list[Pose]:
     """Return poses of a target from its corners, and from those after ``cv2.cornerSubPix``.
 
-    Of one marker both planar solutions. Of several the poses from the corners of all of them, and
-    that of the marker on which most of the others agree: one marker that is wrong spoils the
-    former.
+    Of one marker both planar solutions, of its corners as detected ``planar``. Of several the poses
+    from the corners of all of them, and that of the marker on which most of the others agree: one
+    marker that is wrong spoils the former.
     """
-    if found.key.is_marker:
-        poses = [*found.planar]
+    if one.targets.are_markers:
+        poses = [*planar]
         if refined:
             rotation, translation = both_planar_solutions(
-                refined_corners(found), found.cameras, np.array([found.size_m])
+                refined_corners(one), one.cameras, one.size_m
             )
             poses += zip(rotation[0], translation[0], strict=True)
         return poses
-    poses = []
-    for corners in (found.corners, refined_corners(found)) if refined else (found.corners,):
-        points, pixels = found.objects_m.reshape(-1, 3), corners.reshape(-1, 2)
-        guard = GuardedPoints.of(points, pixels, found.cameras)
+    poses, points = [], one.objects_m.reshape(-1, 3)
+    for corners in (one.corners, refined_corners(one)) if refined else (one.corners,):
+        pixels = corners.reshape(-1, 2)
+        guard = GuardedPoints.of(points, pixels, one.cameras)
         poses += guard.poses(cv2.SOLVEPNP_IPPE) + guard.poses(cv2.SOLVEPNP_ITERATIVE)
         if len(corners) > 1:
-            each = poses_of_each_marker(points, pixels, found.cameras)
-            away = [_typical_error_px(pose, found, corners) for pose in each]
+            each = poses_of_each_marker(points, pixels, one.cameras)
+            away = [_typical_error_px(pose, one, corners) for pose in each]
             poses += [each[k] for k in np.argsort(away)[:1].tolist() if math.isfinite(away[k])]
     return poses
 
 
-def _typical_error_px(pose: Pose, found: Found, corners: Floats) -> float:
+def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
     """Return the median of the markers' reprojection errors; NaN becomes infinite."""
     errors = [
-        reprojection_px(*pose, objects, pixels, found.cameras)
-        for objects, pixels in zip(found.objects_m, corners, strict=True)
+        reprojection_px(*pose, objects, pixels, one.cameras)
+        for objects, pixels in zip(one.objects_m, corners, strict=True)
     ]
     return float(np.median(np.nan_to_num(errors, nan=math.inf)))
 
 
-def refined_corners(found: Found) -> Floats:
+def refined_corners(one: Detections) -> Floats:
     """Return the corners (k, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    refined = found.corners.copy()
-    for k, corners in enumerate(found.corners - found.origin):
-        moved = refined_quad(found.image, corners, module_count(found.key.dictionary))
+    refined, (image,), (origin,) = one.corners.copy(), one.images, one.origins
+    for k, corners in enumerate(one.corners - origin):
+        moved = refined_quad(image, corners, module_count(one.targets[0].dictionary))
         if moved is not None:
-            refined[k] = moved + found.origin
+            refined[k] = moved + origin
     return refined
 
 
@@ -463,37 +402,46 @@ def start_states(
     return np.array([each for each in states if np.isfinite(each).all()])
 
 
-def window_of(found: Found, poses: list[Pose]) -> list[int]:
+def first_side_m(one: Detections) -> float:
+    """Return the assumed side of a target's first marker."""
+    target = one.targets[0]
+    if target.is_marker:
+        return float(one.size_m[0])
+    return float(one.scale[0]) * unit_m(target) * module_count(target.dictionary)
+
+
+def window_of(one: Detections, poses: list[Pose]) -> list[int]:
     """Return what is fitted of the image: left, top, right, bottom.
 
     Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
     of a board its sheet in any of the poses.
     """
-    if found.key.is_marker:
-        dictionary, quiet = found.key.dictionary, found.key.margin or 0.0
-        low, high = found.corners[0].min(axis=0), found.corners[0].max(axis=0)
-        share = 1.5 * quiet / module_count(dictionary)
+    (target,), (image,), (origin,) = one.targets, one.images, one.origins
+    modules = module_count(target.dictionary)
+    if target.is_marker:
+        low, high = one.corners[0].min(axis=0), one.corners[0].max(axis=0)
+        share = 1.5 * (target.margin or 0.0) / modules
         margin = BACKGROUND_MARGIN_PX + share * (high - low)
         low, high = low - margin, high + margin
     else:
-        scale = found.size_m / module_count(found.key.dictionary)
+        scale = first_side_m(one) / modules
         sheet = (
-            box_corners(extent_of(found.key).target[None]) * scale if found.key.is_planar
-            else sheets_m(found.key)[: own_sheets(found.key)].reshape(1, -1, 3)
-            * (scale / unit_m(found.key))
+            box_corners(extent_of(target).target[None]) * scale if target.is_planar
+            else sheets_m(target)[: own_sheets(target)].reshape(1, -1, 3)
+            * (scale / unit_m(target))
         )
         pixels = np.concatenate([
-            found.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
+            one.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
             for rotation, translation in poses
         ])
         if not np.isfinite(pixels).any():
             return [0, 0, 0, 0]
         low = np.nanmin(pixels, axis=0) - BACKGROUND_MARGIN_PX
         high = np.nanmax(pixels, axis=0) + BACKGROUND_MARGIN_PX
-    size = np.array(found.image.shape[::-1])
+    size = np.array(image.shape[::-1])
     window: list[int] = np.concatenate([
-        np.clip(np.floor(low) - found.origin, 0, size),
-        np.clip(np.ceil(high) + 1 - found.origin, 0, size),
+        np.clip(np.floor(low) - origin, 0, size),
+        np.clip(np.ceil(high) + 1 - origin, 0, size),
     ]).astype(np.int64).tolist()
     return window
 
@@ -530,65 +478,69 @@ class Photometric:
     refined: bool
     spread_free: bool
 
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images: yes."""
-        return True
+    needs_images = True
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with their covariances."""
-        out = Estimates.none(len(detections.origins), EstimateStatus.solver_failed)
-        for i, found in enumerate(found_targets(detections)):
-            if found.corners.size < 2 * MIN_POINTS:
+        out = Estimates.none(len(detections), EstimateStatus.solver_failed)
+        planar = both_planar_solutions(
+            detections.corners, detections.cameras, detections.size_m
+        ) if detections.targets.are_markers else ()
+        for i in range(len(detections)):
+            one = detections.take(np.array([i]))
+            if one.corners.size < 2 * MIN_POINTS:
                 out.status[i] = EstimateStatus.too_few_points
                 continue
-            poses = first_poses(found, refined=self.refined)
-            states = self._fitted(found, poses, out, i) if poses else None
+            both = list(zip(*(each[i] for each in planar), strict=True))
+            poses = first_poses(one, both, refined=self.refined)
+            middle = float(one.scale[0]) * middle_m(one.targets[0])
+            states = self._fitted(one, poses, middle, out, i) if poses else None
             if states is None:
                 continue
-            points, pixels = found.objects_m.reshape(-1, 3), found.corners.reshape(-1, 2)
+            points, pixels = one.objects_m.reshape(-1, 3), one.corners.reshape(-1, 2)
             out.rotation[i], out.translation[i] = rotation_of(states[0]), states[0][POSITION]
             out.alternative_rotation[i] = rotation_of(states[1])
             out.reprojection_px[i], out.alternative_reprojection_px[i] = (
                 reprojection_px(
-                    rotation_of(state), state[POSITION] - rotation_of(state) @ found.middle_m,
-                    points, pixels, found.cameras,
+                    rotation_of(state), state[POSITION] - rotation_of(state) @ middle,
+                    points, pixels, one.cameras,
                 ) for state in states
             )
             out.point_count[i] = len(pixels)
-            arm = -out.rotation[i] @ found.middle_m
+            arm = -out.rotation[i] @ middle
             if arm.any():
                 out.translation[i] += arm
                 out.covariance[i] = covariance_elsewhere(out.covariance[i], arm)
         return out
 
     def _fitted(
-        self, found: Found, poses: list[Pose], out: Estimates, i: int
+        self, one: Detections, poses: list[Pose], middle: Floats, out: Estimates, i: int
     ) -> tuple[Floats, Floats] | None:
         """Write all but poses of an estimate; return the states of the best and next minimum.
 
-        Returns None if there is no pose.
+        Returns None if there is no pose. ``middle`` (3,) is what states are the pose of.
         """
-        spread = max(found.blur_px, LIKELY_SPREAD_PX) if self.spread_free else found.blur_px
-        starts = start_states(poses, found.middle_m, spread)
-        left, top, right, bottom = window_of(found, poses)
+        noise_grey, blur_px = float(one.noise_grey[0]), float(one.blur_px[0])
+        spread = max(blur_px, LIKELY_SPREAD_PX) if self.spread_free else blur_px
+        starts = start_states(poses, middle, spread)
+        left, top, right, bottom = window_of(one, poses)
         if not len(starts) or right - left < 2 or bottom - top < 2:
             return None
-        image = found.image[top:bottom, left:right].astype(np.float64)
-        if found.beside is not None:
-            image[found.beside[top:bottom, left:right]] = np.nan
+        image = one.images[0][top:bottom, left:right].astype(np.float64)
+        if len(one.beside):
+            image[one.beside[0][top:bottom, left:right]] = np.nan
         free = POSE + 1 if self.spread_free else POSE
         information = np.empty((free, free))
 
         def seen_from(pose: Pose) -> MarkerView:
             return marker_view(
-                found.key, found.size_m, found.cameras.optics(0),
-                found.origin + np.array([left, top]), noise_variance(found.noise_grey), pose,
+                one.targets[0], first_side_m(one), one.cameras.optics(0),
+                one.origins[0] + np.array([left, top]), noise_variance(noise_grey), pose,
             )
 
         view = seen_from(poses[0])
         state, level, reached, other, freedom = (
-            locate_exactly(image, starts, view, information) if found.key.is_planar
+            locate_exactly(image, starts, view, information) if one.targets[0].is_planar
             else locate_in_sight(image, starts, seen_from, information)
         )
         if not math.isfinite(level) or freedom < 1:
@@ -598,7 +550,7 @@ class Photometric:
             return None
         chi_square = level / view.variance
         out.status[i] = (
-            EstimateStatus.solved if explains(chi_square, freedom, found.noise_grey)
+            EstimateStatus.solved if explains(chi_square, freedom, noise_grey)
             else EstimateStatus.not_explained
         )
         covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
@@ -621,15 +573,15 @@ class PhotometricReal(Photometric):
     tone: bool
 
     def _fitted(
-        self, found: Found, poses: list[Pose], out: Estimates, i: int
+        self, one: Detections, poses: list[Pose], middle: Floats, out: Estimates, i: int
     ) -> tuple[Floats, Floats] | None:
         # The first of the two planar solutions of each set of corners: the other one is its mirror.
-        starts = start_states(poses[::2], found.middle_m, FIRST_SPREAD_PX)
+        starts = start_states(poses[::2], middle, FIRST_SPREAD_PX)
         view = photograph_view(
-            found.key, found.on_board, found.size_m, found.corners[0], found.cameras.optics(0),
-            found.image, found.origin, self.tone,
-        ) if len(starts) and found.key.is_marker else None
-        if view is None or pixel_count(view) <= MOVED + LINEAR:
+            one.targets[0], one.on_board[0] if one.on_board else None, float(one.size_m[0]),
+            one.corners[0], one.cameras.optics(0), one.images[0], one.origins[0], self.tone,
+        ) if len(starts) and one.targets.are_markers else None
+        if view is None or pixel_count(view) <= SIZE:
             return None
         covariance = np.empty((POSE, POSE))
         state, level, reached, other, freedom, misfit = locate_photograph(view, starts, covariance)
@@ -645,5 +597,5 @@ class PhotometricReal(Photometric):
             EstimateStatus.not_explained if misfit > MAX_MISFIT_PX else EstimateStatus.solved
         )
         out.covariance[i], out.misfit_px[i] = covariance, misfit
-        out.residual_ratio[i] = level / (noise_variance(found.noise_grey) * freedom)
+        out.residual_ratio[i] = level / (noise_variance(float(one.noise_grey[0])) * freedom)
         return state, other

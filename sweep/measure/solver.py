@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sweep.measure.estimation import (
     Detections,
     Estimates,
+    PoseEstimator,
     credible_estimates,
     point_covariance,
 )
@@ -29,56 +30,78 @@ from sweep.typing import Floats, Masks
 # OpenCV's solvers, and poses of N markers at once, from four corners each.
 
 @dataclass(frozen=True, slots=True)
-class OpenCVSolver:
-    """One method of ``cv2.solvePnP``.
+class Solver:
+    """One choice of ``solver`` in pipeline files.
 
     Attributes
     ----------
-    method
-        OpenCV's constant.
     meaning
         One line for the reference.
+    build
+        Makes its estimator from a :class:`sweep.measure.estimators.EstimatorSetting`; called once
+        for each configuration and process.
+    method
+        OpenCV's constant of a solver that takes corners alone; None of others.
+    needs_images
+        Whether it uses the pixels: the detections' images are kept for it.
     guarded
-        Whether the guard can call it: it is stable for four coplanar points.
+        Whether the setting ``guarded`` applies to it: it is stable for four coplanar points.
     planar_only
-        Whether it solves for coplanar points alone.
+        Whether it works for coplanar points alone.
     two_solutions
-        Whether it returns both planar solutions.
-    any_points
-        Whether it takes any number of points, as boards have them.
+        Whether OpenCV returns both planar solutions.
+    recorded
+        Whether it estimates nothing, and takes poses of recorded detections.
+    of_boards
+        Whether it estimates the pose of a board from all its points, too.
     """
 
-    method: int
     meaning: str
-    guarded: bool = True
+    build: Callable[[Any], PoseEstimator]
+    method: Any = None
+    needs_images: bool = False
+    guarded: bool = False
     planar_only: bool = False
     two_solutions: bool = False
-    any_points: bool = False
+    recorded: bool = False
+    of_boards: bool = False
+
+
+def _of_opencv(method: int, meaning: str, *, guarded: bool = True, **properties: bool) -> Solver:
+    """Return the record of one method of ``cv2.solvePnP``."""
+    return Solver(
+        meaning,
+        lambda setting: PointSolver(
+            setting.solver, setting.guarded, setting.reprojection_limit, setting.corner_noise_px,
+            setting.points, setting.refine,
+        ),
+        method, guarded=guarded, **properties,
+    )
 
 
 OPENCV_SOLVERS = {
-    "ippe": OpenCVSolver(
+    "ippe": _of_opencv(
         cv2.SOLVEPNP_IPPE, "both planar solutions from the homography", planar_only=True,
-        two_solutions=True, any_points=True,
+        two_solutions=True, of_boards=True,
     ),
-    "ippe_square": OpenCVSolver(
+    "ippe_square": _of_opencv(
         cv2.SOLVEPNP_IPPE_SQUARE, "ippe for the corners of a square", planar_only=True,
         two_solutions=True,
     ),
-    "iterative": OpenCVSolver(
+    "iterative": _of_opencv(
         cv2.SOLVEPNP_ITERATIVE, "Levenberg-Marquardt on the reprojection error, started from the "
-        "homography", any_points=True,
+        "homography", of_boards=True,
     ),
-    "sqpnp": OpenCVSolver(
-        cv2.SOLVEPNP_SQPNP, "SQPnP, a quadratic program over rotations", any_points=True
+    "sqpnp": _of_opencv(
+        cv2.SOLVEPNP_SQPNP, "SQPnP, a quadratic program over rotations", of_boards=True
     ),
-    "p3p": OpenCVSolver(cv2.SOLVEPNP_P3P, "three corners; the fourth selects the solution"),
-    "ap3p": OpenCVSolver(
+    "p3p": _of_opencv(cv2.SOLVEPNP_P3P, "three corners; the fourth selects the solution"),
+    "ap3p": _of_opencv(
         cv2.SOLVEPNP_AP3P, "three corners, algebraic; the fourth selects the solution"
     ),
-    "epnp": OpenCVSolver(
+    "epnp": _of_opencv(
         cv2.SOLVEPNP_EPNP, "EPnP, unreliable for a single marker: it is not made for four coplanar "
-        "points", guarded=False, any_points=True,
+        "points", guarded=False, of_boards=True,
     ),
 }
 """The solvers of OpenCV."""
@@ -121,20 +144,48 @@ def _plain(
     corners: Floats, cameras: Cameras, size_m: Floats, method: int
 ) -> tuple[Floats, Floats]:
     """Call ``cv2.solvePnP`` plainly: marker frame, metres, OpenCV's own lens inverse."""
-    count = len(corners)
-    rvec, translation = np.full((count, 2, 3), np.nan), np.full((count, 2, 3), np.nan)
     objects = marker_corners(size_m)
-    for i in range(count):
-        distortion = cameras.lenses[i, :14] if cameras.distorted[i] else None
-        try:
-            success, r, t = cv2.solvePnP(
-                objects[i], corners[i], cameras.matrix(i), distortion, flags=method
+    return _first_two([
+        _called(objects[i], corners[i], cameras.matrix(i), lens_of(cameras, i), method, every=False)
+        for i in range(len(corners))
+    ])
+
+
+Vectors = tuple[Floats, Floats]
+"""Rotation vector and position, (3, 1) each."""
+
+
+def _called(
+    objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int, *,
+    every: bool, start: tuple[Any, Any, bool] = (None, None, False),
+) -> list[Vectors]:
+    """Return the solutions of ``cv2.solvePnP``, or with ``every`` all of ``cv2.solvePnPGeneric``.
+
+    None if it fails. ``start`` is a rotation vector and a position to start from, and True.
+    """
+    try:
+        if every:
+            success, vectors, positions, _ = cv2.solvePnPGeneric(
+                objects, pixels, matrix, lens, flags=method
             )
-        except cv2.error:
-            continue
-        if success:
-            rvec[i, 0], translation[i, 0] = r[:, 0], t[:, 0]
-    return rotation_of_vector(rvec), translation
+        else:
+            success, vector, position = cv2.solvePnP(
+                objects, pixels, matrix, lens, *start, flags=method
+            )
+            vectors, positions = (vector,), (position,)
+    except cv2.error:
+        return []
+    found: Any = zip(vectors, positions, strict=True) if success else ()
+    return list(found)
+
+
+def _first_two(solutions: Sequence[list[Vectors]]) -> tuple[Floats, Floats]:
+    """Return two solutions of each of n: rotations (n, 2, 3, 3), positions (n, 2, 3); or NaN."""
+    found = np.full((2, len(solutions), 2, 3), np.nan)
+    for i, each in enumerate(solutions):
+        for k, (vector, position) in enumerate(each[:2]):
+            found[0, i, k], found[1, i, k] = vector[:, 0], position[:, 0]
+    return rotation_of_vector(found[0]), found[1]
 
 
 # The guard. IPPE divides by sin(pi) if the rotation vector's norm is pi, which in the marker
@@ -255,15 +306,14 @@ def _iterated(
     Points (n, 4, 2) are BL, BR, TR, TL in undistorted pixels.
     """
     vectors = vector_of_rotation(rotation * _Z_OUT)
-    ended = np.full((2, len(points), 3), np.nan)
-    for i in np.flatnonzero(np.isfinite(vectors).all(axis=1)):
-        success, r, t = cv2.solvePnP(
-            _UNIT_SQUARE, points[i], matrices[i], None, vectors[i, :, None].copy(),
-            translation[i, :, None].copy(), useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
-        )
-        if success:
-            ended[0, i], ended[1, i] = r[:, 0], t[:, 0]
-    return rotation_of_vector(ended[0]) * _Z_OUT, ended[1]
+    ended, positions = _first_two([
+        _called(
+            _UNIT_SQUARE, points[i], matrices[i], None, cv2.SOLVEPNP_ITERATIVE, every=False,
+            start=(vectors[i, :, None].copy(), translation[i, :, None].copy(), True),
+        ) if np.isfinite(vectors[i]).all() else []
+        for i in range(len(points))
+    ])
+    return ended[:, 0] * _Z_OUT, positions[:, 0]
 
 
 def _solve_turned(
@@ -275,35 +325,17 @@ def _solve_turned(
     the marker frame and translations (n, 2, 3) in sides.
     """
     count = len(points)
-    missing = np.full((3, 1), np.nan)
     order = (np.arange(4) + turns[:, None]) % 4
     turned = np.take_along_axis(points, order[:, :, None], axis=1)
-    vectors: list[Any] = []
-    both = method in _TWO_SOLUTIONS
-    for pixels, matrix in zip(turned, matrices, strict=True):
-        try:
-            if both:
-                success, rs, ts, _ = cv2.solvePnPGeneric(
-                    _UNIT_SQUARE, pixels, matrix, None, flags=method
-                )
-            else:
-                success, r, t = cv2.solvePnP(_UNIT_SQUARE, pixels, matrix, None, flags=method)
-                rs, ts = (r,), (t,)
-        except cv2.error:
-            success = False
-        if not success:
-            vectors += [missing] * 4
-        elif len(rs) > 1:
-            vectors += [rs[0], rs[1], ts[0], ts[1]]
-        else:
-            vectors += [rs[0], missing, ts[0], missing]
-    solved = np.concatenate(vectors).reshape(count, 2, 2, 3) if vectors else np.empty((0, 2, 2, 3))
-    rotation, translation = rotation_of_vector(solved[:, 0]), solved[:, 1]
+    rotation, translation = _first_two([
+        _called(_UNIT_SQUARE, pixels, matrix, None, method, every=method in _TWO_SOLUTIONS)
+        for pixels, matrix in zip(turned, matrices, strict=True)
+    ])
     c, s = np.array([1.0, 0.0, -1.0, 0.0])[turns], np.array([0.0, 1.0, 0.0, -1.0])[turns]
     back = np.zeros((count, 3, 3))
     back[:, 0, 0], back[:, 0, 1], back[:, 1, 0], back[:, 1, 1] = c, -s, s, c
     back[:, 2, 2] = 1.0
-    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation.copy()
+    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation
 
 
 # --------------------------------------------------------------------------------------------------
@@ -313,9 +345,9 @@ Pose = tuple[Floats, Floats]
 """Rotation (3, 3) and translation (3,) in metres."""
 
 
-def lens_of(cameras: Cameras) -> Floats | None:
-    """Return the lens of the first camera as OpenCV's calls take it; None if it has none."""
-    return cameras.lenses[0, :14] if cameras.distorted[0] else None
+def lens_of(cameras: Cameras, row: int = 0) -> Floats | None:
+    """Return the lens of a camera as OpenCV's calls take it; None if it has none."""
+    return cameras.lenses[row, :14] if cameras.distorted[row] else None
 
 
 def reprojection_px(
@@ -359,23 +391,15 @@ def poses_of_each_marker(
     ]
 
 
-def _called(
+def _poses(
     objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int
 ) -> list[Pose]:
-    """Call ``cv2.solvePnPGeneric``; no pose if it fails."""
-    try:
-        success, vectors, positions, _ = cv2.solvePnPGeneric(
-            np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, flags=method
-        )
-    except cv2.error:
-        return []
-    if not success:
-        return []
-    return [
-        (rotation_of_vector(np.asarray(r, dtype=np.float64).reshape(1, 3))[0],
-         np.asarray(t, dtype=np.float64).ravel())
-        for r, t in zip(vectors, positions, strict=True)
-    ]
+    """Return all poses that ``cv2.solvePnPGeneric`` finds."""
+    found = _called(
+        np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, method,
+        every=True,
+    )
+    return [(rotation_of_vector(r.reshape(1, 3))[0], t.ravel()) for r, t in found]
 
 
 COLLINEAR = 1e-6
@@ -440,7 +464,7 @@ class GuardedPoints(NamedTuple):
         """Return the target's poses by a method of ``cv2.solvePnPGeneric``."""
         found = []
         if len(self.points):
-            for rotation, position in _called(
+            for rotation, position in _poses(
                 self.points, self.pixels, self.matrix, None, method
             ):
                 turned = rotation @ self.turn @ _Z_IN
@@ -491,10 +515,7 @@ class PointSolver:
     points: str = "markers"
     refine: str = "none"
 
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images: no."""
-        return False
+    needs_images = False
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with covariances if the corners' noise is given."""
@@ -564,7 +585,7 @@ class PointSolver:
             guard = GuardedPoints.of(objects, pixels, cameras)
             poses = guard.poses(method)
         else:
-            poses = _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
+            poses = _poses(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
         ordered = _by_error(poses, objects, pixels, cameras, used)
         if guard is not None and self.solver == "iterative":
             ordered = _least_of(ordered, guard, objects, pixels, cameras, side_px)

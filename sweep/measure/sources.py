@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from sweep.measure.classify import Findings, TargetScenes
 from sweep.measure.detectors import (
     AnyDetectorSetting,
-    BoardDetector,
     BoardDetectorSetting,
+    DetectorSetting,
     FindFunction,
     SearchOutput,
-    make_board_detector,
+    completed,
     make_detector,
 )
 from sweep.measure.flags import DetectionStatus
@@ -57,21 +57,23 @@ class ImageSearch:
 
     Attributes
     ----------
-    find, boards
-        The search for markers, and what OpenCV does by means of a board.
+    setting, on_board
+        The detector of markers, and how OpenCV uses what it knows of a board.
     scenes, targets
         What the images show.
     """
 
-    find: FindFunction
-    boards: BoardDetector
+    setting: AnyDetectorSetting
+    on_board: BoardDetectorSetting
     scenes: Scenes
     targets: TargetScenes
     needs_images: bool = True
+    _find: FindFunction = field(init=False)
     _sides: list[int] = field(init=False)
     _last: tuple[Grey, str, SearchOutput] | None = None
 
     def __post_init__(self) -> None:
+        self._find = make_detector(self.setting)
         self._sides = self.scenes.frame.max(axis=1).tolist()
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
@@ -80,11 +82,12 @@ class ImageSearch:
         dictionary = target.dictionary
         if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
             return self._last[2]  # another marker of a photograph
-        found = self.find(image, dictionary, self._sides[row])
-        output = (
-            SearchOutput(*found) if target.is_marker
-            else self.boards.complete(image, target, found)
-        )
+        found = self._find(image, dictionary, self._sides[row])
+        if target.is_marker:
+            output = SearchOutput(*found)
+        else:
+            own = self.setting if isinstance(self.setting, DetectorSetting) else DetectorSetting()
+            output = completed(image, target, found, self.on_board, own)
         self._last = image, dictionary, output
         return output
 
@@ -179,6 +182,4 @@ def detection_source(
     """
     if isinstance(setting, PluginSetting) and is_recording(setting.plugin.name):
         return RecordedSearch(setting.record().recording, scenes, targets, keys())
-    return ImageSearch(
-        make_detector(setting), make_board_detector(setting, on_board), scenes, targets
-    )
+    return ImageSearch(setting, on_board, scenes, targets)

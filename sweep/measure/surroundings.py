@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.board import Board, Print, target_edges
+from sweep.model.board import Board, Print, edges_on_sheet, target_edges
 from sweep.model.coverage import MarkerEdges
-from sweep.model.marker import BLACK, OUTSIDE, marker_corners, module_count
+from sweep.model.marker import BLACK, OUTSIDE, marker_corners, module_count, overhang
 from sweep.typing import Floats, Integers
 
 
@@ -25,34 +25,30 @@ class BoardMarker(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def surroundings(marker: BoardMarker, margin: float) -> MarkerEdges:
-    """Return the edges of a board within ``margin`` modules of a marker's square.
+def surroundings(marker: BoardMarker | Board, margin: float, beyond: int = BLACK) -> MarkerEdges:
+    """Return the edges of what is printed within ``margin`` modules of a marker's square.
 
-    In modules, from the square's top left corner; the square's own edges are among them.
+    Of a marker of a board, or of one alone on its sheet. In modules, from the square's top left
+    corner; the square's own edges are among them. ``beyond`` is the area farther out.
     """
-    board = marker.board
-    modules = module_count(board.dictionary)
-    ends = _in_modules(marker, board.edges().ends)
-    return clipped(MarkerEdges(ends, board.edges().sides), -margin, modules + margin)
+    if isinstance(marker, Board):
+        board, around = marker, target_edges(marker)
+    else:
+        board = marker.board
+        ends, sides = edges_on_sheet(board.prints)
+        around = MarkerEdges(_in_modules(marker, ends), sides)
+    return clipped(around, -margin, module_count(board.dictionary) + margin, beyond)
 
 
 @lru_cache(maxsize=4096)
 def with_neighbours(marker: BoardMarker, margin: float) -> Board:
     """Return a marker of a board as a target: with what is printed within ``margin`` modules."""
-    board, modules = marker.board, module_count(marker.board.dictionary)
-    around = MarkerEdges(_in_modules(marker, board.edges().ends), board.edges().sides)
-    printed = Print(clipped(around, -margin, modules + margin, OUTSIDE), 1 / modules, 0.5)
+    board, module = marker.board, 1 / module_count(marker.board.dictionary)
+    printed = Print(surroundings(marker, margin, OUTSIDE), module, 0.5)
     return Board(
         board.dictionary, (board.marker_ids[marker.number],), marker_corners(np.ones(1)),
         (printed,), np.empty((0, 3)), margin=margin,
     )
-
-
-@lru_cache(maxsize=4096)
-def edges_alone(marker: Board, margin: float) -> MarkerEdges:
-    """Return the edges of a marker on a sheet of its own, as :func:`surroundings` does."""
-    modules = module_count(marker.dictionary)
-    return clipped(target_edges(marker), -margin, modules + margin)
 
 
 @lru_cache(maxsize=4096)
@@ -63,7 +59,8 @@ def clear_modules(marker: BoardMarker) -> float:
     print's edge comes below.
     """
     board = marker.board
-    ends = _in_modules(marker, board.edges(leave_out=[marker.number]).ends)
+    others = [each for k, each in enumerate(board.prints) if k != marker.number]
+    ends = _in_modules(marker, edges_on_sheet(others).ends)
     half = module_count(board.dictionary) / 2
     start, stop = ends[:, :2] - half, ends[:, 2:] - half
 
@@ -79,6 +76,17 @@ def clear_modules(marker: BoardMarker) -> float:
     return max(float(distance(low).min(initial=np.inf)) - half, 0.0)
 
 
+RING_MODULES = 1.5
+"""Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
+
+
+def ring_modules(marker: Board, on_board: BoardMarker | None) -> float:
+    """Return how many modules around the square of a marker, alone or on a board, are fitted."""
+    clear = marker.margin or 0.0 if on_board is None else clear_modules(on_board)
+    beyond = overhang(marker.dictionary)
+    return min(max(clear, beyond + 0.5), beyond + RING_MODULES)
+
+
 def _in_modules(marker: BoardMarker, ends: Floats) -> Floats:
     """Return edges (E, 4) of a board (metres, right and down) in modules of one of its markers."""
     one = marker.board.prints[marker.number]
@@ -89,7 +97,7 @@ def _in_modules(marker: BoardMarker, ends: Floats) -> Floats:
     return np.asarray(np.round(points, 9), dtype=np.float64).reshape(-1, 4)
 
 
-def clipped(edges: MarkerEdges, low: float, high: float, beyond: int = BLACK) -> MarkerEdges:
+def clipped(edges: MarkerEdges, low: float, high: float, beyond: int) -> MarkerEdges:
     """Return the edges of what lies in the square from ``low`` to ``high``; around it ``beyond``.
 
     What is moved onto the square's border by clamping encloses the part inside, since the clamping

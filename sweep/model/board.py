@@ -148,15 +148,6 @@ class Board:
         only = self.prints[0]
         return self.is_flat and only.x_m == only.y_m == only.roll_rad == 0.0
 
-    def edges(self, leave_out: Sequence[int] = ()) -> MarkerEdges:
-        """Return the edges of the board's prints, as :func:`edges_on_sheet` does.
-
-        ``leave_out``: indices of prints that are not wanted, such as a marker's.
-        """
-        return edges_on_sheet(
-            [each for i, each in enumerate(self.prints) if i not in set(leave_out)]
-        )
-
 
 @lru_cache(maxsize=8192)
 def single_marker(dictionary: str, marker_id: int, margin: float) -> Board:
@@ -367,12 +358,9 @@ def rectangles(boxes: Floats, per_side: int = 1) -> Floats:
 
 def in_space(boxes: Floats, planes: Floats, per_side: int = 1) -> Floats:
     """Return points (n, 4 · per_side, 3) along boxes (n, 4) of sheets in ``planes`` (n, 3, 3)."""
-    points = _homogeneous(rectangles(boxes, per_side))
-    return np.ascontiguousarray(points @ np.swapaxes(planes, 1, 2))
-
-
-def _homogeneous(points: Floats) -> Floats:
-    return np.concatenate([points, np.ones_like(points[..., :1])], axis=2)
+    points = rectangles(boxes, per_side)
+    homogeneous = np.concatenate([points, np.ones_like(points[..., :1])], axis=2)
+    return np.ascontiguousarray(homogeneous @ np.swapaxes(planes, 1, 2))
 
 
 def box_corners(boxes: Floats) -> Floats:
@@ -393,14 +381,6 @@ def side_m(target: Board, size_m: float) -> float:
         return size_m
     side = unit_m(target) * marker.module_count(target.dictionary)
     return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
-
-
-def sides_m(targets: Sequence[Board], number: NDArray[np.intp], size_m: Floats) -> Floats:
-    """Return :func:`side_m` of N targets, ``targets[number]`` with sizes (N,)."""
-    if all(each.is_marker for each in targets):
-        return size_m
-    each = zip(number.tolist(), size_m.tolist(), strict=True)
-    return np.array([side_m(targets[k], size) for k, size in each])
 
 
 @lru_cache(maxsize=8192)
@@ -493,7 +473,7 @@ class _Face(NamedTuple):
 def sheets_of(board: Board) -> tuple[Print, ...]:
     """Return what is printed on each sheet: a board's own, or its markers', then distractors'."""
     of_each = len(board.prints) == len(board)
-    own = board.prints if of_each else (Print(board.edges(), 1.0, 0.0),)
+    own = board.prints if of_each else (Print(edges_on_sheet(board.prints), 1.0, 0.0),)
     return own + board.distractors
 
 
@@ -512,12 +492,6 @@ def sheet_boxes(board: Board) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _corners(board: Board) -> Floats:
-    """Return the corners (P, 4, 3) of each of a board's sheets as (column, row, 1)."""
-    return _homogeneous(rectangles(sheet_boxes(board)))
-
-
-@lru_cache(maxsize=64)
 def sheets_m(board: Board) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the board's frame."""
     return outlines(board, sheet_planes(board, np.eye(3), np.zeros(3), 1.0))
@@ -525,7 +499,7 @@ def sheets_m(board: Board) -> Floats:
 
 def outlines(board: Board, planes: Floats) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the camera frame."""
-    return np.asarray(_corners(board) @ np.swapaxes(planes, 1, 2))
+    return in_space(sheet_boxes(board), planes)
 
 
 def own_sheets(board: Board) -> int:

@@ -307,7 +307,7 @@ def _add_spread(
 
 
 @compiled
-def accumulate_curved(
+def _accumulate_curved(
     cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
     sigma: float, sheet: Sheet,
 ) -> None:
@@ -358,7 +358,7 @@ def accumulate_curved(
 @compiled
 def accumulate(
     cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
-    sigma: float,
+    sigma: float, sheet: Sheet,
 ) -> None:
     """Add a marker's edges to ``cover`` (height, width + 2).
 
@@ -374,9 +374,11 @@ def accumulate(
         The marker's plane, and the camera.
     sigma
         Standard deviation in pixels of a Gaussian point spread; 0 for none.
+    sheet
+        How the sheet is bent or shifted.
     """
-    if projection.optics.distorted:
-        accumulate_curved(cover, edges, levels, projection, left, top, sigma, polygon.flat_sheet())
+    if projection.optics.distorted or sheet.curvature != 0.0 or sheet.waves.shape[1] > 0:
+        _accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
         return
     intrinsics = projection.optics.intrinsics
     shift_x, shift_y = intrinsics[2] + (0.5 - left), intrinsics[3] + (0.5 - top)
@@ -392,18 +394,6 @@ def accumulate(
             _add_blurred(cover, jump, sigma, segment)
         else:
             _add_projected(cover, jump, segment)
-
-
-@compiled
-def accumulate_sheet(
-    cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
-    sigma: float, sheet: Sheet,
-) -> None:
-    """As :func:`accumulate`, of a sheet that may be bent or shifted."""
-    if sheet.curvature != 0.0 or sheet.waves.shape[1] > 0:
-        accumulate_curved(cover, edges, levels, projection, left, top, sigma, sheet)
-    else:
-        accumulate(cover, edges, levels, projection, left, top, sigma)
 
 
 @compiled
@@ -639,7 +629,9 @@ def differentiate(
         # Black is 1 and all else 0, then white.
         area_levels = np.zeros(LEVELS)
         area_levels[1 + area] = 1.0
-        accumulate(work.shares[area], edges, area_levels, projection, 0, 0, sigma)
+        accumulate(
+            work.shares[area], edges, area_levels, projection, 0, 0, sigma, polygon.flat_sheet()
+        )
     plane, optics = projection.plane, projection.optics
     ends, sides = edges.ends, edges.sides
     height, width = work.slot.shape
@@ -758,16 +750,6 @@ def normal_equations(image: Floats, work: Work, free: int, matrix: Floats, vecto
             matrix[m, k] = matrix[k, m]
 
 
-@compiled
-def known_pixels(image: Floats) -> int:
-    """Return how many pixels are not NaN."""
-    count = 0
-    for i in range(image.shape[0]):
-        for j in range(image.shape[1]):
-            count += not math.isnan(image[i, j])
-    return count
-
-
 # --------------------------------------------------------------------------------------------------
 # Exact images of many scenes on plain backgrounds, drawn in one call.
 
@@ -857,7 +839,7 @@ def draw_greys(canvas: Canvas, scenes: DrawnScenes, rows: NDArray[np.int64]) -> 
                 scenes.plane[row],
                 Optics(scenes.intrinsics[row], scenes.lenses[row], scenes.distorted[row]),
             ),
-            left, top, 0.0,
+            left, top, 0.0, polygon.flat_sheet(),
         )
         grey = image.reshape(height, width)[
             top - window[1] : bottom - window[1], left - window[0] : right - window[0]

@@ -155,10 +155,6 @@ class Effect:
             return ~np.isnan(strength)
         return strength != (0 if is_coded(self.off) else self.off)
 
-    def applying(self, apply: Callable[[Floats, Patch], Floats]) -> Effect:
-        """Return it with a function that applies it."""
-        return dataclasses.replace(self, apply=apply)
-
 
 def is_coded(default: Any) -> bool:
     """Return whether scenes hold a parameter as the number of its value: it is text, or a list.

@@ -797,7 +797,7 @@ def _expose(
                     projection, layer.outline, left, top + group, rows.shape[0],
                     rows.shape[1] - 2, REACH * sigma + 2.0 + sheet.largest_px,
                 ):
-                    coverage.accumulate_sheet(
+                    coverage.accumulate(
                         rows, layer.edges, levels * (weight / max(panels, 1)), projection, left,
                         top + group, sigma, sheet,
                     )

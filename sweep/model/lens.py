@@ -66,19 +66,16 @@ def pack(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
     Each call returns an array of its own: for one that is read-only each function would be
     compiled a second time.
     """
-    return _kept(coefficients).copy()
+    return _packed(coefficients).copy()
 
 
-def pack_once(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return what :func:`pack` does, for coefficients that do not come again: nothing is kept."""
+@lru_cache(maxsize=1024)
+def _packed(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
     packed = np.zeros(PACKED)
     packed[: len(coefficients)] = coefficients
     packed[14:23] = _tilt_matrix(packed[12], packed[13]).ravel()
     packed[23] = fold_radius(coefficients)
     return packed
-
-
-_kept = lru_cache(maxsize=1024)(pack_once)
 
 
 @compiled_inline

@@ -18,7 +18,7 @@ from sweep.model.effects import MarkerView, after_step
 from sweep.model.exposure import WARP_PX_PER_MODULE, marker_exposure
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
-from sweep.model.polygon import Optics, Projection
+from sweep.model.polygon import Optics, Projection, flat_sheet
 from sweep.model.scene import RENDERERS, SUPERSAMPLE, Box, Scenes
 from sweep.model.sensor import BLOCK_PX, bloomed, compressed, digitise
 from sweep.typing import Floats, Grey, Masks
@@ -340,6 +340,7 @@ def _bitmap(target: Board, black: float, white: float) -> NDArray[np.float32]:
     coverage.accumulate(
         cover, board.edges_of(target), np.array([0.0, black, white]),
         Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
+        flat_sheet(),
     )
     coverage.sum_levels(cover, 0.0, bitmap)
     return bitmap.astype(np.float32)

@@ -429,7 +429,9 @@ def build_scenes(
     ))
     modules = targets.each(lambda target: extent_of(target).modules)
     sheet = targets.each(lambda target: extent_of(target).sheet)
-    side = board.sides_m(targets.boards, targets.number, size)
+    side = size if targets.are_markers else np.array([
+        board.side_m(*each) for each in zip(targets, size.tolist(), strict=True)
+    ])
     printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
     on_board = targets.each(lambda target: not target.is_marker)

@@ -14,9 +14,14 @@ from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.bound import bound_of_scene
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
+from sweep.measure.likelihood import (
+    BACKGROUND_MARGIN_PX,
+    bound_of_scene,
+    marker_view,
+    noise_variance,
+    state_of,
+)
 from sweep.measure.photometric import Photometric
 
 SCENES = 120

@@ -19,8 +19,8 @@ from support.exact_image import DICTIONARIES, LENSES, values, visible
 from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
+from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.model.board_kinds import BoardMarker, Charuco, Markers, with_distractors
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_boxes, marker_exposure

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board import corners_of, first_overlap
+from sweep.model.board import corners_of, edges_on_sheet, first_overlap
 from sweep.model.board_kinds import AprilGrid, Charuco
 
 DICTIONARY = "DICT_4X4_250"
@@ -17,7 +17,7 @@ OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
 def painted(board, low, high, px_per_m):
     """The board's picture, 0 or 255 a pixel, with outside 128: a pixel's level is the sum of the
     jumps at the edges that a ray from its left crosses. ``low``, ``high``: right and down, m."""
-    edges, (left, top) = board.edges(), low
+    edges, (left, top) = edges_on_sheet(board.prints), low
     width, height = np.round((np.array(high) - low) * px_per_m).astype(int)
     x = left + (np.arange(width) + 0.5) / px_per_m
     y = top + (np.arange(height) + 0.5) / px_per_m

@@ -9,7 +9,7 @@ from sweep.measure.solver import OPENCV_SOLVERS, PointSolver
 from sweep.model.board import single_marker
 from sweep.model.scene import Targets
 
-BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.any_points)
+BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.of_boards)
 
 
 def of_markers(corners, cameras, size_m, noise_grey, markers, images=()):

@@ -244,7 +244,8 @@ def recorded_poses(
         length = len(records[name].paths)
         number = trial % length if simulated else trial
         if number >= length or marker_id not in ids[name]:
-            raise PluginError(f"{plain(name)}: it lacks photographs or markers of the pipeline")
+            raise PluginError(f"{plain(name)}: it has {length} photographs; trial {number} of "
+                              f"marker_id {marker_id} is not among them")
         places.append((name, number, ids[name].index(marker_id)))
 
     def recorded(field: str) -> NDArray[Any]:

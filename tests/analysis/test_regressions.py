@@ -64,8 +64,6 @@ def test_a_worse_rate_is_found_as_by_the_exact_test(lost):
 
 def test_other_scenes_are_not_compared():
     old = perfect(np.random.default_rng(5), SIZES)
-    with pytest.raises(DatasetError, match="not the same scenes"):
-        regressions(old, old.isel(trial=slice(40)))
     with pytest.raises(DatasetError, match="nothing can be paired"):
         regressions(old, perfect(np.random.default_rng(6), SIZES))
 

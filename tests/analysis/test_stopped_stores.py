@@ -109,17 +109,6 @@ def test_intervals_of_means_are_wider_than_those_of_fixed_trials(stopped, full):
     np.testing.assert_allclose(np.divide(*halves), expected, rtol=0.02)
 
 
-def test_markers_are_ranked_over_common_trials(stopped):
-    """Of two markers, one with more trials of the hard side: it is not weak for that."""
-    easy = stopped.copy(deep=True)
-    easy.detection[1, 100:] = DetectionStatus.not_needed
-    both = xr.concat([stopped, easy], "marker_id").assign_coords(marker_id=[0, 1])
-    both = both.assign_attrs(stopped.attrs)
-    table = marker_ranking(both)
-    assert table.detection_rate.values[0] == pytest.approx(table.detection_rate.values[1])
-    np.testing.assert_allclose(table.expected_rate, table.detection_rate)
-
-
 def test_stores_that_stopped_at_other_trials_are_compared_on_the_common_ones(stopped, full):
     other = full.isel(trial=slice(0, 150))
     for pair in ((stopped, other), (other, stopped)):

@@ -272,13 +272,3 @@ def test_page_markdown_json_and_terminal_have_the_answer_of_require(small, tmp_p
     for each in found["numbers"]:
         assert f'<span class="value">{each["text"]}</span>' in shown
         assert f"**{each['text']}**" in written
-
-
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--require", "detectoin >= 0.9"], "--require detectoin >= 0.9: "),
-    (["--require", "detection >= 0.9", "--per", "distanse_m"], "--per distanse_m: no such "),
-])
-def test_what_cannot_be_required_is_told_in_one_line(arguments, message, small, tmp_path):
-    code, out, err = command("report", small, *arguments, "-o", tmp_path / "r.html")
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith(message)

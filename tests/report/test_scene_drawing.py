@@ -5,7 +5,7 @@ import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report.scenes import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
+from sweep.report.scenes import TRUTH, cut_to_marker, draw_outlines, draw_scene
 
 FRAME = {
     "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},
@@ -32,17 +32,6 @@ def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(beari
     plain = draw_outlines(scene)
     assert share_of(plain, TRUTH, right if corner == "right" else left) == 0
     assert picture.shape[0] > plain.shape[0]
-
-
-@pytest.mark.parametrize("at", ["side_px=700", "side_px=12,bearing_x_deg=-30"])
-def test_what_is_drawn_in_place_stays_in_place(at):
-    scene = inspected(at)
-    picture, plain = draw_scene(scene, "title"), draw_outlines(scene)
-    if at == "side_px=700":
-        assert np.array_equal(picture[:1200, : plain.shape[1]], plain)
-    else:
-        assert scene.detection.name != "detected"
-        assert share_of(picture, DETECTED, (0, 0, 1600, 1200)) == 0
 
 
 def test_a_cut_is_the_marker_with_its_surroundings_within_the_window():

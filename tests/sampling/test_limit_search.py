@@ -1,7 +1,6 @@
 """The search for a limit: its error by enumeration, its coverage by simulation, its faults."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -163,8 +162,3 @@ def test_the_hard_end_of_an_axis_is_the_same_for_the_search_and_for_its_results(
     harder = requirement_limits(results, ["detection >= 0.9"], "size_m").attrs["harder"]
     assert size_shrinks_upwards(pipeline, "size_m") is False
     assert harder == "downwards"
-
-
-def test_waves_end_at_the_most_trials():
-    assert wave_ends(100, 40) == (40, 80, 100)
-    assert math.isclose(looks_factor(1), 1.0)

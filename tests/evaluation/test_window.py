@@ -49,18 +49,21 @@ def visible_scenes(count, width=640, height=480, settings=()):
     return built(candidates[seen[:count]])
 
 
-LIMITS_PX = {
-    "none": 0.0,
-    # The iteration stops at a step of 0.1 px, and never leaves the half window of 5 px around its
-    # start, which is the same for both: 10 px between any two results.
-    "subpix": 10.0,
-    # Lines are fitted in float32 to whole-pixel contours; sums of products of coordinates lose
-    # digits with the square of the distance to the image's corner (0.3 px at 4000).
-    "contour": 1.0,
-    # Corners are float32 in the pixels of the image that was searched.
-    "apriltag": None,
-}
-"""How far corners in windows may be from those in frames; ``None``: a unit in the last place."""
+def limit_px(setting, width):
+    """How far corners in windows may be from those in frames."""
+    if full_frame_reason(setting):
+        return 0.0
+    return {
+        "none": 0.0,
+        # The iteration stops at a step of 0.1 px, and never leaves the half window around its
+        # start, which is the same for both.
+        "subpix": 2.0 * setting.cornerRefinementWinSize,
+        # Lines are fitted in float32 to whole-pixel contours; sums of products of coordinates lose
+        # digits with the square of the distance to the image's corner (0.3 px at 4000).
+        "contour": 1.0,
+        # Corners are float32 in the pixels of the image that was searched.
+        "apriltag": np.spacing(np.float32(width)),
+    }[setting.cornerRefinementMethod]
 
 
 @single_threaded()
@@ -75,9 +78,7 @@ def compared(scenes, setting):
         assert len(outcomes_elsewhere(scenes, row, setting)) > 1, row
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
-    limit = 0.0 if full_frame_reason(setting) else LIMITS_PX[setting.cornerRefinementMethod]
-    limit = np.spacing(np.float32(scenes.frame[0, 0])) if limit is None else limit
-    assert difference.max(initial=0.0) <= limit
+    assert difference.max(initial=0.0) <= limit_px(setting, scenes.frame[0, 0])
     return difference, len(exceptions)
 
 
@@ -127,9 +128,6 @@ OTHER_SETTINGS = [
     {"perspectiveRemovePixelPerCell": 10, "validBitIdThreshold": 0.2},
     {"detectInvertedMarker": True},
     {"useAruco3Detection": True},
-    # cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %.
-    {"cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
-     "relativeCornerRefinmentWinSize": 100.0},
     *({"cornerRefinementMethod": "apriltag", name: value} for name, value in {
         "aprilTagQuadSigma": 2.0, "aprilTagQuadDecimate": 2.0, "aprilTagMinWhiteBlackDiff": 100,
         "aprilTagMinClusterPixels": 100, "minDistanceToBorder": 0,
@@ -141,6 +139,15 @@ OTHER_SETTINGS = [
 @lengths(10, 100)
 def test_window_finds_what_the_frame_holds_under_other_settings(count, setting):
     compared(visible_scenes(count), DetectorSetting(**setting))
+
+
+def test_window_leaves_room_for_a_wide_refinement():
+    """cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %."""
+    whole = ["bearing_x_deg=0", "bearing_y_deg=0", "side_px={geom=[12, 200, 12]}"]
+    compared(visible_scenes(40, settings=whole), DetectorSetting(
+        cornerRefinementMethod="subpix", cornerRefinementWinSize=40,
+        relativeCornerRefinmentWinSize=100.0,
+    ))
 
 
 PROCESSING = {

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from support.blocks import run_cells
 from support.board_scenes import BoardPose, board_scene, levels_of
+from support.solving import of_markers
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import state_of
 from sweep.measure.photograph import draw, photograph_view, system
@@ -87,16 +87,15 @@ def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone
         )[0].reshape(4, 2)
         for k in numbers
     ])
-    found = Detections.of_markers(
+    found = of_markers(
         corners + rng.normal(0, error_px, corners.shape),
         Cameras(
             np.repeat(VIEW[None], count, axis=0), np.repeat(pack(lens)[None], count, axis=0),
             np.full(count, bool(lens)),
         ),
-        np.full(count, size), np.full(count, 2.0), np.zeros(count),
+        np.full(count, size), np.full(count, 2.0),
         [single_marker(board.dictionary, board.marker_ids[k], 1.0) for k in numbers],
         [image] * count,
-        np.zeros((count, 2), dtype=np.int64),
     )
     on_board = None if alone else [BoardMarker(board, k) for k in numbers]
     return dataclasses.replace(found, on_board=on_board)

@@ -1,6 +1,6 @@
 """How well will I know the pose? Experiments with fiducial markers, against the truth.
 
-Every public function stands here with all that it takes. Its example runs: ``folder`` is the path
+The signature of a public function has all that it takes. Its example runs: ``folder`` is the path
 of an empty folder, and for `photos`, `fit`, `twins` and `compare` it has three photographs of a
 ChArUco board in ``shots``, the calibration ``camera.json`` and the board's file ``board.toml``.
 Stores that one example makes are read by others. Lengths are in metres, pixels (``_px``) or
@@ -47,11 +47,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.analysis.dataset import decode_flags
-    from sweep.diagnosis.detection import DetectionModel
+    from sweep.diagnosis.detection import error_model
+    from sweep.diagnosis.diagnosis import diagnose
     from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.folders import FittedScene
+    from sweep.report.questions import measure_tradeoff, require, write_report
+    from sweep.report.reference import reference
     from sweep.report.table import Findings
     from sweep.tradeoff.choice_search import Choice
 
@@ -78,17 +81,23 @@ class RunOptions(LocalOptions, total=False):
     yes: bool
 
 
-_IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
-                    "decode_flags": "sweep.analysis.dataset"}
+_IMPORTED_ON_USE = {
+    "sweep.experiment.pipeline": ("Pipeline",), "sweep.execution.progress": ("Progress",),
+    "sweep.analysis.dataset": ("decode_flags",), "sweep.diagnosis.detection": ("error_model",),
+    "sweep.diagnosis.diagnosis": ("diagnose",), "sweep.report.reference": ("reference",),
+    "sweep.report.questions": ("measure_tradeoff", "require", "write_report"),
+}
+"""Modules of public names that have all that they need."""
 
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
     def __getattr__(name: str) -> Any:
-        """Import a public class when it is first used."""
-        if name not in _IMPORTED_ON_USE:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(_IMPORTED_ON_USE[name]), name)
+        """Import a public name when it is first used."""
+        for module, names in _IMPORTED_ON_USE.items():
+            if name in names:
+                return getattr(importlib.import_module(module), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
@@ -538,203 +547,6 @@ def size(
     return found
 
 
-def require(
-    store: str | os.PathLike[str],
-    requirements: Sequence[str] = (),
-    *,
-    per: Sequence[str] | None = None,
-    at: Sequence[str] = (),
-    against: str | os.PathLike[str] | None = None,
-) -> Findings:
-    """Decide whether a store's results meet requirements.
-
-    Parameters
-    ----------
-    store
-        Path or URL of a finished store.
-    requirements
-        Such as "detection >= 0.95" (default: the section [require] of the store's pipeline).
-    per
-        Axes whose values are conditions, at each of which all must hold; others are pooled
-        (default: those of [require], else the axes of size, angle and boards).
-    at
-        "name=value": only these values of axes.
-    against
-        An older store, with which it is compared pose by pose: significantly worse is not met.
-
-    Returns
-    -------
-    Findings
-        The decisions as tables and numbers; ``numbers["decision"]`` is that on all together, and
-        ``data`` the dataset of `sweep.analysis.check_requirements`.
-
-    Raises
-    ------
-    ArgumentError, StoreError, DatasetError
-        For what cannot be required, and stores that cannot be read.
-
-    Examples
-    --------
-    >>> found = sweep.require(folder / "two_sizes.zarr", ["detection >= 0.01"], per=[])
-    >>> found.numbers["decision"].name
-    'met'
-    """
-    older = None if against is None else os.fspath(against)
-    return library.questions.require(
-        os.fspath(store), requirements, per=per, at=at, against=older, every=True)
-
-
-def diagnose(
-    observations: str | os.PathLike[str] | Mapping[str, Sequence[Any]],
-    *,
-    camera: str | os.PathLike[str] | None = None,
-    size_m: float | None = None,
-    dictionary: str = "",
-    refinement: str = "",
-    zero_sd_m: float = 0.01,
-    compared: str = "z",
-    output: str | None = None,
-) -> Findings:
-    """Find why a program's poses are not what a tape says.
-
-    Parameters
-    ----------
-    observations
-        A CSV file, or its columns by name: what the program said (``tvec_x_m``, ``tvec_y_m``,
-        ``tvec_z_m``, or ``range_m``, ``rvec_x`` ...; or corners, ``corner0_x_px`` ...), what was
-        measured (``tape_m`` from lens to marker, ``x_m``, ``y_m``, ``z_m``, ``yaw_deg``), with
-        standard deviations (``tape_sd_m``, ``position_sd_m``). Empty cells are unknown.
-    camera
-        The file of the calibration that the program believes.
-    size_m, dictionary
-        As the program believes them.
-    refinement
-        none, subpix, contour or apriltag; its bias and noise are expected.
-    zero_sd_m
-        Standard deviation of the tape's zero point, in metres.
-    compared
-        What was compared with the tape: "z", the third number of tvec, or "range".
-    output
-        A PNG or SVG file for the figure of residuals.
-
-    Returns
-    -------
-    Findings
-        Causes by posterior probability, what each predicts, the test that would decide, and one
-        sentence. ``numbers`` has the same; ``status`` is 3 if the rows cannot tell.
-
-    Raises
-    ------
-    ArgumentError
-        One line on rows, columns or numbers that cannot be.
-
-    Examples
-    --------
-    >>> rows = {"range_m": [1.8, 3.6], "tape_m": [1.0, 2.0]}
-    >>> found = sweep.diagnose(rows, dictionary="tagStandard41h12")
-    >>> found.numbers["causes"][0]["causes"]
-    ['size']
-    """
-    return library.diagnosis.diagnose(
-        observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
-        zero_sd_m=zero_sd_m, compared=compared, output=output)
-
-
-def error_model(
-    store: str | os.PathLike[str] | xr.Dataset,
-    photographs: str | os.PathLike[str] | xr.Dataset | None = None,
-) -> DetectionModel:
-    """Make a model of the error of one detection: covariance, bias, probability of a flip.
-
-    Parameters
-    ----------
-    store
-        A simulation of one detector setting and one solver, with drawn poses: its path, or results
-        of `open`, of which one setting was chosen with ``.isel``.
-    photographs
-        A store of `photos` with the same setting and solver, or its results: the covariance is
-        multiplied by a factor, so that it describes their errors. Judge it on others.
-
-    Returns
-    -------
-    DetectionModel
-        ``model.at(rvec, tvec_m, ambiguity)`` has the 6 x 6 covariance, the bias and the probability
-        of a flip of estimated poses, and whether they are known: the simulation has poses there.
-        ``model.to_json()`` keeps it.
-
-    Raises
-    ------
-    StoreError, DatasetError
-        If there is no store, fewer than 2,000 solved poses or 50 of photographs, or several
-        settings.
-
-    Examples
-    --------
-    >>> drawn = sweep.run({
-    ...     "pose": {"side_px": {"uniform": [40, 80]}, "tilt_deg": {"uniform": [0, 60]},
-    ...              "azimuth_deg": {"uniform": [0, 360]}, "jitter_px": 0.5},
-    ...     "scene": {"noise_grey": 2.0}, "axes": {"trial": 2200},
-    ... }, store=folder / "drawn.zarr")
-    >>> error_model = sweep.error_model(folder / "drawn.zarr")
-    >>> at = error_model.at(drawn.true_rvec[:3], drawn.true_tvec_m[:3])  # (3, 3) each
-    >>> at.covariance.shape, at.covariance.dims
-    ((3, 6, 6), ('pose', 'row', 'column'))
-    """
-    return library.detection.error_model(store, photographs)
-
-
-def measure_tradeoff(
-    store: str | os.PathLike[str],
-    *,
-    per: Sequence[str] = (),
-    criterion: str = "rotation_p95_deg",
-    limit_s: float = 60.0,
-    budget_ms: float | None = None,
-    output: str | os.PathLike[str] | None = None,
-    progress: bool = False,
-) -> Findings:
-    """Measure what each configuration of a store costs, beside its accuracy on the same images.
-
-    Parameters
-    ----------
-    store
-        Path or URL of a finished store, or a TOML file, which is run first.
-    per
-        Axes of the scene whose values are conditions of their own.
-    criterion
-        The error that ranks configurations.
-    limit_s
-        Seconds of the measurement.
-    budget_ms
-        Most milliseconds a frame: the most accurate configuration within them is named.
-    output
-        PNG or SVG file of a figure.
-    progress
-        Whether progress is told on stderr.
-
-    Returns
-    -------
-    Findings
-        A row for each configuration and condition; ``data`` is the dataset that the store keeps in
-        its group ``cost/tradeoff``.
-
-    Raises
-    ------
-    ArgumentError, PipelineError, StoreError, RunError
-        As for :func:`run`; also if costs cannot be measured here.
-
-    Examples
-    --------
-    >>> found = sweep.measure_tradeoff(folder / "two_sizes.zarr", limit_s=0.5)
-    >>> found.data.detection_ms.item() > 0  # milliseconds a frame
-    True
-    """
-    with library.progress.stage_display() if progress else contextlib.nullcontext() as stage:
-        return library.questions.tradeoff(
-            os.fspath(store), per=per, criterion=criterion, limit_s=limit_s, budget_ms=budget_ms,
-            output=None if output is None else os.fspath(output), progress=stage)
-
-
 def compare(
     first: str | os.PathLike[str],
     second: str | os.PathLike[str],
@@ -795,81 +607,3 @@ def compare(
     elif store:
         raise ArgumentError("store", store, "expected photographs and a TOML file to simulate")
     return library.questions.compare(one, other, bins=bins or None, output=figure)
-
-
-def write_report(
-    store: str | os.PathLike[str],
-    output: str | os.PathLike[str] | None = None,
-    *,
-    require: Sequence[str] = (),
-    per: Sequence[str] | None = None,
-    form: str | None = None,
-    figures: str | os.PathLike[str] | None = None,
-    error_model: Sequence[str] = (),
-    command: str = "",
-) -> Findings:
-    """Write the report of a store: answer, figures, example scenes.
-
-    Parameters
-    ----------
-    store
-        Path or URL of a finished store.
-    output
-        File to write (default: ``report.html``, or ``report.md`` with the form "md").
-    require, per
-        As for :func:`require`: the report begins with whether, and how far, it is met.
-    form
-        "html": one page; "md": Markdown with a folder of figures (default: by the file's suffix).
-    figures
-        Folder into which each figure is written as SVG and PNG, too.
-    error_model
-        JSON files of the error models to write, too.
-    command
-        The command line that asked for it, which the report shows.
-
-    Returns
-    -------
-    Findings
-        The first line and the numbers of the report.
-
-    Raises
-    ------
-    ArgumentError, StoreError, DatasetError
-        For what cannot be required, or written.
-
-    Examples
-    --------
-    >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
-    >>> found.numbers["figures"], (folder / "report.html").exists()
-    (5, True)
-    """
-    return library.questions.report(
-        os.fspath(store), None if output is None else os.fspath(output), require=require, per=per,
-        form=form, figures=None if figures is None else os.fspath(figures),
-        error_model=error_model, command=command)
-
-
-def reference(*names: str) -> Findings:
-    """Return parameters, effects, solvers, variables, flags or statistics, with their meaning.
-
-    Parameters
-    ----------
-    names
-        A subject ("camera", "effects", "flags", ...) or a parameter; without any, the subjects.
-
-    Returns
-    -------
-    Findings
-        A table of each subject, and one of the parameters.
-
-    Raises
-    ------
-    ArgumentError
-        For a name that is neither.
-
-    Examples
-    --------
-    >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
-    'degree'
-    """
-    return library.reference.reference(names)

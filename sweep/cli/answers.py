@@ -58,7 +58,7 @@ def require(
     against : --against STORE
         Also compare pose by pose with this older store: significantly worse is not met.
     """
-    return library.questions.require(
+    return sweep.require(
         store, requirements, per=per, at=at, pipeline=pipeline, against=against,
         every=SESSION.form == "markdown")
 

@@ -159,7 +159,42 @@ def error_model(
     store: xr.Dataset | str | os.PathLike[str],
     photographs: xr.Dataset | str | os.PathLike[str] | None = None,
 ) -> DetectionModel:
-    """Return a model of one detection's error: `sweep.error_model`."""
+    """Make a model of the error of one detection: covariance, bias, probability of a flip.
+
+    Parameters
+    ----------
+    store
+        A simulation of one detector setting and one solver, with drawn poses: its path, or results
+        of `open`, of which one setting was chosen with ``.isel``.
+    photographs
+        A store of `photos` with the same setting and solver, or its results: the covariance is
+        multiplied by a factor, so that it describes their errors. Judge it on others.
+
+    Returns
+    -------
+    DetectionModel
+        ``model.at(rvec, tvec_m, ambiguity)`` has the 6 x 6 covariance, the bias and the probability
+        of a flip of estimated poses, and whether they are known: the simulation has poses there.
+        ``model.to_json()`` keeps it.
+
+    Raises
+    ------
+    StoreError, DatasetError
+        If there is no store, fewer than 2,000 solved poses or 50 of photographs, or several
+        settings.
+
+    Examples
+    --------
+    >>> drawn = sweep.run({
+    ...     "pose": {"side_px": {"uniform": [40, 80]}, "tilt_deg": {"uniform": [0, 60]},
+    ...              "azimuth_deg": {"uniform": [0, 360]}, "jitter_px": 0.5},
+    ...     "scene": {"noise_grey": 2.0}, "axes": {"trial": 2200},
+    ... }, store=folder / "drawn.zarr")
+    >>> error_model = sweep.error_model(folder / "drawn.zarr")
+    >>> at = error_model.at(drawn.true_rvec[:3], drawn.true_tvec_m[:3])  # (3, 3) each
+    >>> at.covariance.shape, at.covariance.dims
+    ((3, 6, 6), ('pose', 'row', 'column'))
+    """
     results, seen = (
         open_dataset(os.fspath(each)) if isinstance(each, (str, os.PathLike)) else each
         for each in (store, photographs))

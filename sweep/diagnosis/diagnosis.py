@@ -19,7 +19,7 @@ from sweep.diagnosis.inference import (
     next_measurement,
     rank,
 )
-from sweep.diagnosis.observations import Observations, read_observations
+from sweep.diagnosis.observations import ZERO_SD_M, Observations, read_observations
 from sweep.model.calibration import Calibration
 from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
@@ -40,12 +40,54 @@ even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d.""
 
 def diagnose(
     observations: str | os.PathLike[str] | Mapping[str, Sequence[Any]], *,
-    camera: str | os.PathLike[str] | Calibration | None = None,
-    output: str | None = None, **settings: Any,
+    camera: str | os.PathLike[str] | Calibration | None = None, size_m: float | None = None,
+    dictionary: str = "", refinement: str = "", zero_sd_m: float = ZERO_SD_M, compared: str = "z",
+    output: str | None = None,
 ) -> Findings:
-    """Return why poses are wrong: `sweep.diagnose`."""
+    """Find why a program's poses are not what a tape says.
+
+    Parameters
+    ----------
+    observations
+        A CSV file, or its columns by name: what the program said (``tvec_x_m``, ``tvec_y_m``,
+        ``tvec_z_m``, or ``range_m``, ``rvec_x`` ...; or corners, ``corner0_x_px`` ...), what was
+        measured (``tape_m`` from lens to marker, ``x_m``, ``y_m``, ``z_m``, ``yaw_deg``), with
+        standard deviations (``tape_sd_m``, ``position_sd_m``). Empty cells are unknown.
+    camera
+        The file of the calibration that the program believes.
+    size_m, dictionary
+        As the program believes them.
+    refinement
+        none, subpix, contour or apriltag; its bias and noise are expected.
+    zero_sd_m
+        Standard deviation of the tape's zero point, in metres.
+    compared
+        What was compared with the tape: "z", the third number of tvec, or "range".
+    output
+        A PNG or SVG file for the figure of residuals.
+
+    Returns
+    -------
+    Findings
+        Causes by posterior probability, what each predicts, the test that would decide, and one
+        sentence. ``numbers`` has the same; ``status`` is 3 if the rows cannot tell.
+
+    Raises
+    ------
+    ArgumentError
+        One line on rows, columns or numbers that cannot be.
+
+    Examples
+    --------
+    >>> rows = {"range_m": [1.8, 3.6], "tape_m": [1.0, 2.0]}
+    >>> found = sweep.diagnose(rows, dictionary="tagStandard41h12")
+    >>> found.numbers["causes"][0]["causes"]
+    ['size']
+    """
     figure = figure_file(output)
-    rows = read_observations(observations, camera=camera, **settings)
+    rows = read_observations(
+        observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
+        zero_sd_m=zero_sd_m, compared=compared)
     ranking = rank(rows)
     if figure is not None:
         write_figure([residual_figure(rows, ranking)], figure)

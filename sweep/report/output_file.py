@@ -20,7 +20,7 @@ from sweep.store.locations import reason_of
 FIGURE_SUFFIXES = (".png", ".svg")
 
 
-def figure_file(name: str | None) -> Path | None:
+def figure_file(name: str | os.PathLike[str] | None) -> Path | None:
     """Return the path of a figure, checked before there is one; None without a name.
 
     Raises

@@ -1,7 +1,6 @@
 """Questions to stores, each answered with findings that print themselves.
 
-They are behind `sweep.require`, `sweep.measure_tradeoff`, `sweep.compare`, `sweep.write_report`
-and behind the commands.
+`sweep.require`, `sweep.measure_tradeoff` and `sweep.write_report` are these functions.
 """
 
 from __future__ import annotations
@@ -9,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from sweep.analysis.requirements import (
 )
 from sweep.analysis.simulation_gaps import is_measured
 from sweep.errors import ArgumentError
-from sweep.execution.progress import StageReport, progress_display
+from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import byte_count, nearest, notice, quoted
@@ -46,7 +47,7 @@ from sweep.report.output_file import figure_file, is_standard_stream
 from sweep.report.report_data import read_report_data
 from sweep.report.table import UNDECIDED, Findings, plural
 from sweep.report.tradeoff_figure import headlines, renderer_table, trade_figure, tradeoff_table
-from sweep.report.write_report import write_report
+from sweep.report.write_report import write_page
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA
@@ -56,11 +57,47 @@ from sweep.tradeoff.pareto import CRITERIA
 
 
 def require(
-    store: str, requirements: Sequence[str] = (), *, per: Sequence[str] | None = None,
-    at: Sequence[str] = (), pipeline: str | None = None, against: str | None = None,
-    every: bool = False,
+    store: str | PathLike[str], requirements: Sequence[str] = (), *,
+    per: Sequence[str] | None = None, at: Sequence[str] = (), pipeline: str | None = None,
+    against: str | PathLike[str] | None = None, every: bool = True,
 ) -> Findings:
-    """Decide whether a store's results meet requirements; parameters as for `sweep.require`."""
+    """Decide whether a store's results meet requirements.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    requirements
+        Such as "detection >= 0.95" (default: the section [require] of the store's pipeline).
+    per
+        Axes whose values are conditions, at each of which all must hold; others are pooled
+        (default: those of [require], else the axes of size, angle and boards).
+    at
+        "name=value": only these values of axes.
+    pipeline
+        A TOML file whose section [require] is taken.
+    against
+        An older store, with which it is compared pose by pose: significantly worse is not met.
+    every
+        Whether the table of conditions has all of them, or those that fail.
+
+    Returns
+    -------
+    Findings
+        The decisions as tables and numbers; ``numbers["decision"]`` is that on all together, and
+        ``data`` the dataset of `sweep.analysis.check_requirements`.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, and stores that cannot be read.
+
+    Examples
+    --------
+    >>> found = sweep.require(folder / "two_sizes.zarr", ["detection >= 0.01"], per=[])
+    >>> found.numbers["decision"].name
+    'met'
+    """
     results, stored = _selected(store, at)
     if pipeline is not None:
         stored = read_pipeline(pipeline)
@@ -96,23 +133,61 @@ def require(
                  decisions.conditions_of(each, table)[:decisions.MAX_ROWS]} for each in found],
             "against": worse},
         table, {Decision.met: 0, Decision.not_met: 1}.get(decision, UNDECIDED),
-        (decisions.more_draws(found, results, store), ""))
+        (decisions.more_draws(found, results, os.fspath(store)), ""))
 
 
-def _selected(url: str, at: Sequence[str]) -> tuple[xr.Dataset, Pipeline]:
+def _selected(
+    url: str | PathLike[str], at: Sequence[str]
+) -> tuple[xr.Dataset, Pipeline]:
     """Return a finished store's results at some values of axes, and its pipeline."""
-    store = open_finished(url)
+    store = open_finished(os.fspath(url))
     return decisions.selected(open_dataset(url), at, store.pipeline), store.pipeline
 
 
 # --------------------------------------------------------------------------------------------------
 # What each configuration costs.
 
-def tradeoff(
-    store: str, *, per: Sequence[str], criterion: str, limit_s: float,
-    budget_ms: float | None = None, output: str | None = None, progress: StageReport | None = None,
+def measure_tradeoff(
+    store: str | PathLike[str], *, per: Sequence[str] = (), criterion: str = "rotation_p95_deg",
+    limit_s: float = 60.0, budget_ms: float | None = None,
+    output: str | PathLike[str] | None = None, progress: bool = False,
 ) -> Findings:
-    """Measure cost and accuracy of a store's configurations; as `sweep.measure_tradeoff`."""
+    """Measure what each configuration of a store costs, beside its accuracy on the same images.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store, or a TOML file, which is run first.
+    per
+        Axes of the scene whose values are conditions of their own.
+    criterion
+        The error that ranks configurations.
+    limit_s
+        Seconds of the measurement.
+    budget_ms
+        Most milliseconds a frame: the most accurate configuration within them is named.
+    output
+        PNG or SVG file of a figure.
+    progress
+        Whether progress is told on stderr.
+
+    Returns
+    -------
+    Findings
+        A row for each configuration and condition; ``data`` is the dataset that the store keeps in
+        its group ``cost/tradeoff``.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError
+        As for :func:`run`; also if costs cannot be measured here.
+
+    Examples
+    --------
+    >>> found = sweep.measure_tradeoff(folder / "two_sizes.zarr", limit_s=0.5)
+    >>> found.data.detection_ms.item() > 0  # milliseconds a frame
+    True
+    """
     if criterion not in CRITERIA:
         raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
                             + nearest(criterion, CRITERIA))
@@ -120,6 +195,7 @@ def tradeoff(
         if value is not None and not 0 < value < math.inf:
             raise ArgumentError(name, value, "expected a finite number above 0")
     figure = figure_file(output)
+    store = os.fspath(store)
     if store.lower().endswith(".toml"):
         pipeline = read_pipeline(store)
         check_required(pipeline.requirements, store)
@@ -131,7 +207,8 @@ def tradeoff(
     question: dict[str, str | float] = {"criterion": criterion}
     if budget_ms is not None:
         question["budget_ms"] = budget_ms
-    trade, renderers = measure_trade(store, per, limit_s, progress, question=question)
+    with stage_display() if progress else contextlib.nullcontext() as stage:
+        trade, renderers = measure_trade(store, per, limit_s, stage, question=question)
     if figure is not None:
         write_figure([trade_figure(trade, criterion)], figure)
     found = trade_lines(read_report_data(store), trade, budget_ms)
@@ -186,12 +263,49 @@ NO_REPORTS = {
 """Suffixes of files that neither HTML nor Markdown would be taken for."""
 
 
-def report(
-    store: str, output: str | None = None, *, require: Sequence[str] = (),
-    per: Sequence[str] | None = None, form: str | None = None, figures: str | None = None,
-    error_model: Sequence[str] = (), command: str = "",
+def write_report(
+    store: str | PathLike[str], output: str | PathLike[str] | None = None, *,
+    require: Sequence[str] = (), per: Sequence[str] | None = None, form: str | None = None,
+    figures: str | PathLike[str] | None = None, error_model: Sequence[str] = (),
+    command: str = "",
 ) -> Findings:
-    """Write the report of a store; parameters as for `sweep.write_report`."""
+    """Write the report of a store: answer, figures, example scenes.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    output
+        File to write (default: ``report.html``, or ``report.md`` with the form "md").
+    require, per
+        As for :func:`require`: the report begins with whether, and how far, it is met.
+    form
+        "html": one page; "md": Markdown with a folder of figures (default: by the file's suffix).
+    figures
+        Folder into which each figure is written as SVG and PNG, too.
+    error_model
+        JSON files of the error models to write, too.
+    command
+        The command line that asked for it, which the report shows.
+
+    Returns
+    -------
+    Findings
+        The first line and the numbers of the report.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, or written.
+
+    Examples
+    --------
+    >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
+    >>> found.numbers["figures"], (folder / "report.html").exists()
+    (5, True)
+    """
+    output, figures = (
+        None if each is None else os.fspath(each) for each in (output, figures))
     for name, value in (("output", output), ("figures", figures)):
         if value is not None and not value.strip():
             raise ArgumentError(name, repr(value), "expected a name")
@@ -201,14 +315,14 @@ def report(
         raise ArgumentError("output", output, "expected a file that ends in .html or .md")
     form = form or ("md" if str(output).lower().endswith(".md") else "html")
     page = Path(output or f"report.{form}")
-    data = read_report_data(store, require, per, command)
+    data = read_report_data(os.fspath(store), require, per, command)
     if error_model:
         written_error_models(data, error_model)
-    count, answer = write_report(data, page, form, Path(figures) if figures else None)
+    count, answer = write_page(data, page, form, Path(figures) if figures else None)
     size = f", {byte_count(page.stat().st_size)}" if page.is_file() else ""
     then = (f"look at {page}", "")
     if data.trade is None and data.setting_axes:
-        then = (f"sweep tradeoff {quoted(store)}", "what each configuration costs")
+        then = (f"sweep tradeoff {quoted(data.store)}", "what each configuration costs")
     content: dict[str, Any] = {
         "report": str(page), "figures": count, "store": data.store,
         "required": list(data.require), "per": list(data.per)}

@@ -19,13 +19,18 @@ from sweep.model.effects import EFFECTS
 from sweep.report.table import Findings, Table
 
 
-def reference(names: Sequence[str] = ()) -> Findings:
-    """Return the tables of some subjects, or the list of subjects.
+def reference(*names: str) -> Findings:
+    """Return parameters, effects, solvers, variables, flags or statistics, with their meaning.
 
     Parameters
     ----------
     names
-        Of each table its name in `TABLES`, or the name of a parameter.
+        A subject ("camera", "effects", "flags", ...) or a parameter; without any, the subjects.
+
+    Returns
+    -------
+    Findings
+        A table of each subject, and one of the parameters.
 
     Raises
     ------
@@ -34,7 +39,7 @@ def reference(names: Sequence[str] = ()) -> Findings:
 
     Examples
     --------
-    >>> reference(["tilt_deg"]).numbers["parameters"][0]["unit"]
+    >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
     'degree'
     """
     parameters = [name for name in names if name not in TABLES]

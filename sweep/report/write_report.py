@@ -215,7 +215,7 @@ def _check_folder(wanted: Path) -> None:
     check_folder_writable(folder)
 
 
-def write_report(
+def write_page(
     data: ReportData, output: Path, form: str = "html", figures: Path | None = None
 ) -> tuple[int, Answer]:
     """Write the report of a store; return its number of figures, and the answer.

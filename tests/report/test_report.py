@@ -19,7 +19,7 @@ from sweep.report.figures import figures_of
 from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.scenes import scenes_of
 from sweep.report.table import number
-from sweep.report.write_report import write_report
+from sweep.report.write_report import write_page
 from sweep.store.lifecycle import open_dataset, open_store
 
 ODD = {
@@ -204,5 +204,5 @@ def test_results_without_poses_are_refused(full, tmp_path):
     empty = ReportData(data.store, data.results.isel(trial=slice(0, 0)), data.pipeline,
                        data.run_metadata)
     with pytest.raises(StoreError, match="there are no results"):
-        write_report(empty, tmp_path / "report.html")
+        write_page(empty, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []

@@ -274,7 +274,8 @@ _descend_in_sight = getattr(descend, "py_func", descend)
 
 
 def locate_in_sight(
-    image: Floats, starts: Floats, seen_from: Callable[[Pose], MarkerView], information: Floats
+    image: Floats, starts: Floats, view: MarkerView, seen_from: Callable[[Pose], MarkerView],
+    information: Floats,
 ) -> tuple[Floats, float, bool, Floats, int]:
     """Return what :func:`locate_exactly` does of a target in several planes, from each start."""
     free, square_sum, work = len(information), squares(image), work_space(*image.shape)
@@ -283,7 +284,6 @@ def locate_in_sight(
     fits = [(missing, math.inf, False), (missing, math.inf, False)]
     for start in starts:
         state, level, reached = start.copy(), math.inf, False
-        view = seen_from((rotation_of(start), start[POSITION]))
         if is_before_camera(state, view):
             level, reached = _descend_in_sight(
                 InSight(image, square_sum, view, seen_from), state, work, freedom, FINE_STEPS,
@@ -541,7 +541,7 @@ class Photometric:
         view = seen_from(poses[0])
         state, level, reached, other, freedom = (
             locate_exactly(image, starts, view, information) if one.targets[0].is_planar
-            else locate_in_sight(image, starts, seen_from, information)
+            else locate_in_sight(image, starts, view, seen_from, information)
         )
         if not math.isfinite(level) or freedom < 1:
             return None

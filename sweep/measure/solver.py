@@ -144,48 +144,20 @@ def _plain(
     corners: Floats, cameras: Cameras, size_m: Floats, method: int
 ) -> tuple[Floats, Floats]:
     """Call ``cv2.solvePnP`` plainly: marker frame, metres, OpenCV's own lens inverse."""
+    count = len(corners)
+    rvec, translation = np.full((count, 2, 3), np.nan), np.full((count, 2, 3), np.nan)
     objects = marker_corners(size_m)
-    return _first_two([
-        _called(objects[i], corners[i], cameras.matrix(i), lens_of(cameras, i), method, every=False)
-        for i in range(len(corners))
-    ])
-
-
-Vectors = tuple[Floats, Floats]
-"""Rotation vector and position, (3, 1) each."""
-
-
-def _called(
-    objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int, *,
-    every: bool, start: tuple[Any, Any, bool] = (None, None, False),
-) -> list[Vectors]:
-    """Return the solutions of ``cv2.solvePnP``, or with ``every`` all of ``cv2.solvePnPGeneric``.
-
-    None if it fails. ``start`` is a rotation vector and a position to start from, and True.
-    """
-    try:
-        if every:
-            success, vectors, positions, _ = cv2.solvePnPGeneric(
-                objects, pixels, matrix, lens, flags=method
+    for i in range(count):
+        distortion = cameras.lenses[i, :14] if cameras.distorted[i] else None
+        try:
+            success, r, t = cv2.solvePnP(
+                objects[i], corners[i], cameras.matrix(i), distortion, flags=method
             )
-        else:
-            success, vector, position = cv2.solvePnP(
-                objects, pixels, matrix, lens, *start, flags=method
-            )
-            vectors, positions = (vector,), (position,)
-    except cv2.error:
-        return []
-    found: Any = zip(vectors, positions, strict=True) if success else ()
-    return list(found)
-
-
-def _first_two(solutions: Sequence[list[Vectors]]) -> tuple[Floats, Floats]:
-    """Return two solutions of each of n: rotations (n, 2, 3, 3), positions (n, 2, 3); or NaN."""
-    found = np.full((2, len(solutions), 2, 3), np.nan)
-    for i, each in enumerate(solutions):
-        for k, (vector, position) in enumerate(each[:2]):
-            found[0, i, k], found[1, i, k] = vector[:, 0], position[:, 0]
-    return rotation_of_vector(found[0]), found[1]
+        except cv2.error:
+            continue
+        if success:
+            rvec[i, 0], translation[i, 0] = r[:, 0], t[:, 0]
+    return rotation_of_vector(rvec), translation
 
 
 # The guard. IPPE divides by sin(pi) if the rotation vector's norm is pi, which in the marker
@@ -306,14 +278,15 @@ def _iterated(
     Points (n, 4, 2) are BL, BR, TR, TL in undistorted pixels.
     """
     vectors = vector_of_rotation(rotation * _Z_OUT)
-    ended, positions = _first_two([
-        _called(
-            _UNIT_SQUARE, points[i], matrices[i], None, cv2.SOLVEPNP_ITERATIVE, every=False,
-            start=(vectors[i, :, None].copy(), translation[i, :, None].copy(), True),
-        ) if np.isfinite(vectors[i]).all() else []
-        for i in range(len(points))
-    ])
-    return ended[:, 0] * _Z_OUT, positions[:, 0]
+    ended = np.full((2, len(points), 3), np.nan)
+    for i in np.flatnonzero(np.isfinite(vectors).all(axis=1)):
+        success, r, t = cv2.solvePnP(
+            _UNIT_SQUARE, points[i], matrices[i], None, vectors[i, :, None].copy(),
+            translation[i, :, None].copy(), useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
+        )
+        if success:
+            ended[0, i], ended[1, i] = r[:, 0], t[:, 0]
+    return rotation_of_vector(ended[0]) * _Z_OUT, ended[1]
 
 
 def _solve_turned(
@@ -325,17 +298,35 @@ def _solve_turned(
     the marker frame and translations (n, 2, 3) in sides.
     """
     count = len(points)
+    missing = np.full((3, 1), np.nan)
     order = (np.arange(4) + turns[:, None]) % 4
     turned = np.take_along_axis(points, order[:, :, None], axis=1)
-    rotation, translation = _first_two([
-        _called(_UNIT_SQUARE, pixels, matrix, None, method, every=method in _TWO_SOLUTIONS)
-        for pixels, matrix in zip(turned, matrices, strict=True)
-    ])
+    vectors: list[Any] = []
+    both = method in _TWO_SOLUTIONS
+    for pixels, matrix in zip(turned, matrices, strict=True):
+        try:
+            if both:
+                success, rs, ts, _ = cv2.solvePnPGeneric(
+                    _UNIT_SQUARE, pixels, matrix, None, flags=method
+                )
+            else:
+                success, r, t = cv2.solvePnP(_UNIT_SQUARE, pixels, matrix, None, flags=method)
+                rs, ts = (r,), (t,)
+        except cv2.error:
+            success = False
+        if not success:
+            vectors += [missing] * 4
+        elif len(rs) > 1:
+            vectors += [rs[0], rs[1], ts[0], ts[1]]
+        else:
+            vectors += [rs[0], missing, ts[0], missing]
+    solved = np.concatenate(vectors).reshape(count, 2, 2, 3) if vectors else np.empty((0, 2, 2, 3))
+    rotation, translation = rotation_of_vector(solved[:, 0]), solved[:, 1]
     c, s = np.array([1.0, 0.0, -1.0, 0.0])[turns], np.array([0.0, 1.0, 0.0, -1.0])[turns]
     back = np.zeros((count, 3, 3))
     back[:, 0, 0], back[:, 0, 1], back[:, 1, 0], back[:, 1, 1] = c, -s, s, c
     back[:, 2, 2] = 1.0
-    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation
+    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation.copy()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -345,9 +336,9 @@ Pose = tuple[Floats, Floats]
 """Rotation (3, 3) and translation (3,) in metres."""
 
 
-def lens_of(cameras: Cameras, row: int = 0) -> Floats | None:
-    """Return the lens of a camera as OpenCV's calls take it; None if it has none."""
-    return cameras.lenses[row, :14] if cameras.distorted[row] else None
+def lens_of(cameras: Cameras) -> Floats | None:
+    """Return the lens of the first camera as OpenCV's calls take it; None if it has none."""
+    return cameras.lenses[0, :14] if cameras.distorted[0] else None
 
 
 def reprojection_px(
@@ -391,15 +382,23 @@ def poses_of_each_marker(
     ]
 
 
-def _poses(
+def _called(
     objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int
 ) -> list[Pose]:
-    """Return all poses that ``cv2.solvePnPGeneric`` finds."""
-    found = _called(
-        np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, method,
-        every=True,
-    )
-    return [(rotation_of_vector(r.reshape(1, 3))[0], t.ravel()) for r, t in found]
+    """Call ``cv2.solvePnPGeneric``; no pose if it fails."""
+    try:
+        success, vectors, positions, _ = cv2.solvePnPGeneric(
+            np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, flags=method
+        )
+    except cv2.error:
+        return []
+    if not success:
+        return []
+    return [
+        (rotation_of_vector(np.asarray(r, dtype=np.float64).reshape(1, 3))[0],
+         np.asarray(t, dtype=np.float64).ravel())
+        for r, t in zip(vectors, positions, strict=True)
+    ]
 
 
 COLLINEAR = 1e-6
@@ -464,7 +463,7 @@ class GuardedPoints(NamedTuple):
         """Return the target's poses by a method of ``cv2.solvePnPGeneric``."""
         found = []
         if len(self.points):
-            for rotation, position in _poses(
+            for rotation, position in _called(
                 self.points, self.pixels, self.matrix, None, method
             ):
                 turned = rotation @ self.turn @ _Z_IN
@@ -585,7 +584,7 @@ class PointSolver:
             guard = GuardedPoints.of(objects, pixels, cameras)
             poses = guard.poses(method)
         else:
-            poses = _poses(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
+            poses = _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
         ordered = _by_error(poses, objects, pixels, cameras, used)
         if guard is not None and self.solver == "iterative":
             ordered = _least_of(ordered, guard, objects, pixels, cameras, side_px)

@@ -19,7 +19,12 @@ from sweep.diagnosis.inference import (
     next_measurement,
     rank,
 )
-from sweep.diagnosis.observations import ZERO_SD_M, Observations, read_observations
+from sweep.diagnosis.observations import (
+    READABLE_PX,
+    ZERO_SD_M,
+    Observations,
+    read_observations,
+)
 from sweep.model.calibration import Calibration
 from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
@@ -184,6 +189,9 @@ def _sentence(rows: Observations, ranking: Ranking, measurement: Measurement | N
         return (f"No known cause explains these rows: even {name_of(first)} misses them by "
                 f"{np.sqrt(_misfit(first) / count):.2g} standard deviations; look for a mistaken "
                 "row, or state a larger tape_sd_m.")
+    if not first.names and (rows.side_px < READABLE_PX).any():
+        return ("What was said agrees with what was measured, but no detector reads so small a "
+                "square: are size_m and all distances in metres?")
     if not first.names:
         return ("The numbers agree with what is expected: nothing is wrong that these rows could "
                 "show.")

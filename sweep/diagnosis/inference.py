@@ -135,7 +135,10 @@ def predict(rows: Observations, causes: Sequence[Cause], correction: Correction)
     seen = np.concatenate(
         [seen, np.broadcast_to(zeros, (len(points), *zeros.shape))[..., np.unique(component)]],
         axis=-1)
-    distance = np.linalg.norm(points, axis=-1)[:, row]
+    # Noise grows with the distance as measured: with that of the points a factor that brings them
+    # near would explain many rows by less noise.
+    known = np.where(np.isfinite(rows.tape), rows.tape, rows.position[:, 2])
+    distance = np.where(np.isfinite(known), np.abs(known), np.linalg.norm(points, axis=-1))[:, row]
     focal = rows.camera.fx_px if rows.camera is not None else 1000.0
     along = (onto * sight[:, row]).sum(axis=-1)
     tape = np.where(component == 3, rows.tape_sd[row], rows.position_sd[row])
@@ -164,7 +167,9 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
     covariance = np.linalg.inv(precision)
     slope = np.einsum("cdk,cd->ck", weighted, residual)
     numbers = np.einsum("ckl,cl->ck", covariance, slope)
-    misfit = (residual**2 / predicted.variance).sum(axis=-1) - (slope * numbers).sum(axis=-1)
+    # As a sum of squares: the shorter difference of two large numbers came out below zero.
+    left = residual - np.einsum("cdk,ck->cd", predicted.columns, numbers)
+    misfit = (left**2 / predicted.variance).sum(axis=-1) + (numbers**2).sum(axis=-1)
     likelihood = -0.5 * (
         misfit + np.log(2.0 * math.pi * predicted.variance).sum(axis=-1)
         + np.linalg.slogdet(precision)[1])

@@ -74,6 +74,9 @@ UNKNOWN_SIDE_PX = 80.0
 LENGTHS_M = (1e-5, 1e7)
 """Lengths between which positions and tapes can be, in whatever unit."""
 
+MAX_ROWS = 1000
+"""Rows that are judged within half a minute."""
+
 READABLE_PX = 4.0
 """Sides below this cannot be read: the numbers are in other units than the size."""
 
@@ -164,8 +167,8 @@ def read_observations(
                          f"expected {', '.join(SAID)} and {', '.join(TAPE)}, or {IMAGE}, or "
                          f"corners {CORNERS[0]} ...")
     count = max((len(values) for values in columns.values()), default=0)
-    if not count:
-        raise _fault("no rows: expected one or more below the header")
+    if not 0 < count <= MAX_ROWS:
+        raise _fault(f"{count or 'no'} rows: expected 1 to {MAX_ROWS} below the header")
     for setting, value, known in (
         ("dictionary", dictionary, dictionary_names()), ("refinement", refinement, [*REFINEMENTS]),
         ("compared", compared, ["z", "range"]),
@@ -292,6 +295,9 @@ def _read_csv(path: str) -> dict[str, list[str]]:
         raise ArgumentError("observations", plain(path), reason) from None
     lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
     header, *rows = [[cell.strip() for cell in row] for row in lines if any(row)] or [[]]
+    if len(header) == 1 and {*";\t"} & {*header[0]}:
+        raise ArgumentError("observations", plain(path), "expected commas between columns, and "
+                            "points in numbers")
     if twice := {name for name in header if header.count(name) > 1}:
         raise ArgumentError("observations", plain(path), f"column {plain(min(twice))} is there "
                             "twice")

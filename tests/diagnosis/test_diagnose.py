@@ -43,9 +43,16 @@ def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
     assert "confounded" in found.numbers["sentence"]
 
 
-def test_rows_that_agree_or_that_nothing_explains_are_said_to_be():
-    found = sweep.diagnose({"range_m": AWAY * 1.003, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
+@pytest.mark.parametrize(("away", "words"), [
+    (AWAY, "nothing is wrong"), (np.linspace(0.5, 2, 100), "nothing is wrong"),
+    (1000 * AWAY, "in metres?")])
+def test_rows_that_agree_are_said_to(away, words):
+    found = sweep.diagnose({"range_m": away * 1.003, "tape_m": away}, camera=CAMERA, size_m=0.1)
     assert (first(found), found.status) == (["agree"], 0)
+    assert words in found.numbers["sentence"]
+
+
+def test_rows_that_nothing_explains_are_said_to_be():
     found = sweep.diagnose({"range_m": [0.5, 1.9, 0.9, 3.0], "tape_m": [0.9, 0.5, 1.5, 1.0]})
     assert "No known cause" in found.numbers["sentence"]
 
@@ -72,7 +79,7 @@ def test_next_measurement_is_where_predictions_differ():
     ({"range_m": [1.0], "tape_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m"),
     ({"range_m": [1.0], "tape_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
     ({"range_m": [1e300], "tape_m": [1.0]}, "expected metres between"),
-    ({}, "no rows"),
+    ({}, "no rows"), ({"range_m": [1.0] * 1001}, "1001 rows"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
     with pytest.raises(sweep.ArgumentError) as error:
@@ -120,7 +127,7 @@ def test_poses_are_solved_from_images(tmp_path):
     assert "the white margin" in wrong.numbers["causes"][0]["size"]
     for text, words in (
         ("image,tape_m,marker_id\n" + f"{names[0]},1,7\n", "(IDs 0): expected one, or marker_id"),
-        ("image,tape_m\nnone.png,1\n", "none.png"),
+        ("image,tape_m\nnone.png,1\n", "none.png"), ("tape_m;range_m\n1,5;1,5\n", "commas"),
     ):
         rows.write_text(text)
         with pytest.raises(sweep.ArgumentError, match=re.escape(words)):

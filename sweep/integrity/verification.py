@@ -213,6 +213,10 @@ def check_scenes(
         report.not_sampled = (
             "there is no sound block" if sample else "a sample of 0 scenes was asked for")
         return
+    metadata = {f"{variable.name}/zarr.json" for variable in store.variables}
+    if unreadable := metadata & {each.where for each in report.damage}:
+        report.not_sampled = f"{min(unreadable)} is damaged"
+        return
     try:
         pipeline = computable(store)
     except SweepError as error:

@@ -424,3 +424,8 @@ def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith(f"{copied}: store format {number}")
         assert "sweep run PIPELINE --store NEW" in line
+
+
+def test_no_scene_is_recomputed_where_metadata_cannot_be_read(copied):
+    (copied / "nees/zarr.json").write_bytes(b"")
+    assert verify(str(copied), 3).not_sampled == "nees/zarr.json is damaged"

@@ -11,6 +11,7 @@ import logging
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -467,11 +468,12 @@ def _reusing_command(given: Sequence[str], url: str) -> str:
     return quoted("sweep", *words, "--store", new, "--reuse", url)
 
 
-def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
-    """Print one line if the system refused a file, memory, a thread or a process.
+def print_system_error(error: OSError | MemoryError | RuntimeError | ValueError) -> int:
+    """Print one line if the system refused something, or Zarr cannot decode a file of a store.
 
-    Any other RuntimeError is a defect, and raised.
+    Any other RuntimeError or ValueError is a defect, and raised.
     """
+    modules = [frame.f_globals["__name__"] for frame, _ in traceback.walk_tb(error.__traceback__)]
     if isinstance(error, MemoryError):
         line, number = "out of memory", errno.ENOMEM
     elif isinstance(error, OSError):
@@ -482,6 +484,8 @@ def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
         line, number = f"{cause}: {error.strerror or error}", error.errno or 0
     elif str(error) == NO_THREAD:
         line, number = f"the system refused a request: {error}", errno.EAGAIN
+    elif modules[-1].partition(".")[0] in ("zarr", "numcodecs"):
+        line, number = f"a store cannot be read: {error}; `sweep verify` names what is damaged", 0
     else:
         raise error
     advice = f"; {ADVICE[number]}" if number in ADVICE else ""

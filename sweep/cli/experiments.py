@@ -169,7 +169,7 @@ def plan(
     pipeline: str, *, settings: Sequence[str] = (), precision: Sequence[str] = (),
     max_trials: int | None = None, workers: int | None = None,
 ) -> Findings:
-    """Show a pipeline's grid and expected cost.
+    """Show a pipeline's grid, active parts and expected cost.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def plan(
     """
     read = read_pipeline(pipeline, settings, precision, max_trials)
     announce_compilation(read)
-    facts = read.facts
+    facts, listed = read.facts, read.facts.parts
     expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
     refused = library.forecast.objections(
@@ -191,6 +191,8 @@ def plan(
         "Dimensions": _dimensions(read),
         "Required": _required(read),
         "Trials": [] if read.stopping is None else _rule_lines(read.stopping),
+        "Parts": [
+            f"{part.name:17} {'on ' if part.active else 'off'}  {part.reason}" for part in listed],
         "Expected": _expected(read, expected),
     }
     lines = [read.heading]
@@ -205,6 +207,7 @@ def plan(
         "dimensions": {axis.name: len(axis) for axis in read.axes},
         "require": {"all": list(read.requirements), "per": list(read.require_per)},
         **dataclasses.asdict(expected),
+        "parts": [dataclasses.asdict(part) for part in listed],
     }, 0, quoted("sweep", "run", pipeline, *words))
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -29,13 +30,18 @@ from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.detectors import (
+    NOISE_MARGIN_PX,
     OPENCV,
     AnyDetectorSetting,
     BoardDetectorSetting,
     DetectorSetting,
+    full_frame_reason,
+    margin_px,
+    uneven_light_needs_frame,
 )
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.likelihood import BoundSetting
+from sweep.messages import label
 from sweep.model.board_kinds import ARRANGING, arranged_board
 from sweep.model.camera import (
     VIEW_PARAMETERS,
@@ -46,7 +52,14 @@ from sweep.model.camera import (
     intrinsics,
     map_columns,
 )
-from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
+from sweep.model.effects import (
+    EFFECTS,
+    Effect,
+    ScenePlugins,
+    checked_effect,
+    checked_renderer,
+    is_coded,
+)
 from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
@@ -468,8 +481,28 @@ def _text(numbers: Sequence[float] | Floats, digits: int = 6) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """An optional part of the work.
+
+    Attributes
+    ----------
+    name
+        Its name.
+    active, reason
+        Whether it runs, and why.
+    switch
+        Of an effect: the parameter that switches it on.
+    """
+
+    name: str
+    active: bool
+    reason: str
+    switch: str = ""
+
+
 class Facts:
-    """What an experiment's camera and poses are, and what may surprise.
+    """What an experiment's camera and poses are, which parts are active, and what may surprise.
 
     Of large grids, and of what is drawn, by the scenes that are looked at. `sweep plan` prints all
     of it; the start of a run prints the notes.
@@ -681,3 +714,86 @@ class Facts:
         if PHOTOGRAPHS in self.grid.given:
             return []
         return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """Every optional part, active or not."""
+        grid, effects, settings = self.grid, self.experiment.effects, self.experiment.detectors
+        on = [effect for effect in effects
+              if effect.switch in grid.distributions
+              or grid.any_value(effect.switch, effect.is_on)]
+        calibrated = grid.calibration is not None
+        draws = dict.fromkeys([
+            *grid.distributions, *["jitter_px"] * grid.any_value("jitter_px", bool),
+            *(each.switch for each in on if each.random),
+            *["the believed calibration"] * calibrated,
+        ])
+        lens = any(map(canonical_distortion, grid.values_of("distortion")))
+        image = grid.any_value("background", lambda value: isinstance(value, str))
+        noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
+        coarse = any("noise" in effect.worsens for effect in on)
+        around = f" px around the {grid.target_word}'s pixels" + (
+            f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
+        windows = {margin_px(each) for each in settings if full_frame_reason(each) is None}
+        if image or "full" in grid.values_of("window"):
+            windows = set()
+        assumptions = [
+            name for name in PARAMETERS
+            if name.startswith("believed_") and grid.fixed.get(name, "varies") is not None
+        ] + ["believed: calibration"] * calibrated
+        with_pixels = {each.name for each in grid.plugins if each.needs_images} | {
+            name for name, each in SOLVERS.items() if each.needs_images}
+        # Why each is active, and what is said if nothing is a reason.
+        reasons: dict[str, tuple[Iterable[str], str]] = {
+            "lens distortion": (["distortion is given"] * lens, "distortion is empty"),
+            "random draws": (
+                [*draws, *["Sobol' points"] * (grid.sampling == "sobol")], "nothing is random"),
+            "background image": (["background names a file"] * image, "a level"),
+            "window": ([", ".join(map(str, sorted(windows))) + around] * bool(windows),
+                       "the full frame"),
+            "plug-ins": (map(_described, grid.plugins), "none is named"),
+            "full frame": (self._reasons_for_the_frame(on, image=image), "no setting needs it"),
+            "renderer": (sorted(set(grid.values_of("renderer"))), ""),
+            "solver guard": (["guarded = true"] * grid.any_value("guarded", bool),
+                             "guarded = false: plain cv2.solvePnP"),
+            "accuracy bound": (
+                [f"bound is {each}" for each in sorted(set(grid.values_of("bound")) - {"none"})],
+                "bound is none"),
+            "pixels kept": (
+                [f"solver {each} needs them" for each in grid.values_of("solver")
+                 if each in with_pixels], "no solver needs them"),
+            "wrong assumptions": (assumptions, "the estimator knows the true camera and size"),
+        }
+        listed = [Part(name, bool(text := ", ".join(each)), text or otherwise)
+                  for name, (each, otherwise) in reasons.items()]
+        return [*listed, *map(self._effect, effects)]
+
+    def _reasons_for_the_frame(self, on: Sequence[Effect], *, image: bool) -> list[str]:
+        """Return why the whole frame is searched, given the effects that are on."""
+        settings = self.experiment.detectors
+        reasons = sorted({reason for each in settings if (reason := full_frame_reason(each))})
+        gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
+            [1.0, *self.grid.values_of("gain")])
+        if any(effect.widens == "uneven light" for effect in on) and any(
+                uneven_light_needs_frame(setting, gain) for setting in settings):
+            reasons.append("adaptiveThreshConstant is low for uneven light")
+        if image:
+            reasons.append("the background is an image: clutter near the "
+                           f"{self.grid.target_word} may change the detection")
+        return reasons + ['window = "full"'] * ("full" in self.grid.values_of("window"))
+
+    def _effect(self, effect: Effect) -> Part:
+        switch, drawn = effect.switch, self.grid.distributions.get(effect.switch)
+        if drawn is not None:
+            return Part(effect.label, True, f"{switch} is drawn: {drawn}", switch)
+        values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
+        text = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) or not values \
+            else _text(values)
+        return Part(effect.label, bool(values), f"{switch} is {text or effect.off_text}", switch)
+
+
+def _described(plugin: DeclaredPlugin) -> str:
+    """Return a plug-in in words: kind, name, versions."""
+    versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
+    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads

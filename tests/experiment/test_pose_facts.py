@@ -54,3 +54,21 @@ def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
     # of 600 poses is off by 0.11, six standard deviations, with a probability of 1e-9.
     line, = (line for line in facts.notes if "outside the frame" in line)
     assert abs(float(line.split()[1]) / 100 - (1 - 30.96 / 40)) < 0.11
+
+
+@pytest.mark.parametrize(("document", "name", "reason"), [
+    ({}, "full frame", None),
+    ({}, "window", "px around the marker's pixels"),
+    ({"detector": {"useAruco3Detection": True}}, "full frame",
+     "useAruco3Detection scales the image by the frame's size"),
+    ({"scene": {"blur_px": 0.5}}, "optical blur", "blur_px is 0.5"),
+    ({"scene": {"noise_grey": {"uniform": [1, 2]}}}, "random draws", "noise_grey"),
+    ({"camera": {"distortion": [0.1, 0, 0, 0]}}, "lens distortion", "distortion is given"),
+    ({"estimator": {"solver": "photometric"}}, "pixels kept", "solver photometric needs them"),
+    ({"estimator": {"believed_focal_scale": 1.01}}, "wrong assumptions", "believed_focal_scale"),
+])
+def test_parts_are_active_for_a_reason(document, name, reason):
+    pipeline = Pipeline.from_dict({"pose": {"side_px": 40}, **document})
+    part, = (each for each in pipeline.facts.parts if each.name == name)
+    assert part.active == (reason is not None)
+    assert (reason or "no setting needs it") in part.reason

@@ -91,9 +91,9 @@ def rules_of_solved(share, rng):
 @pytest.mark.long
 @pytest.mark.parametrize(("rules", "value", "most", "error"), [
     *((rules_of_width, half_width, 60, 0.05) for half_width in (0.01, 0.03, 0.1, 0.25)),
-    # At 0.9999 the error is up to 1.11 times that promised.
+    # At 0.9999 the error is up to 1.18 times that promised, beside 4,000 ends of each rule.
     *((rules_of_level, level, 30, times * (1 - level))
-      for level, times in ((0.9, 1.0), (0.99, 1.0), (0.9999, 1.15))),
+      for level, times in ((0.9, 1.0), (0.99, 1.0), (0.9999, 1.2))),
     (rules_of_solved, 0.3, 60, 0.05),
 ])
 def test_the_least_coverage_of_any_rate_is_as_promised(rules, value, most, error, claim):

@@ -195,12 +195,12 @@ def error_model(
     >>> at.covariance.shape, at.covariance.dims
     ((3, 6, 6), ('pose', 'row', 'column'))
     """
-    results, seen = (
-        open_dataset(os.fspath(each)) if isinstance(each, (str, os.PathLike)) else each
-        for each in (store, photographs))
-    assert results is not None  # noqa: S101  (the type of ``store``)
-    model = of_simulation(results)
-    return model if seen is None else widened(model, seen)
+    model = of_simulation(_opened(store))
+    return model if photographs is None else widened(model, _opened(photographs))
+
+
+def _opened(store: xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
+    return store if isinstance(store, xr.Dataset) else open_dataset(os.fspath(store))
 
 
 def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:

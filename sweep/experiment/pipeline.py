@@ -497,8 +497,10 @@ def something_random_to_repeat(reading: Reading) -> None:
     Their trials are whole replicates.
     """
     trials = len(reading.values_of(TRIAL)) or 1
-    drawn = (
-        bool(reading.distributions) or reading.is_active("jitter_px") or _is_calibrated(reading))
+    # A distribution that is at fault is one, too.
+    drawn = any(isinstance(value, Mapping) and reading.axis_of(name) is None
+                for name, (_, value) in reading.written.items())
+    drawn = drawn or reading.is_active("jitter_px") or _is_calibrated(reading)
     noisy = map(reading.is_active, (*RANDOM, *(
         plugin.settings[0].name for plugin in reading.plugins
         if plugin.kind == "effect" and plugin.random)))

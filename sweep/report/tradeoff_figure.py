@@ -25,7 +25,7 @@ CRITERION = "rotation_p95_deg"
 OTHER_CRITERION = "rotation_median_deg"
 """Used if the first is infinite or NaN for every configuration of some condition."""
 
-MS = "ms a frame"
+MS, MS_VARIABLE = "ms a frame", "cost_ms"
 
 
 def heading_of(name: str) -> str:
@@ -36,9 +36,12 @@ def heading_of(name: str) -> str:
 
 
 def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[Column]]:
-    """Return a trade with its front and covariances as columns, and the columns of its table."""
+    """Return a trade with its front and covariances as columns, and the columns of its table.
+
+    Columns without any value are left out, but for the cost and the criterion.
+    """
     columns = [
-        Column(MS, "cost_ms"), Column("x baseline", "cost_ratio"),
+        Column(MS, MS_VARIABLE), Column("x baseline", "cost_ratio"),
         Column("detected, %", "detection_rate", 100), Column("flips, %", "flip_rate", 100),
         Column(heading_of(criterion), criterion)]
     for quantity, unit in UNITS.items():
@@ -55,7 +58,8 @@ def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[C
         marked["trusted"] = marked["covariance_trusted"].astype(object).where(
             marked["nees_count"] > 0, None)
         columns.append(Column("covariance trusted", "trusted"))
-    return marked, [each for each in columns if each.variable in marked]
+    return marked, [each for each in columns if each.variable in (MS_VARIABLE, criterion) or (
+        each.variable in marked and bool(marked[each.variable].notnull().any()))]
 
 
 def tradeoff_table(trade: xr.Dataset, criterion: str) -> Table:

@@ -205,19 +205,26 @@ def _opened(store: xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
 
 def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
     """Return a model whose covariance times a factor describes the errors in photographs."""
+    found = judged(model, photographs)
+    used = np.isfinite(found["squared_error"].values)
+    if used.sum() < MIN_PHOTOGRAPHED:
+        raise DatasetError(
+            f"{used.sum()} solved poses of photographs that are not flipped and that the "
+            f"simulation knows: a factor needs {MIN_PHOTOGRAPHED} or more; take more photographs, "
+            "or simulate their poses (`sweep.twins`)")
+    error, covariance, deviations = (
+        found[name].values[used] for name in ("error", "covariance", "truth_std"))
     factor = 1.0
     for _ in range(ROUNDS):  # the truth's own errors are not multiplied
-        wider = dataclasses.replace(
-            model, log_covariance=model.log_covariance + math.log(factor) * np.eye(6))
-        squares = judged(wider, photographs)["squared_error"].values
-        used = int(np.isfinite(squares).sum())
-        if used < MIN_PHOTOGRAPHED:
-            raise DatasetError(
-                f"{used} solved poses of photographs that are not flipped and that the simulation "
-                f"knows: a factor needs {MIN_PHOTOGRAPHED} or more; take more photographs, or "
-                "simulate their poses (`sweep.twins`)")
-        factor *= float(np.nanmean(squares)) / 6.0
-    return wider
+        factor *= float(squared_errors(error, factor * covariance, deviations).mean()) / 6.0
+    return dataclasses.replace(
+        model, log_covariance=model.log_covariance + math.log(factor) * np.eye(6))
+
+
+def squared_errors(errors: Floats, covariance: Floats, deviations: Floats) -> Floats:
+    """Return squares (n,) of errors (n, 6) in units of a covariance and of the truth's own one."""
+    both = covariance + np.eye(6) * deviations[:, None, :] ** 2
+    return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(both), errors))
 
 
 def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
@@ -235,11 +242,10 @@ def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
     found = model.at(rvec, tvec, ratio)
     lengths = np.linalg.norm(tvec, axis=1)
     left = errors * np.repeat([lengths, np.ones(len(tvec))], 3, axis=0).T - found["bias"].values
-    covariance = found["covariance"].values + np.eye(6) * deviations[:, None, :] ** 2
     squares = np.full(len(left), np.nan)
     used = found["known"].values & ~flipped
-    squares[used] = np.einsum(
-        "ni,nij,nj->n", left[used], np.linalg.inv(covariance[used]), left[used])
+    squares[used] = squared_errors(
+        left[used], found["covariance"].values[used], deviations[used])
     return found.assign(
         error=(("pose", "row"), left), truth_std=(("pose", "row"), deviations),
         flipped=("pose", flipped), squared_error=("pose", squares))
@@ -322,14 +328,14 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
                            "results.isel(...)")
     one = {dim: 0 for dim in results["estimate"].dims if dim not in scene}
     poses = [dim for dim in scene if dim != "xyz"]
-    own = [name for name in ("truth_std",) if name in results]
+    own = ["truth_std"] if "truth_std" in results else []
     table = results[[*names, *own]].isel(one, drop=True).load().stack(
         pose=poses, create_index=False)
     used = (table["estimate"] == EstimateStatus.solved).values
     deviations = np.zeros((used.sum(), 6))
-    for name in own:  # rotation, then position
-        deviations += np.nan_to_num(table[name].transpose("pose", ...).values[used])[:, [
-            3, 4, 5, 0, 1, 2]]
+    if own:  # rotation, then position
+        stored = np.nan_to_num(table["truth_std"].transpose("pose", ...).values[used])
+        deviations = stored[:, [3, 4, 5, 0, 1, 2]].astype(np.float64)
     rvec, tvec, rotation, position = (
         table[name].transpose("pose", "xyz").values[used].astype(np.float64) for name in names[:4])
     chosen, other, flipped = (table[name].values[used] for name in names[4:7])

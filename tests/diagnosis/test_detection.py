@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.diagnosis.detection import DetectionModel, error_model, judged
+from sweep.diagnosis.detection import DetectionModel, error_model, judged, widened
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import (
@@ -62,19 +62,18 @@ def test_errors_of_other_draws_are_as_large_as_the_covariance_says(model):
         assert abs(flipped[bin_].sum() - expected) < 4 * spread + 3
 
 
-def test_a_factor_from_photographs_widens_the_covariance_to_their_errors():
+def test_a_factor_from_photographs_widens_the_covariance_to_their_errors(model):
     photographs = drawn(3, 3000)
     for name in ("rotation_error_rad", "translation_error_m"):
         unflipped = photographs["flipped"] == Flipped.not_flipped
         photographs[name] = photographs[name] * xr.where(unflipped, 2.0, 1.0)
     photographs["truth_std"] = (("trial", "component"), np.full((3000, 6), 1e-4))
     seen, others = photographs.isel(trial=slice(1500)), photographs.isel(trial=slice(1500, None))
-    simulated = drawn(1)
-    assert judged(error_model(simulated), others)["squared_error"].mean() > 20
-    wider = error_model(simulated, seen)
+    assert judged(model, others)["squared_error"].mean() > 20
+    wider = error_model(drawn(1), seen)
     assert 5.5 < judged(wider, others)["squared_error"].mean() < 6.5
     with pytest.raises(DatasetError, match="take more photographs"):
-        error_model(simulated, seen.isel(trial=slice(40)))
+        widened(model, seen.isel(trial=slice(40)))
 
 
 def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):

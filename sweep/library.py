@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sweep import compilation, processor
     from sweep.analysis import camera_calibration, requirements
     from sweep.conformance import check
-    from sweep.diagnosis import detection, diagnosis, observations
+    from sweep.diagnosis import diagnosis, observations
     from sweep.evaluation import block, inspection
     from sweep.exchange import answers, export, score
     from sweep.execution import forecast, limit_search, progress, runner, status
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         limit_figure,
         output_file,
         questions,
-        reference,
         report_data,
         scenes,
         table,

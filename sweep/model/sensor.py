@@ -221,9 +221,6 @@ REACH_PX = 2
 """Pixels around a pixel that its result depends on: neighbours, and at the frame's border the
 neighbours of the pixel that OpenCV copies there."""
 
-MIN_FRAME_PX = 3
-"""Smallest side of an image that OpenCV demosaics."""
-
 STEPS_PER_LEVEL = 257.0
 """The raw image has 16 bits: 65535 at level 255."""
 

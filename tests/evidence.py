@@ -7,9 +7,9 @@
 also on several processors, ``-n 2 --dist loadfile``), and writes outcome and duration of every test
 function, what tests claim by the fixture ``claim``, and on what they ran: version and commit of the
 project, versions of libraries, processor, date. It writes after each test, so that a run that is
-stopped keeps what it found. ``table`` joins the files of one commit and
-writes the table of claims into tests/README.md, and prints seconds by folder; it exits with 1 where
-a test failed, or a shard is missing or did not end.
+stopped keeps what it found. ``table`` joins the files of one commit, writes the table of claims
+into tests/claims.txt, and prints seconds by folder; it exits with 1 where a test failed, or a shard
+is missing or did not end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sweep.processor import processor
 from sweep.version import __version__
 
 HERE = Path(__file__).parent
-README = HERE / "README.md"
+CLAIMS = HERE / "claims.txt"
 BEGIN, END = "<!-- claims: python -m tests.evidence table -->", "<!-- end of claims -->"
 LIBRARIES = ("opencv-contrib-python-headless", "numpy", "numba", "scipy", "xarray", "zarr", "dask")
 
@@ -119,7 +119,7 @@ def joined(claims: list[dict[str, Any]]) -> list[list[str]]:
             for (what, against, unit), worst in rows.items()]
 
 
-def table(*files: str, page: Path = README) -> int:
+def table(*files: str, page: Path = CLAIMS) -> int:
     """Write the table of claims; return 1 where a test failed or a shard is missing, else 0."""
     parts = [json.loads(Path(file).read_text(encoding="utf-8")) for file in files]
     if len({(part["commit"], part["shards"]) for part in parts}) != 1:

@@ -13,7 +13,7 @@ import numpy as np
 from sweep.plugins import DetectorPlugin, Markers, parameter
 
 # --------------------------------------------------------------------------------------------------
-# What the wrappers of AprilTag's C library share: families, settings, the order of corners.
+# Common to the wrappers of AprilTag's C library: families, settings, the order of corners.
 
 CORNER_ORDER = (1, 0, 3, 2)
 """AprilTag's corners run counter-clockwise from the bottom left of its own bitmap, which OpenCV's
@@ -41,7 +41,7 @@ FAMILIES = {**OPENCV_FAMILIES, **{name: name for name in OWN_FAMILIES}}
 class AprilTagSettings:
     """The settings of AprilTag's C library that all wrappers pass on, by its names and defaults.
 
-    The wrappers' defaults are the same, also that of ``quad_decimate``.
+    The wrappers' defaults are the same, ``quad_decimate`` included.
     """
 
     quad_decimate: float = parameter(
@@ -71,7 +71,7 @@ class AprilTagSettings:
 def markers(family: str, found: list[tuple[int, Any]]) -> Markers:
     """Return ID and corners (4, 2) of each marker, in the order of corners of tag families.
 
-    Those of AprilTag's own families are turned by 180°: there :data:`CORNER_ORDER` is of bitmaps
+    Markers of AprilTag's own families are turned by 180°: there :data:`CORNER_ORDER` is of bitmaps
     that are as AprilTag draws them.
     """
     corners = np.array([quad for _, quad in found], dtype=np.float64).reshape(-1, 4, 2)

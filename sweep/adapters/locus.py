@@ -26,7 +26,7 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class LocusSettings:
-    """The profile, and what is chosen beside it."""
+    """The profile, and choices beside it."""
 
     locus_profile: str = parameter(
         "standard", "Locus: the shipped profile of settings",
@@ -73,7 +73,7 @@ SAME = 1e-6
 
 @dataclass(frozen=True)
 class LocusBoardSettings:
-    """The detector's profile, and what is used of a chessboard."""
+    """The detector's profile, and the corners of a chessboard that are used."""
 
     locus_board_profile: str = parameter(
         "standard", "Locus' boards: the shipped profile of settings",

@@ -76,7 +76,7 @@ class Conventions:
 def conventions(
     found: Sequence[Found], marker_id: Integers, corners_px: Floats
 ) -> Conventions | None:
-    """Return the conventions that explain what was found in N scenes; None if nothing was.
+    """Return the conventions that explain the markers found in N scenes; None without any.
 
     Parameters
     ----------
@@ -125,9 +125,9 @@ def conventions(
 def order_faults(
     result: Conventions, declared: Sequence[int] | None, pixel_center: float | None
 ) -> list[str]:
-    """Return what is wrong with corners and IDs, a line each, with what to declare instead.
+    """Return the faults of corners and IDs, a line each, with the declaration that fits instead.
 
-    ``declared`` and ``pixel_center`` are what a plug-in declares; None for OpenCV.
+    ``declared`` and ``pixel_center`` are a plug-in's declarations; None for OpenCV.
     """
     faults = []
     if result.ids:
@@ -281,7 +281,7 @@ def trial_scenes(pipeline: Pipeline) -> TrialScenes:
 
 
 # --------------------------------------------------------------------------------------------------
-# Six checks of a detector, and of a solver: each a function that returns what it has found.
+# Six checks of a detector, and of a solver: each a function that returns its finding.
 #
 # They run in a child process, which the plug-in may end or never leave.
 
@@ -299,7 +299,7 @@ PREFERRED = "DICT_APRILTAG_36h11"
 OK, NOTE, FAULT = "ok", "note", "fault"
 
 Outcome = tuple[str, str] | tuple[str, str, dict[str, Any]]
-"""What a check returns: a verdict, a line, and maybe numbers by name."""
+"""Result of a check: a verdict, a line, and maybe numbers by name."""
 
 
 @dataclass(frozen=True)
@@ -341,7 +341,7 @@ class ConformanceReport:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What the checks measured: "detected", "offset_px", "rms_px"; "solved"."""
+        """Measurements of the checks: "detected", "offset_px", "rms_px"; "solved"."""
         return {key: value for each in self.findings for key, value in each.numbers.items()}
 
 
@@ -438,13 +438,13 @@ def _open(arguments: tuple[str, str, str, tuple[str, ...], str, bool]) -> None:
 
 @single_threaded()
 def _run(kind: str, number: int) -> Finding:
-    """Return what a check finds."""
+    """Run one check and return its finding."""
     verdict, text, *numbers = CHECKS[number](_trials[0])
     return Finding(NAMES[kind][number], verdict, text, *numbers)
 
 
 class DetectorTrial:
-    """A detector, the scenes, and what it returns for their images."""
+    """A detector, the scenes, and the markers that it finds in their images."""
 
     returned = "corners and IDs of the right shapes"
     found_key, found_what, found_hint = "detected", "a marker", ""
@@ -503,7 +503,7 @@ class DetectorTrial:
         ), numbers
 
     def odd(self) -> list[str]:
-        """Search plain, black, noisy and small images; return what is raised."""
+        """Search plain, black, noisy and small images; return the errors' lines."""
         generator = np.random.default_rng(1)
         lines = []
         for height, width, low, high in (
@@ -519,7 +519,7 @@ class DetectorTrial:
 
 
 class SolverTrial:
-    """A solver, and what it makes of the scenes' detections."""
+    """A solver, and its poses of the scenes' detections."""
 
     returned = "poses of the right shapes, rotations that are rotations"
     found_key, found_what = "solved", "a pose that reprojects to the corners"
@@ -553,7 +553,7 @@ class SolverTrial:
         return values
 
     def _faults_of_all(self) -> list[str]:
-        """Return what is raised if all detected targets are solved in one call.
+        """Return the errors raised when all detected targets are solved in one call.
 
         A run solves them one by one then, which takes long and hides it.
         """
@@ -583,7 +583,7 @@ class SolverTrial:
         )
 
     def odd(self) -> list[str]:
-        """Solve markers that are seen nearly from the side; return what is raised."""
+        """Solve markers that are seen nearly from the side; return the errors' lines."""
         return _raised(run_cells(self.steep.experiment, [np.arange(SCENES)]))
 
 
@@ -594,7 +594,7 @@ def _bits(found: Found) -> bytes:
 
 
 def _raised(result: CellsResult) -> list[str]:
-    """Return the last lines of what was raised."""
+    """Return the last lines of the errors that were raised."""
     return [failure.text.strip().splitlines()[-1] for failure in result.failures]
 
 
@@ -641,7 +641,7 @@ def _differing(trial: Trial, rows: Sequence[int]) -> int:
 
 
 def survives_odd_input(trial: Trial) -> Outcome:
-    """Try odd input; what is raised is noted."""
+    """Try odd input; errors are noted."""
     lines = "; ".join(dict.fromkeys(trial.odd()))
     return (NOTE, lines) if lines else (OK, trial.survived)
 

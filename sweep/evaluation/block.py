@@ -2,7 +2,7 @@
 
 The paper's eleven steps (Poroykov et al., 2020) are found by name::
 
-    steps 1-6   scenes       sweep.evaluation.search.scenes_at: camera, pose, what is printed
+    steps 1-6   scenes       sweep.evaluation.search.scenes_at: camera, pose, print
                              (sweep.model.scene.build_scenes)
     steps 7-8   images       sweep.evaluation.search.images_of (sweep.model.renderers)
     step 9      detections   sweep.evaluation.search.detections_of (sweep.measure.detectors)
@@ -60,14 +60,14 @@ from sweep.model.scene import Scenes
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
-# Detections to poses: what an estimator assumes; a failure in a batch costs one pose only.
+# Detections to poses: an estimator's assumptions; a failure in a batch costs one pose only.
 
 def assumed_cameras(
     estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes
 ) -> tuple[Cameras, Floats]:
     """Return the N cameras and marker sizes (N,) in m that an estimator assumes.
 
-    Those of the scenes, but for the ``believed_`` parameters: of ``values`` if they are drawn,
+    They are the scenes' own, but for the ``believed_`` parameters: of ``values`` if they are drawn,
     else of the estimator. A believed calibration is drawn.
     """
     truth, calibrated = scenes.cameras, estimator.believed == "calibration"
@@ -103,7 +103,7 @@ def assumed_cameras(
 def detections_for(
     estimator: EstimatorSetting, batch: SceneBatch, result: SearchResult, rows: NDArray[np.intp]
 ) -> Detections:
-    """Return what was found in scenes ``rows`` (n,), with what an estimator assumes of them."""
+    """Return the detections in scenes ``rows`` (n,), with an estimator's assumptions of them."""
     values, scenes, found, targets = batch.values, batch.scenes, result.found, batch.targets.targets
     cameras, size = assumed_cameras(estimator, values, scenes)
     noise, blur = (
@@ -183,7 +183,7 @@ def run_cells(
     Parameters
     ----------
     experiment
-        What is computed.
+        The compiled experiment.
     indices
         Indices (N,) along each scene axis.
     need
@@ -275,7 +275,7 @@ def _run_batch(
 
 
 # --------------------------------------------------------------------------------------------------
-# What is said of bounds before a run: whether any scene can have one.
+# Before a run: whether any scene can have a bound.
 
 NOTED_SCENES = 64
 """Scenes, spread over the grid, by which it is told whether any has a bound."""
@@ -326,7 +326,7 @@ def warm_up(pipeline: Pipeline) -> None:
     Raises
     ------
     MachineFaultError
-        If the scene cannot be computed, or the marker's pose is not what it is known to be.
+        If the scene cannot be computed, or the marker's pose is not the recorded one.
     """
     renderers = sorted(
         name for name in set(pipeline.values_of("renderer"))

@@ -101,7 +101,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         Every axis but ``trial`` must be fixed, as
         :func:`sweep.experiment.pipeline.cell` does.
     whole_frame
-        Whether the image is the whole frame; the searched window is that of a run all the same.
+        Whether the image is the whole frame; the searched window is a run's all the same.
 
     Raises
     ------

@@ -43,7 +43,7 @@ def machine_fault(error: BaseException) -> MachineFaultError | None:
     if isinstance(error, MachineFaultError):
         return error
     if isinstance(error, SweepError):
-        return None  # it says itself what is wrong
+        return None  # it names the fault itself
     for cause in _chain(error):
         if isinstance(cause, MachineFaultError):
             return cause
@@ -62,7 +62,7 @@ def _chain(error: BaseException | None) -> list[BaseException]:
 
 
 def local_fault(fault: str) -> MachineFaultError:
-    """Return the error that says of this machine what is wrong with it."""
+    """Return the error that names the fault of this machine."""
     return MachineFaultError(plain(fault, MAX_FAULT_LENGTH), socket.gethostname())
 
 

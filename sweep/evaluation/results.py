@@ -134,7 +134,7 @@ class CellsResult:
 
 
 def concatenate(parts: Sequence[CellsResult]) -> CellsResult:
-    """Return the results of several groups of scenes as those of one group."""
+    """Return the results of several groups of scenes as one group's results."""
     starts = np.cumsum([0, *(len(part.row_seconds) for part in parts)]).tolist()
     columns, seconds = parts[0].columns, parts[0].seconds
     return CellsResult(

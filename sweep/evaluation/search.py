@@ -49,9 +49,9 @@ class SceneBatch:
     visibility
         (N,) why the scenes are not searched; ``not_run`` for those that are.
     targets
-        What the scenes show.
+        The targets of the scenes.
     boxes
-        (N, 4) left, top, right, bottom of what the targets can influence, px of the frame.
+        (N, 4) left, top, right, bottom of the pixels that the targets can influence.
     """
 
     experiment: Experiment
@@ -126,9 +126,9 @@ class SearchResult:
     Attributes
     ----------
     targets, found
-        What the scenes show, and what was found of it.
+        The targets of the scenes, with the markers that were found of each.
     flags
-        (N,) :class:`~sweep.measure.flags.DetectionStatus`: those of ``found``, or ``failed``.
+        (N,) :class:`~sweep.measure.flags.DetectionStatus`: the flags of ``found``, or ``failed``.
     seconds
         Time spent on searching.
     images
@@ -136,9 +136,10 @@ class SearchResult:
     origins
         (N, 2) the first pixel of each searched image in the frame.
     poses
-        Those that come with what was found (:meth:`DetectionSource.poses`).
+        Poses that come with the detections (:meth:`DetectionSource.poses`).
     outputs, output_origins
-        Row -> what the source found, and (N, 2) the pixel of the frame from which it counts.
+        Row -> the markers that the source found, and (N, 2) the pixel of the frame from which it
+        counts.
     """
 
     targets: TargetScenes
@@ -164,7 +165,7 @@ def whole_frames(batch: SceneBatch) -> Masks:
 def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
     """Return why scenes (N,) are not searched; not_run for those that must be.
 
-    A pose that is NaN is that of a marker that a photograph does not show.
+    The pose of a marker that a photograph does not show is NaN.
     """
     flags = np.full(len(scenes), DetectionStatus.not_run, dtype=np.uint8)
     behind = hidden(scenes)
@@ -186,7 +187,7 @@ def search_windows(
     scenes
         N scenes.
     boxes
-        (N, 4) left, top, right, bottom of what each marker can influence, px.
+        (N, 4) left, top, right, bottom of the pixels that each marker can influence.
     setting
         The detector setting.
     full
@@ -313,7 +314,7 @@ class _Pass:
             self.row_s[row] = time.perf_counter() - begun
 
     def result(self, targets: TargetScenes) -> SearchResult:
-        """Return what was found in the windows."""
+        """Return the markers that were found in the windows."""
         begun, first = time.perf_counter(), self.windows[:, :2]
         origins = first if self.source.needs_images else np.zeros_like(first)
         found = classify(targets, self.outputs, origins.astype(np.float64))

@@ -48,7 +48,7 @@ class EstimationResults:
     Attributes
     ----------
     estimates, error
-        What the estimator returned, and its errors: n of each.
+        The estimator's poses, and their errors: n of each.
     true_rotation
         (n, 3, 3) target to camera.
     """

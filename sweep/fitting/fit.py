@@ -92,7 +92,7 @@ def estimate(values: Floats) -> Estimate:
 def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estimate]:
     """Return estimates of a function (k,) of photographs, by leaving each of them out.
 
-    ``function`` takes the numbers of those that count. The interval is that of the pseudo-values.
+    ``function`` takes the numbers of the photographs that count. Pseudo-values give the interval.
     """
     every = np.arange(count)
     whole = function(every)
@@ -111,13 +111,13 @@ def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estima
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
-    """The fits of photographs, and what they say of the camera.
+    """The fits of photographs, and the camera's parameters by them.
 
     Attributes
     ----------
     fits, tested_fits
-        One of each photograph in which a marker could be fitted: with what is kept, and with all
-        effects.
+        One of each photograph in which a marker could be fitted: with the kept effects, and with
+        all effects.
     kept
         (3,) which of variance, amount and bloom are kept.
     """
@@ -128,13 +128,13 @@ class CameraFit:
 
     @property
     def tested(self) -> list[Estimate]:
-        """Estimates of (variance, amount, bloom) of all effects: what is absent is judged so."""
+        """Estimates of (variance, amount, bloom) with all effects: they judge which are absent."""
         return [estimate(each) for each in np.transpose([fit.parameters for fit in
                                                          self.tested_fits])]
 
     @property
     def estimates(self) -> list[Estimate]:
-        """Estimates of (variance, amount, bloom); of what is not kept those tested."""
+        """Estimates of (variance, amount, bloom); of effects not kept those with all effects."""
         found = np.transpose([fit.parameters for fit in self.fits])
         return [
             estimate(each) if kept else tested
@@ -155,13 +155,13 @@ def fit_camera(
     Parameters
     ----------
     photographs
-        What is fitted.
+        The pixels of markers that are fitted.
     without
         Parameters that are left out whatever their intervals: of AMOUNT and BLOOM.
     known
         Fits of all effects of these photographs, which are then not made again.
     say
-        Is told how many photographs are fitted.
+        Gets a line for some of the photographs.
     """
     every = np.ones(len(START), dtype=bool)
     fits = tuple(known) or _fitted(photographs, every, START, say)
@@ -259,11 +259,11 @@ def edge_field(shifts: Sequence[EdgeShifts], module_px: float) -> EdgeField:
 # --------------------------------------------------------------------------------------------------
 # Shifts of markers beside the camera's model: how large they are, and how far they reach.
 #
-# The fitted corners of a photograph's markers minus those of the board's pose, fitted to the same
-# corners, are (1 - P) (shifts + noise), P being the projection on what a pose explains. The
+# The fitted corners of a photograph's markers minus the corners of the board's pose, which is
+# fitted to them, are (1 - P) (shifts + noise), P being the projection on the changes by a pose. The
 # shifts are a Gaussian field of covariance s² exp(-d² / (2 l²)), as
 # ``geometry_px`` has it in scenes. Two sums of squares say s and l (the method of
-# moments): that of the markers' centres, and that of their corners beside the centres, which turn
+# moments): one of the markers' centres, and one of their corners beside the centres, which turn
 # a pose. The farther the field reaches, the smaller is the second one beside the first.
 #
 # The intervals are the jackknife's by photograph, of logarithms (Efron and Stein, "The jackknife
@@ -287,9 +287,9 @@ class Residuals:
     Attributes
     ----------
     squares
-        (2,) px², beyond what the pixels' noise and single edges are expected to add to them.
+        (2,) px², less the expected share of the pixels' noise and of single edges.
     fields
-        (2, lengths) what a field of standard deviation 1 px adds, for each of :data:`LENGTHS`.
+        (2, lengths) the share of a field of standard deviation 1 px, for each of :data:`LENGTHS`.
     """
 
     squares: Floats
@@ -380,7 +380,7 @@ def residuals_of(
     forms = [part.T @ part for part in parts]
 
     def sums(covariance: Floats) -> Floats:
-        """Return what a field of shifts adds to both sums of squares."""
+        """Return the expected share of a field of shifts in both sums of squares."""
         shifted = sum(each @ covariance @ each.T for each in moved)
         return np.array([float((form * shifted).sum()) for form in forms])
 
@@ -444,7 +444,7 @@ def _matched(squares: Floats, fields: Floats) -> Floats:
 
 
 # --------------------------------------------------------------------------------------------------
-# The terms of a scene: what each was estimated to be, and whether it is kept.
+# The terms of a scene: the estimate of each, and whether it is kept.
 
 DIGITS = 4
 """Significant digits of the values that are written."""
@@ -457,11 +457,11 @@ class Term:
     Attributes
     ----------
     name
-        What it is, in words.
+        Its name in words.
     parameter
         Its name in pipelines.
     estimate
-        What it was estimated to be.
+        Its value with an interval.
     kept
         Whether the scene has it.
     reason
@@ -471,7 +471,7 @@ class Term:
     of
         Parameter that switches the effect on, if that is another one: they are kept together.
     setting
-        What a pipeline has in the place of the estimate's value; None for that.
+        The pipeline's value in the place of the estimate's; None for the estimate's.
     """
 
     name: str
@@ -485,7 +485,7 @@ class Term:
 
     @property
     def value(self) -> Any:
-        """What a pipeline has."""
+        """The value in a pipeline."""
         return shortened(self.estimate.value) if self.setting is None else self.setting
 
     def as_json(self) -> dict[str, Any]:
@@ -510,8 +510,8 @@ def judged(
 ) -> Term:
     """Return a term that is kept if its interval excludes the value at which it is absent.
 
-    ``test`` is the estimate that decides, if it is another one; ``convert`` makes of an estimate
-    that of the parameter.
+    ``test`` is the estimate that decides, if it is another one; ``convert`` takes an estimate to
+    the parameter's.
     """
     deciding = estimate if test is None else test
     shown = estimate if convert is None else convert(estimate)
@@ -549,7 +549,7 @@ class SceneFit:
     photographs, markers
         How many of them were fitted.
     lines
-        What is to be said beside the terms.
+        Lines for the user beside the terms.
     tested_fits
         The fits of the photographs with all effects.
     """
@@ -569,7 +569,7 @@ class SceneFit:
 def scene_views(
     taken: PhotographScenes, board: Board | None, markers: int = MARKERS
 ) -> tuple[list[FittedPhotograph], list[str]]:
-    """Return what is fitted of photographs, and lines on what is not.
+    """Return the pixels of photographs that are fitted, and lines on photographs left out.
 
     Parameters
     ----------
@@ -612,7 +612,7 @@ def fit_scene(
     Parameters
     ----------
     views
-        What is fitted.
+        The pixels of markers that are fitted.
     taken, board
         As for :func:`scene_views`.
     without
@@ -620,7 +620,7 @@ def fit_scene(
     known
         Fits of all effects, of an earlier scene's (:attr:`SceneFit.tested_fits`).
     say
-        Is told how far the fit is.
+        Gets lines of progress.
 
     Raises
     ------
@@ -722,7 +722,7 @@ def _noise(camera: CameraFit, noises: Sequence[Floats]) -> list[Term]:
 
 
 def _with_reach(term: Term, length_px: Estimate) -> list[Term]:
-    """Return the term of a field of shifts, and that of its reach, which is kept with it."""
+    """Return the term of a field of shifts, and the term of its reach, which is kept with it."""
     if term.kept and not term.estimate.value > 0:
         term = term.left_out("smaller than the noise")
     return [term, Term(

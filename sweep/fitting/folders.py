@@ -73,7 +73,7 @@ class HeldOut:
     folder
         Where the stores of simulations go.
     say
-        Is told what is simulated.
+        Gets a line before each simulation.
     """
 
     pipeline: Pipeline
@@ -108,7 +108,7 @@ class HeldOut:
 def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
     """Return the mean size of all statistics' gaps, in half-widths of the intervals of ``widths``.
 
-    Of ratios that of their logarithms. NaN if nothing has an interval.
+    Of ratios the logarithms count. NaN if nothing has an interval.
     """
     sizes = []
     for each in (*RATES, *QUANTILES):
@@ -139,7 +139,7 @@ def held_out(
     folder
         Where the record and the stores go.
     say
-        Is told what is simulated of them.
+        Gets a line before each simulation.
     """
     chosen = dataclasses.replace(
         record,
@@ -230,7 +230,7 @@ def scene_text(
     document: dict[str, Any], found: SceneFit, record: PhotographRecord, name: str,
     lines: Sequence[str] = (),
 ) -> str:
-    """Return the content of the file: what it follows from, the terms, and the pipeline."""
+    """Return the content of the file: its source, the terms, and the pipeline."""
     digest = hashlib.sha256("".join(record.digests).encode()).hexdigest()
     head = [
         f"Fitted to {found.markers} markers in {found.photographs} photographs ({plain(name)}),",
@@ -259,10 +259,10 @@ def numbers_text(term: Term) -> str:
 PathName = str | os.PathLike[str]
 
 OF_MARKERS = ("dictionary", "size_m")
-"""Settings that say what is in the photographs; others are of what is compared."""
+"""Settings of the markers in the photographs; others set the comparison."""
 
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
-"""What the check compares unless it is set."""
+"""Detector settings that the check compares unless others are given."""
 
 SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
 """Effects that are kept where the errors of photographs that were not fitted say so."""
@@ -281,9 +281,9 @@ class FittedScene:
     pipeline
         A pipeline of this camera, with poses as in the photographs.
     text
-        The pipeline's file, with intervals and what was left out in its comments.
+        The pipeline's file, with intervals and left-out terms in its comments.
     lines
-        What is to be said of the photographs.
+        Lines on the photographs for the user.
     gap
         Half of the photographs beside a simulation with the scene that the others gave
         (:func:`sweep.analysis.simulation_gap`); None without a check.
@@ -315,12 +315,12 @@ def fit_folder(
         Whether half of the photographs are held out, to see which effects bring errors nearer to
         theirs, and what gap is left.
     say
-        Is told, in lines, how far it is.
+        Gets lines of progress.
 
     Raises
     ------
     ArgumentError, PipelineError, StoreError, RunError
-        What has to be changed, in lines.
+        Says in lines what to change.
     """
     if not 1 <= markers <= 1000:
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")

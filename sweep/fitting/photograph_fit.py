@@ -1,4 +1,4 @@
-"""The fit of the simulator's own image to one photograph, and what its residuals say."""
+"""The fit of the simulator's own image to one photograph: noise and edges by its residuals."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from sweep.typing import Floats, Masks
 #     F(s) = s + amount (s - s_wide) + bloom s (1 - s),
 #
 # s being the exact share of white through a Gaussian point spread, and s_wide that through one that
-# is wider by the radius of the sharpening: what the simulator makes of black, white, blur,
-# sharpening and bloom before it adds noise. Each marker has its own corners and levels; point
+# is wider by the radius of the sharpening: the simulator's image of black, white, blur, sharpening
+# and bloom before it adds noise. Each marker has its own corners and levels; point
 # spread, amount and bloom are the photograph's. All are one vector: the shifts of the corners from
 # their true places, right and down in turn, then b and c, then the photograph's.
 
@@ -49,12 +49,12 @@ START = np.array([0.5, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerState:
-    """A marker's and its photograph's parameters, and what the n fitted pixels say at them.
+    """A marker's and its photograph's parameters, with residuals and slopes of the n fitted pixels.
 
     Attributes
     ----------
     marker
-        What is fitted.
+        The pixels of markers that are fitted.
     parameters
         (13,) of the marker, then of the photograph.
     residuals
@@ -100,7 +100,7 @@ class MarkerState:
 def _of_corners(at: Floats, reach: float) -> Floats:
     """Return the shares (..., 4) of the corners TL, TR, BR, BL in a shift at (..., 2).
 
-    What is farther than ``reach`` from the square is other print: it moves with the marker as a
+    Print farther than ``reach`` from the square is not the marker's: it moves with the marker as a
     whole, and has no share in its size.
     """
     x, y = at[..., 0], at[..., 1]
@@ -184,7 +184,7 @@ MAX_STEPS, ROUNDS = 30, 2
 """Most steps of a marker's fit, and steps of the photograph's parameters."""
 
 OUTLIER = 2.5
-"""Markers whose residuals are so many times those of the photograph's median marker are left out;
+"""Markers whose residuals are so many times the median marker's of the photograph are left out;
 something lies on them."""
 
 MIN_CONTRAST = 5.0
@@ -220,7 +220,7 @@ def fit_photograph(
     Parameters
     ----------
     photograph
-        What is fitted.
+        The pixels of markers that are fitted.
     moved
         (3,) which of the photograph's parameters are moved; the others stay as at the start.
     start
@@ -301,7 +301,7 @@ MIN_PIXELS = 100
 def photograph_noise(states: Sequence[MarkerState]) -> Floats:
     """Return the variances (2,) of pixels on black and on white, from a photograph's markers.
 
-    In squared grey levels, without that of rounding; NaN where too few pixels are flat.
+    In squared grey levels, without the variance of rounding; NaN where too few pixels are flat.
     """
     squares, counts, freedom = np.zeros(2), np.zeros(2), np.zeros(2)
     for state in states:
@@ -329,7 +329,7 @@ REACH_MODULES, ALONG_MODULES = 0.5, 0.4
 """Half widths across and along the edge of the pixels that say where a module's edge is."""
 
 STEP_SHARE = 0.6
-"""Share of the whole step from black to white from which pixels are those of an edge."""
+"""Share of the whole step from black to white from which pixels count as an edge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +339,7 @@ class EdgeShifts:
     Attributes
     ----------
     squares, edges
-        Sum of squares beyond what the noise of pixels adds, and the degrees of freedom.
+        Sum of squares less the share of the pixels' noise, and the degrees of freedom.
     products, pairs
         Sum of products of two edges on one line of modules that follow on each other, and their
         number.
@@ -352,7 +352,7 @@ class EdgeShifts:
 
 
 def edge_shifts(states: Sequence[MarkerState], noise: Floats) -> EdgeShifts:
-    """Return the shifts of edges; ``noise`` (2,) is that of pixels on black and on white."""
+    """Return the shifts of edges; ``noise`` (2,) is the variance on black and on white."""
     variance = float(np.nanmean(noise)) + QUANTISATION_VARIANCE
     sums = np.zeros(4)
     for state in states:

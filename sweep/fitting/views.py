@@ -1,4 +1,4 @@
-"""What is fitted of photographs: markers spread over the frame, their pixels."""
+"""Pixels of photographs that are fitted: markers spread over the frame."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ PANEL_PX = 0.4
 class Drawn(NamedTuple):
     """The share of white (h, w), its slopes along x, along y and by the point spread's variance.
 
-    And the share of what is outside the print.
+    And the share of the area outside the print.
     """
 
     white: Floats
@@ -115,7 +115,7 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
 
 
 # --------------------------------------------------------------------------------------------------
-# What is fitted of photographs: the pixels of some markers, well spread over each frame.
+# Pixels that are fitted: of some markers, well spread over each frame.
 
 MODELLED_PX = 10.0
 """Pixels around the fitted ones within which print is in the model: what blur and sharpening
@@ -137,14 +137,14 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedMarker:
-    """The pixels of one marker in one photograph, and what is known of them.
+    """The pixels of one marker in one photograph, with its true pose and print.
 
     Attributes
     ----------
     levels, used
         (h, w) grey levels of a box, and which pixels are fitted.
     ends, sides
-        (E, 2, 2) start and end of the edges of what is printed at its true pose, in px of the box,
+        (E, 2, 2) start and end of the print's edges at its true pose, in px of the box,
         none longer than a module; (E, 2) the areas beside them. Black beyond.
     ends_at, at
         (E, 2, 2) of these points and (2, h, w) of the pixels: column and row as shares of the black
@@ -161,7 +161,7 @@ class FittedMarker:
     row
         Number of its scene.
     ground
-        Median level around the marker and what is its own quiet zone.
+        Median level around the marker and its own quiet zone.
     """
 
     levels: Floats
@@ -190,7 +190,7 @@ class FittedPhotograph:
 def photograph_views(
     taken: PhotographScenes, board: Board | None, most: int
 ) -> list[FittedPhotograph]:
-    """Return what is fitted of each photograph that shows a marker: at most ``most`` markers.
+    """Return the fitted pixels of each photograph that shows a marker: at most ``most`` markers.
 
     They are those farthest from one another, beginning with the one nearest the frame's centre.
     """

@@ -47,7 +47,7 @@ CLEARLY = 0.02
 """By how much more of the markers another board must fit."""
 
 FITTING_SHARE = 0.2
-"""Distance of a corner to that of the board's homography, as a share of the marker's side."""
+"""Distance of a corner to its place by the board's homography, as a share of the marker's side."""
 
 MAX_SIZE_ERROR = 0.08
 """Relative difference of the markers' measured side to the board's that is refused; blur makes
@@ -71,7 +71,7 @@ def check_board(
     Raises
     ------
     ArgumentError
-        One line: what is wrong, and which board fits.
+        One line: the fault, and which board fits.
     """
     _check_halves(board, find, photographs)
     if not any(len(ids) for ids, _ in seen):
@@ -177,7 +177,7 @@ COUNTS = {
 
 
 def _others(path: Path) -> Iterator[tuple[str, Board]]:
-    """Yield boards that differ from a file's in what is often mistaken, each in words."""
+    """Yield boards that differ from a file's in an often mistaken key, each in words."""
     document = tomllib.loads(path.read_text())
     kind = document.get("kind")
     if kind not in COUNTS:
@@ -265,7 +265,7 @@ MAX_TRIED_VIEWS = 5
 """Photographs with the most corners in which they are tried."""
 
 SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "2", "3", "4")))
-"""Resolutions of photographs over that of a calibration."""
+"""Resolutions of photographs over the resolution of a calibration."""
 
 
 def check_resolution(
@@ -392,7 +392,7 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCame
 def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:
     """Return the covariance (9, 9) of the camera's numbers beside the photographs' poses.
 
-    That of least squares with the residuals' variance: the inverse of the Schur complement of the
+    By least squares with the residuals' variance: the inverse of the Schur complement of the
     poses in the normal equations, as of a bundle adjustment (Triggs et al., 2000, section 6.1).
     """
     numbers = len(intrinsics.INTRINSICS)

@@ -28,7 +28,7 @@ from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
-# The photographs of a folder: which files they are, and what of them is said to the user.
+# The photographs of a folder: which files they are, and lines on them for the user.
 
 MAX_NAMED = 3
 """The most files that a line names."""
@@ -45,7 +45,7 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """Photographs of one size, by name, and lines on what was left out or converted."""
+    """Photographs of one size, by name, and lines on files left out or converted."""
 
     photographs: tuple[Photograph, ...]
     lines: tuple[str, ...]
@@ -151,7 +151,7 @@ def named(names: Sequence[str]) -> str:
 
 
 def _conversions(content: bytes) -> list[str]:
-    """Return what the conversion to 8-bit grey, upright, does to an encoded image."""
+    """Return notes on the conversion of an encoded image to 8-bit grey, upright."""
     encoded = np.frombuffer(content, np.uint8)
     stored = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
     notes: list[str] = []
@@ -197,7 +197,7 @@ REFERENCE = DetectorSetting(cornerRefinementMethod="subpix")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundCorners:
-    """What was found of a board in a photograph.
+    """The corners of a board that were found in a photograph.
 
     Attributes
     ----------
@@ -317,7 +317,7 @@ class Prepared:
     pipeline
         The experiment.
     lines
-        What was found, left out and converted, a line each.
+        Photographs found, left out and converted, a line each.
     photographs, markers
         How many there are: markers whose pose is known.
     """
@@ -356,7 +356,7 @@ class WantedMarkers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera: its lens, what is known of its numbers' errors, and a line on it.
+    """A camera: its lens, the errors of its numbers as far as known, and a line on it.
 
     ``sd`` are their standard deviations, ``covariance`` (c, c) is None if it is not known.
     """
@@ -373,7 +373,7 @@ def setting_name(setting: str) -> str:
 
 
 def name_of(folder: Path) -> str:
-    """Return what a folder's store is named after."""
+    """Return the name that a folder gives its store."""
     return re.sub(r"[^A-Za-z0-9._+-]", "-", folder.resolve().name).strip("-._") or "photographs"
 
 

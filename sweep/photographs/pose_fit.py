@@ -78,7 +78,7 @@ class Lens(NamedTuple):
     def by_camera(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
         """Return the change (6, c) of a fitted pose by the camera's numbers.
 
-        The pose is that of least squares from the images of points (n, 3): it gives way to an
+        The pose is the least-squares one from the images of points (n, 3): it gives way to an
         error of the camera as far as it can.
         """
         design = self.derivatives(points, rotation, translation)[1].reshape(-1, 6)

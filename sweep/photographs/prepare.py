@@ -93,7 +93,7 @@ def prepare(
     Raises
     ------
     ArgumentError, PipelineError, StoreError
-        What has to be changed, in lines.
+        Says in lines what to change.
     """
     _check_arguments(folders, camera, poses, stereo)
     with single_threaded():  # OpenCV's calibration is the same to the bit only then
@@ -303,8 +303,7 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
         lines.append(f"no pose of a marker is known in {named(empty)}: not counted")
     if np.any([each.known.any(axis=1) for each in truth], axis=0).sum() == 1:
         lines.append(
-            "one photograph: errors and rates without intervals, which are those of other "
-            "photographs"
+            "one photograph: errors and rates have no intervals, which several photographs give"
         )
     std = np.concatenate([each.std[each.known] for each in truth])
     distance = np.concatenate([each.translation[each.known][:, 2] for each in truth])

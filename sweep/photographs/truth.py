@@ -96,8 +96,8 @@ def partner_poses(
 ) -> Poses:
     """Return the poses of M markers in P left photographs, from the right ones of the same moment.
 
-    Their standard deviations are those of the differences between left and right poses, over √2:
-    robust ones over all markers, since those of one marker are not known.
+    Their standard deviations are computed from the differences between left and right poses, over
+    √2: robust ones over all markers, since a single marker's are not known.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _numbers(written: str, tree: Any, name: str, count: int) -> Floats:
 # Truth by a file of poses, which is checked against the markers that are detected.
 
 NEAR_SHARE = 0.5
-"""Distance of a detected corner to that of the file's pose, as a share of the marker's side."""
+"""Distance of a detected corner to the one of the file's pose, as a share of the marker's side."""
 
 OTHER_UNIT = 1.5
 """Ratio of distances from which positions are taken for those in another unit."""
@@ -372,7 +372,7 @@ def _of_photographs(line: str) -> str:
 def _fault(
     poses: Poses, sizes_m: Floats, lens: Lens, seen: Sequence[SeenMarkers]
 ) -> str:
-    """Return what is wrong with poses that are not where markers are detected; empty if nothing."""
+    """Return the fault of poses that are not where markers are detected; empty if there is none."""
     own = own_poses(lens, sizes_m, seen)
     distances, ratios = [], []
     for photograph, each in enumerate(seen):
@@ -406,14 +406,14 @@ def _fault(
 # --------------------------------------------------------------------------------------------------
 # Truth by a board: the pose of each marker, from all corners of the board but its own.
 #
-# Its covariance is that of least squares with the residuals' variance, and is raised where the
+# Its covariance is the one of least squares with the residuals' variance, and is raised where the
 # poses of two halves of the corners differ by more than it says: neighbouring residuals are not
 # independent. An error of the camera's numbers is in it as far as the marker's own corners do not
 # lead to the same change of the pose: what truth and estimates share is no error of either
 # against the other. A bent board is not in it.
 
 MIN_CORNERS = 6
-"""Corners of a board from which its pose is taken for known, beside those of the marker."""
+"""Corners of a board, without the marker's own, from which its pose is taken for known."""
 
 MIN_HALF = 5
 """Corners in each of two halves whose poses are compared."""
@@ -434,7 +434,7 @@ class BoardPoses:
         The board's own pose in each photograph; None where too few corners were found.
     halves_ratio
         Root mean square of the differences between the poses of two halves of the corners, over
-        what the residuals' variance predicts; NaN if no photograph has corners enough.
+        the prediction from the residuals' variance; NaN if no photograph has corners enough.
     """
 
     poses: Poses

@@ -26,7 +26,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     """Return the pipeline that simulates the markers of photographs at their true poses.
 
     Each image has one marker on a plain ground, with what its board has printed around it. Camera,
-    detectors, estimators, rows and flags are those of the photographs, so that results pair: trial
+    detectors, estimators, rows and flags are the photographs' own, so that results pair: trial
     k has the poses of photograph k modulo their number. What is drawn of the scene is drawn for
     each photograph and repeat, and is the same for all its markers; noise and shifts are each
     marker's own.
@@ -34,7 +34,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     Parameters
     ----------
     pipeline
-        That of a store of photographs.
+        The pipeline of a store of photographs.
     scene
         Parameters of the section [scene] by name, as a document has them: values, or
         distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` has the median level of
@@ -80,7 +80,7 @@ def _ground(black: Any) -> dict[str, float]:
             return {"background": float(drawn.at(np.array([0.5]))[0])}
         return {} if black is None else {"background": float(black)}
     except (TypeError, ValueError):
-        return {}  # the pipeline's check says what is wrong with it
+        return {}  # the pipeline's check names its fault
 
 
 def _record(pipeline: Pipeline) -> PhotographRecord:
@@ -110,7 +110,7 @@ def twin_store(photographs: str | os.PathLike[str], scene: str | os.PathLike[str
 def read_scene(path: str | os.PathLike[str], like: Pipeline | None = None) -> dict[str, Any]:
     """Return the section [scene] of a TOML file, such as `sweep fit` writes.
 
-    Warns if its camera has other pixels than that of ``like``, whose twins are to have the scene.
+    Warns if its camera has other pixels than the camera of ``like``, whose twins get the scene.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the author of a plug-in imports: the records that declare one, and its settings.
+"""Names that the author of a plug-in imports: the records that declare one, and its settings.
 
 A plug-in is found by the name of an entry point (groups ``sweep.detectors``, ``sweep.estimators``,
 ``sweep.effects``, ``sweep.renderers``), or as ``module:name`` in a file beside the pipeline. What
@@ -20,7 +20,7 @@ __all__ = [
 
 
 class Markers(NamedTuple):
-    """What a detector returns for an image; a plain tuple of the first two does as well.
+    """Result of a detector for an image; a plain tuple of the first two does as well.
 
     Attributes
     ----------
@@ -38,10 +38,10 @@ class Markers(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """What a solver returns of N detections; a plain tuple of the first two does as well.
+    """Result of a solver for N detections; a plain tuple of the first two does as well.
 
-    NaN where there is no solution. Poses are those of the marker in the camera's frame: OpenCV's
-    axes, metres.
+    NaN where there is no solution. Poses take the marker's frame to the camera's: OpenCV's axes,
+    metres.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Poses(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin:
-    """What all plug-ins declare.
+    """Declarations that all plug-ins share.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ class ArrayFile(Generic[Record]):
     Attributes
     ----------
     meaning
-        What it is, in words that follow "expected".
+        Description of the file, in words that follow "expected".
     version
         The number in its array ``version``.
     arrays

@@ -60,7 +60,7 @@ class DeclaredPlugin:
     Attributes
     ----------
     kind, name
-        What it is ("detector"), and its name in the pipeline.
+        Its kind ("detector"), and its name in the pipeline.
     meaning
         One line.
     versions
@@ -70,7 +70,7 @@ class DeclaredPlugin:
     settings
         Its settings.
     dictionaries
-        Those that a detector knows; empty for all.
+        Dictionaries that a detector knows; empty for all.
     threads
         Threads that it uses.
     needs_images, of_boards, random, widens, step
@@ -93,7 +93,7 @@ class DeclaredPlugin:
     step: str = "light"
 
     def record(self, folder: str) -> Plugin:
-        """Return the plug-in's record, imported; ``folder`` is that of the pipeline.
+        """Return the plug-in's record, imported; ``folder`` is the pipeline's folder.
 
         Raises
         ------
@@ -192,7 +192,7 @@ def _listed(versions: tuple[tuple[str, str], ...]) -> str:
 
 
 def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
-    """Import a plug-in and return what it declares.
+    """Import a plug-in and return its declaration.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def _settings(record: Plugin) -> Iterator[Setting]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Which plug-ins are installed, and what one declares.
+# Which plug-ins are installed, and the declaration of one.
 
 def installed() -> list[dict[str, str]]:
     """Return kind, name and distribution of each installed plug-in; none is imported."""
@@ -273,7 +273,7 @@ def installed() -> list[dict[str, str]]:
 
 
 def described(name: str, folder: str = ".") -> list[DeclaredPlugin]:
-    """Import the plug-ins of a name, of whichever kinds, and return what they declare.
+    """Import the plug-ins of a name, of whichever kinds, and return their declarations.
 
     Raises
     ------

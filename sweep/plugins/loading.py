@@ -26,7 +26,7 @@ from sweep.plugins.recording import is_recording, recorded_detector
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
-# What plug-ins print goes to the standard error: the standard output is that of the command.
+# Output of plug-ins goes to the standard error: the standard output belongs to the command.
 
 @contextlib.contextmanager
 def printing_to_stderr() -> Iterator[None]:
@@ -273,7 +273,7 @@ def versions_of(kind: str, name: str, record: Plugin) -> tuple[tuple[str, str], 
 # Calls of plug-ins: whatever one raises is an error of its own, in one line.
 
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function of the plug-in ``name``; what it prints goes to stderr.
+    """Call a function of the plug-in ``name``; its output goes to stderr.
 
     A copy of this process that it leaves running ends here, before it does our work a second time.
 
@@ -300,7 +300,7 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def real_numbers(name: str, what: str, returned: Any) -> Floats:
-    """Return what a plug-in returned as a new array of real numbers.
+    """Return a plug-in's result as a new array of real numbers.
 
     Raises
     ------

@@ -358,40 +358,32 @@ SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
 """What the side depends on: itself, or distance, size and camera."""
 
 
-def image_sides(
-    results: xr.Dataset, bins: Mapping[str, Sequence[float]]
-) -> xr.DataArray:
+def image_sides(results: xr.Dataset) -> xr.DataArray:
     """Return the sides as if the square were parallel to the image plane: fx · size / distance.
 
     Parameters
     ----------
     results
         The dataset of a run.
-    bins
-        Edges of drawn parameters, whose bins' middles take the place of the draws.
 
     Returns
     -------
     xr.DataArray
-        Sides in pixels over the dimensions that change them, bins' names among these.
+        Sides in pixels over the dimensions that change them.
 
     Raises
     ------
     DatasetError
-        If they cannot be computed, or are drawn and not in bins.
+        If they cannot be computed, or are drawn.
     """
-    middles = {name: (name, (np.asarray(edges)[:-1] + np.asarray(edges)[1:]) / 2.0)
-               for name, edges in bins.items()}
-    given = {name: array for name, array in results.coords.items() if name not in bins}
-    shell = xr.Dataset(coords=given, attrs=results.attrs).assign_coords(middles)
+    by_side = "side_px" in results.coords
     for name in SIZE_PARAMETERS:
-        derived = name == "distance_m" and "side_px" in shell.coords
-        if name in shell.coords and DRAWS in shell[name].dims and not derived:
-            raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid; "
-                               f'give bins, such as bins={{"{name}": [...edges...]}}')
-    if "side_px" in shell.coords:
-        return _checked(shell["side_px"])
-    return sides_of(functools.partial(parameter_value, shell))
+        if name in results.coords and DRAWS in results[name].dims and not (
+                by_side and name == "distance_m"):
+            raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid")
+    if by_side:
+        return _checked(results["side_px"])
+    return sides_of(functools.partial(parameter_value, results))
 
 
 def sides_of(value: Callable[[str], Any]) -> xr.DataArray:
@@ -423,24 +415,6 @@ def _checked(sides: xr.DataArray) -> xr.DataArray:
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
                            "the distance and the camera")
     return without_fixed(sides)
-
-
-def require_size_axes(results: xr.Dataset, sides: xr.DataArray) -> None:
-    """Raise unless the sides differ along an axis."""
-    if not sides.dims:
-        raise DatasetError(
-            "side_px or distance_m: no axis changes the size in the image; there are "
-            f"{', '.join(axes_of(results)) or 'none'}")
-
-
-def parameters_along(
-    results: xr.Dataset, axis: str, bins: Mapping[str, Sequence[float]]
-) -> list[str]:
-    """Return the names of the numbers along an axis that the sides depend on."""
-    if axis in bins:
-        return [axis]
-    return [name for name in SIZE_PARAMETERS if name in results.coords
-            and results[name].dims == (axis,) and results[name].dtype.kind in "fiu"]
 
 
 # --------------------------------------------------------------------------------------------------

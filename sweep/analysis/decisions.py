@@ -19,27 +19,21 @@ from sweep.analysis.dataset import (
     configuration_axes,
     describes,
     image_sides,
-    is_sampling_stopped,
     kept_dimensions,
     parameter_value,
-    parameters_along,
     require_poses,
-    require_size_axes,
     stacked,
     stopping_rule,
-    with_common_trials,
 )
 from sweep.analysis.estimator import (
     INTERVAL,
-    Bins,
     Count,
     Statistic,
     aggregate,
     draws_of_quantile,
-    scaled_to_draws,
     stopped_level,
 )
-from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor, wilson
+from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
 from sweep.analysis.poses import Poses
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
@@ -61,7 +55,7 @@ from sweep.analysis.requirements import (
     requirables,
     worst_cell,
 )
-from sweep.analysis.summaries import LOOKED_FOR, detection_rate
+from sweep.analysis.summaries import LOOKED_FOR
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL
@@ -73,141 +67,8 @@ from sweep.messages import shown
 from sweep.model.marker import module_count
 from sweep.typing import Floats, Integers, Masks
 
-SAME_SIDE = 1e-9
-"""Sides that differ by less, relatively, are equal."""
-
-
-class SideLimit(Flag):
-    """Whether the rate is reached within the grid."""
-
-    not_run = flag(0, "No pose was looked for.", counted=False)
-    found = flag(1, "The rate is reached from a side of the grid on.", present=True)
-    never = flag(2, "The rate is not reached at the largest side.")
-    always = flag(
-        3, "The rate is reached at the smallest side: the limit may lie below it.", present=True)
-
-
-@describes
-def detection_limit(
-    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None,
-    bins: Bins | None = None,
-) -> xr.Dataset:
-    """Return the smallest side of the black square from which on the marker is detected.
-
-    Parameters
-    ----------
-    results
-        The dataset of a run with a dimension that changes the size in the image: ``side_px``,
-        ``distance_m``, ``size_m``, a focal length or field of view, the resolution, parameters
-        that go together, or several of these. What is no dimension or coordinate is read from the
-        pipeline in its attributes.
-    rate
-        The detection rate that is asked for, above 0 and at most 1.
-    per
-        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A
-        dimension ``dictionary`` is always kept; all dimensions of the sides and the trials cannot
-        be. Others are pooled: of the dimensions that change the side, what has the same side.
-    bins
-        Edges of bins of drawn parameters that change the side, such as ``distance_m``: a bin has
-        the side of its middle.
-
-    Returns
-    -------
-    xr.Dataset
-        Dimensions (*per).
-
-        - ``side_px``: side in pixels, if the square were parallel to the image, from which on, at
-          all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a
-          larger side counts. Infinite for never. Its interval is in ``side_px_low`` and
-          ``side_px_high``; ``side_px_below`` is the grid's next smaller side, at which the rate is
-          not reached.
-        - ``side_px_per_module``: the same per module of the marker, with its interval.
-        - ``distance_m``, ``size_m`` and whatever else changes the side along the axis, if it is
-          one axis: its value of that side, with its interval in ``distance_m_low`` and
-          ``distance_m_high``. 0 or infinite: beyond the grid.
-        - ``limit``: whether the rate is reached within the grid (`SideLimit`).
-
-    Raises
-    ------
-    ArgumentError
-        For a rate outside (0, 1], for ``per`` that names a dimension that cannot be kept, and for
-        bins that cannot be.
-    DatasetError
-        If no axis changes the side, or it is drawn and not in bins; if the dataset lacks variables
-        of results, or has no poses.
-
-    Notes
-    -----
-    The interval is that of the limit on the grid, at 95 %: from ``side_px_high`` on Wilson's lower
-    ends are at least ``rate``, and from ``side_px_low`` on all upper ends are. Only the one side
-    below the limit can make the high end too small, any above it the low end too large: the upper
-    ends are those of all sides together (Bonferroni). A low end of 0 says that the limit may lie
-    below the grid, an infinite high end that it may lie above; both are NaN if no cell has two
-    draws.
-
-    Examples
-    --------
-    >>> limit = detection_limit(results, rate=0.6)
-    >>> limit["side_px"].item(), limit["side_px_below"].item(), SideLimit(limit["limit"]).name
-    (20.0, 10.0, 'found')
-    """
-    if not 0.0 < rate <= 1.0:
-        raise ArgumentError("rate", rate, "expected a number above 0 and at most 1, such as 0.9")
-    axes = axes_of(results)
-    require_poses(results)
-    dictionaries = ["dictionary"] if "dictionary" in axes else []
-    if per is None:
-        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
-    kept = kept_dimensions(results, (*as_names(per), *dictionaries))
-    bins = bins or {}
-    sides = image_sides(results, bins)
-    require_size_axes(results, sides)
-    along = [str(dim) for dim in sides.dims if dim not in kept]
-    if DRAWS in kept or not along:
-        name = DRAWS if DRAWS in kept else ", ".join(map(str, sides.dims))
-        raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
-    distinct = _distinct(sides, along)
-    stopped = is_sampling_stopped(results)
-    if stopped and distinct < math.prod(sides.sizes[name] for name in along):
-        results = with_common_trials(results, kept)  # those of the same side are pooled
-    table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
-    counts = [table["detected"], table["looked_for"], table["draws"],
-              table["detection_rate_low"].notnull().astype(np.int64)]
-    *values, limit = xr.apply_ufunc(
-        _side_limit, sides, *counts,
-        kwargs={"rate": rate, "dims": len(along), "count": distinct, "stopped": stopped},
-        input_core_dims=[along] * 5, output_core_dims=[[]] * 5,
-    )
-    meanings = {
-        "side_px": f"smallest side from which on the detection rate is at least {rate:g}",
-        "side_px_low": "lower end of the 95 % interval: smallest side",
-        "side_px_high": "upper end of the 95 % interval: smallest side",
-        "side_px_below": "the grid's next smaller side",
-    }
-    modules, out = _modules(results), {}
-    for (name, meaning), array in zip(meanings.items(), values, strict=True):
-        out[name] = array.assign_attrs(long_name=meaning, units="px")
-        if name != "side_px_below":
-            out[name.replace("px", "px_per_module")] = (array / modules).assign_attrs(
-                long_name=f"{meaning}, per module", units="px")
-    if len(along) == 1:
-        out |= _in_units_of_the_axis(results, sides, along[0], bins, out)
-    out["limit"] = limit.astype(np.uint8).assign_attrs(
-        cf_attributes("whether the rate is reached within the grid", flags=SideLimit))
-    return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
-
-
-def _distinct(sides: xr.DataArray, along: Sequence[str]) -> int:
-    """Return the largest number of distinct sides of a condition."""
-    rows = sides.transpose(..., *along).values.reshape(
-        -1, math.prod(sides.sizes[name] for name in along))
-    return max(int(_is_next(np.sort(row)[::-1]).sum()) for row in rows)
-
-
-def _is_next(sides: Floats) -> Masks:
-    """Return which of some sides, from large to small, are not those before them."""
-    return np.concatenate([[True], sides[1:] < sides[:-1] * (1.0 - SAME_SIDE)])
-
+# --------------------------------------------------------------------------------------------------
+# How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".
 
 def last_steady(holds: Masks, judged: Masks) -> Integers:
     """Return the index (...) of the last judged value up to which all judged ones hold; -1 of none.
@@ -221,113 +82,6 @@ def last_steady(holds: Masks, judged: Masks) -> Integers:
     last = steady.shape[-1] - 1 - np.argmax(steady[..., ::-1], axis=-1)
     return np.asarray(np.where(steady.any(axis=-1), last, -1))
 
-
-def _side_limit(
-    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Integers, *, rate: float,
-    dims: int, count: int, stopped: bool,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
-
-    Poses of the same side are pooled; ``count`` is the largest number of distinct sides.
-    ``stopped`` says whether sampling was stopped (`sweep.analysis.estimator`).
-    """
-    shape = (*n.shape[: n.ndim - dims], math.prod(n.shape[n.ndim - dims :]))
-    sides = np.broadcast_to(sides, n.shape).reshape(shape)
-    order = np.argsort(-sides, axis=-1, kind="stable")  # the largest first
-    sides, hits, n, draws, drawn = (
-        np.take_along_axis(each.reshape(shape), order, axis=-1)
-        for each in (sides, hits, n, draws, drawn))
-    hits, n, draws, drawn = _pooled(sides, hits, n, draws, drawn)
-    exists = n > 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reached = hits / n >= rate
-    # Of draws, rounded outwards, as in `Rate`.
-    fewest, most = scaled_to_draws(hits, n, draws)
-    joint = 1.0 - (1.0 - LEVEL) / count
-    interval: Callable[..., tuple[Floats, Floats]] = clopper_pearson if stopped else wilson
-    levels = [stopped_level(level) if stopped else level for level in (LEVEL, joint)]
-    surely = interval(fewest, draws, levels[0])[0] >= rate
-    possibly = interval(most, draws, levels[1])[1] >= rate
-
-    def smallest(holds: Masks) -> Floats:
-        """Return the smallest side down to which it holds."""
-        at = last_steady(holds, exists)
-        side = np.take_along_axis(sides, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
-        return np.where(at < 0, np.inf, side)
-
-    side, high, low = smallest(reached), smallest(surely), smallest(possibly)
-    low = np.where((possibly | ~exists).all(axis=-1), 0.0, low)
-    smaller = np.where(exists & (sides < side[..., None]), sides, -np.inf).max(
-        axis=-1, initial=-np.inf)
-    empty = ~exists.any(axis=-1)
-    flags = np.select(
-        [empty, (reached | ~exists).all(axis=-1), np.isinf(side)],
-        [SideLimit.not_run, SideLimit.always, SideLimit.never], SideLimit.found)
-    unknown = ~((drawn > 0) | ~exists).all(axis=-1) | empty
-    return (np.where(empty, np.nan, side), np.where(unknown, np.nan, low),
-            np.where(unknown, np.nan, high), np.where(np.isinf(smaller), np.nan, smaller),
-            flags.astype(np.float64))
-
-
-def _pooled(sides: Floats, *counts: Integers) -> list[Integers]:
-    """Return the counts with those of equal sides at the first of these, 0 at the others."""
-    pooled = [np.zeros_like(each) for each in counts]
-    for row in np.ndindex(*sides.shape[:-1]):
-        first = np.nonzero(_is_next(sides[row]))[0]
-        for sums, each in zip(pooled, counts, strict=True):
-            sums[(*row, first)] = np.add.reduceat(each[row], first)
-    return pooled
-
-
-def _in_units_of_the_axis(
-    results: xr.Dataset, sides: xr.DataArray, axis: str, bins: Bins,
-    limits: Mapping[str, xr.DataArray],
-) -> dict[str, xr.DataArray]:
-    """Return the limit and its interval as values of the parameters along the axis."""
-    out = {}
-    for name in parameters_along(results, axis, bins):
-        if name == "side_px":
-            continue
-        values = sides[axis].values if axis in bins else results[name].values
-        order = np.argsort(values)
-        ends = sides.isel({axis: order[[0, -1]]})
-        smaller = bool((ends.isel({axis: 1}) < ends.isel({axis: 0})).all())
-        low, high = ("high", "low") if smaller else ("low", "high")
-        for ending, source, words in (
-            ("", "side_px", "value of that side"),
-            ("_low", f"side_px_{low}", "lower end of the 95 % interval: value of that side"),
-            ("_high", f"side_px_{high}", "upper end of the 95 % interval: value of that side"),
-        ):
-            out[f"{name}{ending}"] = xr.apply_ufunc(
-                _value_of_side, limits[source], sides.drop_vars(axis, errors="ignore"),
-                kwargs={"values": values.astype(np.float64), "smaller": smaller},
-                input_core_dims=[[], [axis]],
-            ).assign_attrs(long_name=f"{name}: {words}",
-                           units=str(results[name].attrs.get("units", "1")))
-    return out
-
-
-def _value_of_side(
-    side: Floats, sides: Floats, values: Floats, *, smaller: bool
-) -> Floats:
-    """Return the values (...) at which sides (..., n) are those of (...); 0 or inf beyond all."""
-    nearest = np.argmin(np.abs(sides - np.where(np.isfinite(side), side, 0.0)[..., None]), axis=-1)
-    found = np.where(np.isnan(side), np.nan, values[nearest])
-    found = np.where(side == 0.0, np.inf if smaller else 0.0, found)
-    return np.where(np.isinf(side), 0.0 if smaller else np.inf, found)
-
-
-def _modules(results: xr.Dataset) -> Any:
-    """Return the modules along the black square's side, by dictionary."""
-    names = parameter_value(results, "dictionary")
-    if isinstance(names, xr.DataArray):
-        counts = [module_count(str(name)) for name in np.atleast_1d(names.values)]
-        return xr.DataArray(np.reshape(counts, names.shape), names.coords, names.dims)
-    return module_count(names)
-
-
-# --------------------------------------------------------------------------------------------------
-# How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".
 
 class Reach(Flag):
     """How far the requirements are met along the axis."""
@@ -493,7 +247,7 @@ def is_harder_upwards(results: xr.Dataset, along: str, keeps: xr.DataArray) -> b
     does not change the size in the image.
     """
     values = results[along].to_numpy()
-    smaller = smaller_upwards(lambda: image_sides(results, {}), values, along)
+    smaller = smaller_upwards(lambda: image_sides(results), values, along)
     return easier_first(keeps.transpose(along, ...).to_numpy(), values) \
         if smaller is None else smaller
 
@@ -686,6 +440,101 @@ def requirement_limits(
     found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
         long_name="scenes that were computed, of all values", units="1")
     return found.assign_attrs(per=[*per], at_all=at_all, require=[*require])
+
+
+@describes
+def detection_limit(
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
+) -> xr.Dataset:
+    """Return the smallest side of the black square from which on the marker is detected.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run with an axis that changes the size in the image: ``side_px``,
+        ``distance_m``, ``size_m``, or one of the camera. What is no coordinate is read from the
+        pipeline in its attributes.
+    rate
+        The detection rate that is asked for, above 0 and below 1.
+    per
+        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A dimension
+        ``dictionary`` is always kept, the axis of the size and the trials cannot be. Others are
+        pooled.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*detector settings, *per): `requirement_limits` of ``detection >= rate``, as
+        sides.
+
+        - ``side_px``: side in pixels, if the square were parallel to the image, down to which the
+          rate is reached without a gap; infinite for never. Its interval is in ``side_px_low`` and
+          ``side_px_high``: 0 or infinite, the limit may lie beyond the grid.
+        - ``side_px_per_module``: the same per module of the marker, with its interval.
+        - the axis, such as ``distance_m``: its value there, with its interval in
+          ``distance_m_low`` and ``distance_m_high``.
+        - ``reach``: whether the rate is reached within the grid (`Reach`).
+
+    Raises
+    ------
+    ArgumentError
+        For a rate outside (0, 1), and for ``per`` that cannot be kept, or leaves several axes of
+        the size.
+    DatasetError
+        If no axis changes the size, or it is drawn; if the dataset lacks variables of results, has
+        no poses, or a single draw of each.
+
+    Notes
+    -----
+    The interval is that of `requirement_limits`, for each condition by itself.
+
+    Examples
+    --------
+    >>> limit = detection_limit(results, rate=0.6)
+    >>> limit["side_px"].item(), limit["side_px_high"].item(), Reach(limit["reach"].item()).name
+    (20.0, 40.0, 'found')
+    """
+    require_poses(results)
+    axes = axes_of(results)
+    results = results.isel(  # what has several estimators has been detected once
+        {name: 0 for name in axes if name not in results["detection"].dims}, drop=True)
+    if per is None:
+        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
+    per = kept_dimensions(
+        results, (*as_names(per), *(name for name in ("dictionary",) if name in axes)))
+    sides = image_sides(results)
+    if not sides.dims:
+        raise DatasetError("side_px or distance_m: no axis changes the size in the image; there "
+                           f"are {', '.join(axes) or 'none'}")
+    along = [str(dim) for dim in sides.dims if dim not in per]
+    if len(along) != 1:
+        raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
+                            f"the limit is along; there are {', '.join(map(str, sides.dims))}")
+    found = requirement_limits(results, [f"detection >= {rate:.12g}"], along[0], per)
+    names = parameter_value(results, "dictionary")
+    modules: Any = module_count(names) if isinstance(names, str) else xr.apply_ufunc(
+        np.vectorize(module_count), names)
+    smaller = found.attrs["harder"] == "upwards"
+    # Ends of sides are the other ends of what makes markers small as it grows.
+    ends = ("", "_high", "_low") if smaller else tuple(INTERVAL)
+    out = {"reach": found["reach"]}
+    for (end, words), other in zip(INTERVAL.items(), ends, strict=True):
+        value, at = (found[each[1:] or "value"] for each in (end, other))
+        nowhere = at.isnull()
+        at = at.where(~nowhere, -np.inf if smaller else np.inf)
+        known = sides.sel({along[0]: at.clip(float(sides[along[0]].min()),
+                                             float(sides[along[0]].max()))}, method="nearest")
+        beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
+        side = known.drop_vars(along).where(np.isfinite(at), beyond).where(
+            found["reach"] != Reach.not_run)
+        meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
+        out |= {
+            f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
+            f"side_px_per_module{end}": (side / modules).assign_attrs(
+                long_name=f"{meaning}, per module", units="px")}
+        if along[0] != "side_px":
+            out[f"{along[0]}{end}"] = value
+    return xr.Dataset({name: each.drop_vars(along, errors="ignore") for name, each in out.items()})
 
 
 # --------------------------------------------------------------------------------------------------

@@ -274,7 +274,7 @@ def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
     if name in results.variables and not is_fixed(results[name]):
         return results[name].reset_coords(drop=True)
     if name == SIDE:
-        return image_sides(results, {})
+        return image_sides(results)
     if name == "distance_m":
         return results["true_tvec_m"].isel(xyz=2, drop=True)
     raise DatasetError(f"{name}: both datasets need it for bins; one has "

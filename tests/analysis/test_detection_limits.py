@@ -9,7 +9,7 @@ import pytest
 from support.comparisons import with_detected
 from support.small_datasets import perfect
 from sweep.analysis import detection_limit
-from sweep.analysis.decisions import SideLimit
+from sweep.analysis.decisions import Reach
 from sweep.errors import ArgumentError, DatasetError
 
 TEXT = """
@@ -72,44 +72,35 @@ def test_the_limit_is_found_along_any_axis_that_changes_the_size(name):
     answer = detection_limit(dataset({name: values}, rates, **texts), rate=0.9)
     expected = limit_by_hand(sides, rates, 0.9)
     assert answer["side_px"].item() == pytest.approx(expected, rel=1e-9)
-    assert SideLimit(answer["limit"].item()) is SideLimit.found
+    assert Reach(answer["reach"].item()) is Reach.found
     value, low, high = (answer[f"{name}{end}"].item() for end in ("", "_low", "_high"))
     assert value == values[sides.index(expected)]
     assert low <= value <= high
-    assert {low, high} <= {0.0, math.inf, *values}
+    assert {low, high} <= {-math.inf, math.inf, *values}
 
 
-def test_several_axes_pool_what_has_the_same_side():
-    distances, sizes = [1.0, 2.0, 4.0], [0.06, 0.12]
-    rates = np.array([[0.9, 1.0], [0.5, 0.95], [0.0, 0.5]])
-    results = dataset({"distance_m": distances, "size_m": sizes}, rates, marker="")
-    answer = detection_limit(results, rate=0.7)
-    sides = [FX * size / distance for distance in distances for size in sizes]
-    # 36 px at 1 and at 2 m are pooled: 0.925; 18 px at 2 and at 4 m are 0.5
-    assert answer["side_px"].item() == pytest.approx(limit_by_hand(sides, rates.ravel(), 0.7))
-    assert "distance_m" not in answer
-    by_size = detection_limit(results, rate=0.7, per=["size_m"])
-    assert by_size["distance_m"].values.tolist() == [1.0, 2.0]
+def test_a_limit_for_each_size_has_the_same_side():
+    results = dataset({"distance_m": [1.0, 2.0, 4.0], "size_m": [0.06, 0.12]},
+                      [[1.0, 1.0], [0.5, 1.0], [0.0, 0.5]], marker="")
+    answer = detection_limit(results, rate=0.7, per=["size_m"])
+    assert answer["distance_m"].values.tolist() == [1.0, 2.0]
+    assert answer["side_px"].values.tolist() == pytest.approx([FX * SIZE_M] * 2)
+    np.testing.assert_allclose(answer["side_px_per_module"], FX * SIZE_M / 6)
 
 
-def test_drawn_distances_are_taken_by_bins():
-    rng = np.random.default_rng(5)
-    results = dataset({"tilt_deg": [0.0]}, [1.0], pose="distance_m = { uniform = [1, 5] }")
-    drawn = rng.uniform(1.0, 5.0, (1, TRIALS))
-    results = results.assign_coords(distance_m=(("tilt_deg", "trial"), drawn, {"units": "m"}))
-    missed = drawn > 3.0
-    results["detection"].values[missed] = 4
-    with pytest.raises(DatasetError, match=r"is drawn.*give bins"):
-        detection_limit(results, per=[])
-    answer = detection_limit(results, per=[], bins={"distance_m": [1, 2, 3, 4, 5]})
-    assert answer["side_px"].item() == pytest.approx(FX * SIZE_M / 2.5)
-    assert answer["distance_m"].item() == 2.5
+def test_a_rate_that_is_never_reached_has_an_infinite_side():
+    answer = detection_limit(dataset({"distance_m": [1.0, 2.0]}, [0.5, 0.2]))
+    assert [float(answer[name]) for name in ("side_px", "side_px_low", "side_px_high")] == [
+        math.inf] * 3
+    assert np.isnan(answer["distance_m"])
 
 
 @pytest.mark.parametrize(("results", "per", "error", "problem"), [
     (dataset({"tilt_deg": [0.0, 10.0]}, [1.0, 1.0]), None, DatasetError, "no axis changes"),
-    (dataset({"distance_m": [1.0, 2.0]}, [1.0, 1.0]), ["distance_m"], ArgumentError,
-     "cannot be kept"),
+    *((dataset({"distance_m": [1.0, 2.0], "size_m": [0.1, 0.2]}, np.ones((2, 2)), marker=""), per,
+       ArgumentError, "but one") for per in ([], ["distance_m", "size_m"])),
+    (dataset({"tilt_deg": [0.0]}, [1.0], pose="distance_m = { uniform = [1, 5] }").assign_coords(
+        distance_m=("trial", np.linspace(1.0, 5.0, TRIALS))), None, DatasetError, "is drawn"),
 ])
 def test_a_limit_that_cannot_be_is_refused(results, per, error, problem):
     with pytest.raises(error, match=problem) as refused:

@@ -41,6 +41,7 @@ from sweep.report.report_data import (
     ReportData,
     configurations,
     course_of,
+    notes_of,
 )
 from sweep.report.table import Column, Table, each_cell, interval_text, number
 
@@ -184,11 +185,8 @@ def required(data: ReportData) -> Required:
         As `sweep.analysis.check_requirements`.
     """
     known = configurations(data, targets=False)
-    axes = known.settings.axes
-    results = data.results.isel({name: list(some) for name, some in axes.items()})
+    results, positions = data.results.isel(known.axes), known.combinations
     table = data.once("required", lambda: check_requirements(results, data.require, data.per))
-    positions = [{name: axes[name].index(index) for name, index in each.items()}
-                 for each in known.settings.combinations]
     found = [verdicts(table.isel({name: [k] for name, k in at.items()})) for at in positions]
     decisions = [combined(each) for each in found]
     along, others = course_of(data, data.per)
@@ -210,10 +208,10 @@ def required(data: ReportData) -> Required:
     line = f"{' and '.join(data.require)}: {_decided(found[best], decisions[best])}"
     if limits:
         line += _reached([part.isel(positions[best]) for part in limits], others)
-    flat = tuple(each for part in found for each in part)
+    every = tuple(verdicts(table))
     return Required(
-        f"{line}{whose}.", (*map(limit_table, limits), decision_table(flat)),
-        (condition_table(found[best], table, every=True),), best, decisions[best], flat,
+        f"{line}{whose}.", (*map(limit_table, limits), decision_table(every)),
+        (condition_table(found[best], table, every=True),), best, decisions[best], every,
         limits[0] if limits else None)
 
 
@@ -275,8 +273,7 @@ def _notes(data: ReportData, known: Configurations) -> str:
     return warnings + sentences(
         "A board counts as detected if at least one of its markers is."
         if data.pipeline.shows_boards else "",
-        interval_note(data), *known.settings.grouping.notes,
-        data.pooled(*known.settings.axes))
+        interval_note(data), notes_of(data, {}), data.pooled(*known.axes))
 
 
 def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from sweep.report.report_data import (
     Configurations,
     ReportData,
     configurations,
+    stacked,
 )
 from sweep.report.table import Column, Table, Value, number
 from sweep.tradeoff.pareto import WRONG, conditions_of
@@ -141,12 +142,12 @@ class Comparison:
     def line(self) -> str:
         """The best configuration against the one that comes nearest to it, in one line."""
         known = self.known
-        others = [k for k in known.order if k != self.best]
+        others = [k for k in range(len(known.names)) if k != self.best]
         if not others:
             return ""
         # What a wrong belief costs is the question if nothing else varies.
         others = [k for k in others if not known.wrong[k]] or others
-        rival = min(others, key=lambda k: (self.verdict(k), known.order.index(k)))
+        rival = min(others, key=self.verdict)
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
             next((each for each in pair[2:] if not np.isnan(each.value)), pair[0])]
@@ -224,7 +225,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
 
 def _comparison(data: ReportData, among: Sequence[int] | None) -> Comparison:
     known = configurations(data, targets=among is None)
-    usable = [k for k in known.order if among is None or k in among]
+    usable = [k for k in range(len(known.names)) if among is None or k in among]
     tried: dict[int, list[tuple[Difference, ...]]] = {}
 
     def better_than(best: int) -> list[int]:
@@ -249,12 +250,11 @@ def _against_each(
     data: ReportData, known: Configurations, best: int
 ) -> list[tuple[Difference, ...]]:
     """Return the differences of one configuration from each, of no quantity from itself."""
-    grouping, at = known.settings.grouping, known.settings.combinations[best]
-    chosen = {name: list(some) for name, some in grouping.chosen}
-    reference = with_configuration(data.results, at).isel(chosen)
-    tables = data.once(("against", tuple(at.items()), grouping), lambda: paired(
-        data.results.isel(chosen), reference, grouping.dims))
-    shown, deciding = map(known.settings.stacked, tables)
+    at = known.combinations[best]
+    chosen = data.results.isel(known.axes)
+    tables = data.once(("against", *at.items()), lambda: paired(
+        chosen, with_configuration(chosen, at), list(at)))
+    shown, deciding = (stacked(table, known.combinations, known.names) for table in tables)
     return [() if k == best else _differences(*(
         each.isel({CONFIGURATION: k}) for each in (shown, deciding)))
             for k in range(len(known.names))]
@@ -329,7 +329,8 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
         costs = dict(zip(part["treatment"].values.tolist(), part["cost_ms"].values.tolist(),
                          strict=True))
         cost = [costs.get(name, np.nan) for name in known.names]
-        usable = [k for k in known.order if WRONG not in known.names[k] and np.isfinite(cost[k])]
+        usable = [k for k, name in enumerate(known.names)
+                  if WRONG not in name and np.isfinite(cost[k])]
         within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]
         start = f"{label}: " if label else ""
         if not within:

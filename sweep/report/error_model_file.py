@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +15,25 @@ from sweep.analysis.error_models import (
     PREDICTORS,
     QUANTITIES,
     UNITS,
-    VARIES,
     WORDS,
     Use,
     cell_edges,
     error_models,
-    model_errors,
 )
+from sweep.analysis.estimator import INTERVAL
 from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Findings, Table, interval_text, number
+from sweep.report.table import Findings, Table, Value, each_cell, interval_text, number
 from sweep.version import __version__
 
-SCHEMA = "sweep-error-model/2"
+SCHEMA = "sweep-error-model/3"
+
+OF_QUANTITIES = (
+    *(f"{name}{end}" for name in ("sigma", "bias", "exponent") for end in INTERVAL), "knots",
+    "coverage", "camera_coverage")
+"""Variables of the models that the file has of each quantity."""
 
 FRAME = (
     "sight frame: the camera's frame (x right, y down, z forward), turned by the shortest way so "
@@ -92,8 +95,8 @@ def error_model_text(models: xr.Dataset, facts: Mapping[str, Any]) -> str:
 
 def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of the file; what is not a number is null."""
-    flat = stacked(models)
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
+    knots = {name: models[name].values.tolist() for name in PREDICTORS}
     return {
         "schema": SCHEMA, "sweep": __version__, **facts,
         "frame": FRAME, "formula": FORMULA,
@@ -108,20 +111,16 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
                 "configuration": configuration,
                 "side_px_times_distance_m": None if models.attrs["focal_size_varies"] else
                 models.attrs["focal_size_px_m"],
-                "region": _region(flat.isel(model=k)),
-                "knots": {name: flat[name].values.tolist() for name in PREDICTORS},
-                "knots_u": [_logarithms(name, flat[name].values) for name in PREDICTORS],
+                "region": _region(model),
+                "knots": knots,
+                "knots_u": [_logarithms(name, values) for name, values in knots.items()],
                 "cells": edges,
                 "cells_u": [_logarithms(name, ends[1:-1]) for name, ends in edges.items()],
-                **{name: flat[name].isel(model=k).values.tolist()
+                **{name: model[name].values.tolist()
                    for name in ("looked_for", "solved_rate", "flip_rate", "judged")},
-                "quantities": {
-                    quantity: _quantity(flat.isel(model=k).sel(quantity=quantity))
-                    for quantity in QUANTITIES
-                },
-                "rule_of_thumb": _rule(flat.isel(model=k)),
+                "quantities": {name: _quantity(model.sel(quantity=name)) for name in QUANTITIES},
             }
-            for k, configuration in enumerate(configurations(models))
+            for configuration, model in models_apart(models)
         ],
     }
 
@@ -144,68 +143,36 @@ def _logarithms(name: str, values: Any) -> Any:
 
 
 def _quantity(model: xr.Dataset) -> dict[str, Any]:
-    names = [Use(value).name for value in model["use"].values.ravel()]
+    """Return what a reader computes with, and all variables, of one quantity."""
     metres = str(model["quantity"].item()) in QUANTITIES[:3]
     scale = model["distance_m"].values[:, None, None] if metres else 1.0
+    names = np.array([Use(flag).name for flag in model["use"].values.ravel()], dtype=object)
     return {
         "unit": "m" if metres else "radian",
-        "ln_sigma": (np.log(model["sigma"].values)).tolist(),
+        "ln_sigma": np.log(model["sigma"].values).tolist(),
         "bias_u": (model["bias"].values / scale).tolist(),
-        "sigma": model["sigma"].values.tolist(),
-        "sigma_interval": [model[f"sigma_{end}"].values.tolist() for end in ("low", "high")],
-        "bias": model["bias"].values.tolist(),
-        "bias_interval": [model[f"bias_{end}"].values.tolist() for end in ("low", "high")],
-        "knots_needed": model["knots"].values.tolist(),
-        "exponent": model["exponent"].values.tolist(),
-        "exponent_interval": [model[f"exponent_{end}"].values.tolist() for end in ("low", "high")],
-        "coverage": model["coverage"].values.tolist(),
-        "camera_coverage": model["camera_coverage"].values.tolist(),
-        "use": np.reshape(np.array(names, dtype=object), model["use"].shape).tolist(),
+        **{name: model[name].values.tolist() for name in OF_QUANTITIES},
+        "use": names.reshape(model["use"].shape).tolist(),
     }
 
 
-def _rule(model: xr.Dataset) -> dict[str, Any]:
-    """Return how the usual rule for one tag compares with sigma of z at the knots."""
-    rule = RULE_M * model["distance_m"] ** 2
-    ratio = (rule / model["sigma"].sel(quantity="z")).transpose(*PREDICTORS)
-    return {"rule": "sigma = 0.02 d² m", "ratio_to_sigma_of_z": ratio.values.tolist()}
+def models_apart(models: xr.Dataset) -> list[tuple[dict[str, Any], xr.Dataset]]:
+    """Return the values of the axes by which models are kept apart, and each model."""
+    return list(each_cell(models, [
+        str(dim) for dim in models["exponent"].dims if dim != "quantity"]))
 
 
-def stacked(models: xr.Dataset) -> xr.Dataset:
-    """Return the models with one dimension ``model`` in front, in place of those kept apart."""
-    kept = kept_of(models)
-    flat = models.drop_vars([name for name in kept if name in models.coords])
-    flat = flat.stack(model=kept, create_index=False) if kept else flat.expand_dims("model")
-    return flat.transpose("model", "quantity", *PREDICTORS, *(f"cell_{n}" for n in PREDICTORS),
-                          *(f"region_{n}" for n in CONDITIONS), "direction", ...)
-
-
-def kept_of(models: xr.Dataset) -> list[str]:
-    """Return the dimensions that keep models apart, in order."""
-    return [str(dim) for dim in models["exponent"].dims if dim != "quantity"]
-
-
-def configurations(models: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the values of the axes that models are kept apart by, of each model."""
-    kept = kept_of(models)
-    shape = [models.sizes[name] for name in kept]
-    return [
-        {name: np.asarray(models[name].values[k]).item()
-         for name, k in zip(kept, index, strict=True)}
-        for index in np.ndindex(*shape)
-    ]
-
-
-def configuration_names(models: xr.Dataset) -> list[str]:
-    """Return each model's configuration in words; one without axes is "the configuration"."""
-    return [", ".join(f"{name} = {value}" for name, value in each.items()) or "the configuration"
-            for each in configurations(models)]
+def names_apart(models: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
+    """Return the configuration in words, and each model."""
+    return [(", ".join(f"{name} = {value}" for name, value in at.items()) or "the configuration",
+             model) for at, model in models_apart(models)]
 
 
 def warnings_of(models: xr.Dataset) -> list[str]:
     """Return sentences on where the models must not be used, beside the flags of the cells."""
-    lines, uses = [], stacked(models)["use"].values
-    for use, name in zip(uses, configuration_names(models), strict=True):
+    lines = []
+    for name, model in names_apart(models):
+        use = model["use"].values
         counted = use[:, (use != Use.no_poses).any(axis=0)]
         parts = [f"{100 * float((counted == flag).mean()):.0f} % {flag.name}" for flag in Use
                  if flag != Use.no_poses and (counted == flag).any()]
@@ -298,14 +265,11 @@ def error_model_tables(data: ReportData) -> tuple[Table, ...]:
 
 def error_model_table(models: xr.Dataset) -> Table:
     """Return a table with a row for some distances and viewing angles of each configuration."""
-    names, flat = configuration_names(models), stacked(models)
-    rows = []
-    for k, name in enumerate(names):
-        model = flat.isel(model=k)
-        label = [name] if len(names) > 1 else []
-        rows += [[*label, *row] for at in _points(model) if (row := _row(model, at))]
-    several = ["configuration"] if len(names) > 1 else []
+    apart = names_apart(models)
+    several = ["configuration"] if len(apart) > 1 else []
     sided = ["side, px"] if models.sizes["side_px"] > 1 else []
+    rows = [[*([name] if several else []), number(distance), *([number(side)] if sided else []),
+             *rest] for name, model in apart for distance, side, *rest in _rows(model)]
     headings = [
         *several, "distance, m", *sided, "viewing angle, deg",
         "held-out check", "x, mm", "y, mm", "z, mm",
@@ -315,77 +279,39 @@ def error_model_table(models: xr.Dataset) -> Table:
     return Table.of(CAPTION, headings, rows, stub=len(several) + 2 + len(sided))
 
 
-def exponent_lines(models: xr.Dataset) -> list[str]:
-    """Return, for each configuration, with which power of the distance sigma of z goes."""
-    flat = stacked(models)
-    lines = []
-    for k, name in enumerate(configuration_names(models)):
-        z = flat.isel(model=k).sel(quantity="z")
-        power, low, high = (float(z[f"exponent{end}"]) for end in ("", "_low", "_high"))
-        if not np.isfinite(power):
-            continue
-        fits = int(z["knots"].sel(predictor="distance_m")) <= 2 and (
-            int(z["knots"].sel(predictor="side_px")) <= 2)
-        of = "distance" if models.sizes["distance_m"] > 1 else "side"
-        lines.append(
-            f"{name}: sigma of z goes with the {of} to the power {number(power)} "
-            f"({interval_text(low, high)})"
-            + ("" if fits else "; a power law does not describe it, the knots do"))
-    return lines
+def _rows(model: xr.Dataset) -> Iterator[list[Any]]:
+    """Yield distance, side and cells of some knots at which the store has poses."""
+    knots = [model[name].values for name in PREDICTORS]
+    inner = [cell_edges(model, name)[1:-1] for name in PREDICTORS]
+    angles = sorted({int(np.abs(knots[2] - each).argmin()) for each in ANGLES_DEG})
+    places = {}
+    for place in itertools.product(*(range(len(each)) for each in knots[:2]), angles):
+        cell = {f"cell_{name}": int(np.searchsorted(ends, values[k], side="right"))
+                for name, ends, values, k in zip(PREDICTORS, inner, knots, place, strict=True)}
+        use = model["use"].isel(cell).values
+        if not (use == Use.no_poses).all():
+            places[place] = use
+    shown = [_spread({place[k] for place in places}, most)
+             for k, most in enumerate((MAX_DISTANCES, MAX_SIDES))]
+    scales = [1e3] * 3 + [float(np.degrees(1.0))] * 3
+    for place, use in places.items():
+        if place[0] in shown[0] and place[1] in shown[1]:
+            point = model.isel(dict(zip(PREDICTORS, place, strict=True)))
+            distance, side, angle = (values[k] for values, k in zip(knots, place, strict=True))
+            ends = zip(*(point[f"sigma{end}"].values for end in INTERVAL), strict=True)
+            sigma_z = float(point["sigma"].sel(quantity="z"))
+            yield [float(distance), float(side), number(angle), _use(use), *(
+                Value(*(scale * float(end) for end in each))
+                for scale, each in zip(scales, ends, strict=True)),
+                Value(1e3 * float(point["bias"].sel(quantity="z"))),
+                Value(RULE_M * distance**2 / sigma_z)]
 
 
-def _points(model: xr.Dataset) -> list[dict[str, int]]:
-    """Return indices of the knots that the table has: of the seen ones if those are few."""
-    angles = model["viewing_angle_deg"].values
-    some = [
-        _spread(model.sizes["distance_m"], MAX_DISTANCES),
-        _spread(model.sizes["side_px"], MAX_SIDES),
-        sorted({int(np.abs(angles - each).argmin()) for each in ANGLES_DEG}),
-    ]
-    points = [dict(zip(PREDICTORS, index, strict=True)) for index in itertools.product(*some)]
-    if any(_row(model, at) for at in points):
-        return points
-    every = [dict(zip(PREDICTORS, index, strict=True))
-             for index in np.ndindex(*(model.sizes[name] for name in PREDICTORS))]
-    seen = [at for at in every if _row(model, at)]
-    return [seen[k] for k in _spread(len(seen), MAX_DISTANCES * MAX_SIDES)] if seen else []
-
-
-def _spread(count: int, most: int) -> list[int]:
-    return sorted({round(float(each)) for each in np.linspace(0, count - 1, min(count, most))})
-
-
-def _row(model: xr.Dataset, at: dict[str, int]) -> list[str]:
-    """Return the texts of a knot, none if the store has no poses there."""
-    point = model.isel(at)
-    distance, angle = (float(point[name]) for name in ("distance_m", "viewing_angle_deg"))
-    side = float(point["side_px"]) if model.attrs["focal_size_varies"] else None
-    use = model_errors(model, _held(model, "distance_m", distance), _held(
-        model, "viewing_angle_deg", angle), side)["use"].values[0]
-    if (use == Use.no_poses).all():
-        return []
-    texts = []
-    for k, name in enumerate(QUANTITIES):
-        scale = 1e3 if k < 3 else float(np.degrees(1.0))
-        sigma, low, high = (
-            scale * float(point[f"sigma{end}"].sel(quantity=name)) for end in ("", "_low", "_high"))
-        texts.append(f"{number(sigma)} ({interval_text(low, high)})")
-    sided = [number(float(point["side_px"]))] if model.sizes["side_px"] > 1 else []
-    bias = 1e3 * float(point["bias"].sel(quantity="z"))
-    ratio = RULE_M * distance**2 / float(point["sigma"].sel(quantity="z"))
-    return [number(distance), *sided, number(angle), _use(use), *texts, number(bias), number(ratio)]
-
-
-def _held(model: xr.Dataset, name: str, value: float) -> float:
-    """Return a knot, moved into the model's region if it is another model's end beside it."""
-    k = list(CONDITIONS).index(name)
-    low, high = (float(model[f"region_{end}"][k]) for end in ("low", "high"))
-    if CONDITIONS[name]:
-        low, high = math.exp(low), math.exp(high)
-        near = low / VARIES[name] < value < high * VARIES[name]
-    else:
-        near = low - VARIES[name] < value < high + VARIES[name]
-    return min(max(value, low), high) if near else value
+def _spread(values: set[int], most: int) -> list[int]:
+    """Return at most so many of some indices, evenly spaced."""
+    ordered = sorted(values)
+    places = np.linspace(0, len(ordered) - 1, min(len(ordered), most)).round().astype(int)
+    return [ordered[k] for k in places.tolist()]
 
 
 def _use(use: Iterable[int]) -> str:
@@ -397,3 +323,19 @@ def _use(use: Iterable[int]) -> str:
         return Use(next(iter(by_flag))).name.replace("_", " ")
     return "; ".join(f"{', '.join(names)} {Use(flag).name.replace('_', ' ')}"
                      for flag, names in by_flag.items() if flag != Use.holds)
+
+
+def exponent_lines(models: xr.Dataset) -> list[str]:
+    """Return, for each configuration, with which power of the distance sigma of z goes."""
+    of = "distance" if models.sizes["distance_m"] > 1 else "side"
+    lines = []
+    for name, model in names_apart(models):
+        z = model.sel(quantity="z")
+        power, low, high = (float(z[f"exponent{end}"]) for end in INTERVAL)
+        if np.isfinite(power):
+            fits = (z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all()
+            lines.append(
+                f"{name}: sigma of z goes with the {of} to the power {number(power)} "
+                f"({interval_text(low, high)})"
+                + ("" if fits else "; a power law does not describe it, the knots do"))
+    return lines

@@ -116,8 +116,8 @@ class Figure:
         a row of dots.
     by
         Column whose values have a line each; the other columns that name a row tell panels apart.
-    shown
-        Values of the columns that are drawn (default: all).
+    rows
+        Rows of dots that are drawn at most.
     marked
         Column whose rows that say yes are drawn as diamonds.
     labels
@@ -134,7 +134,7 @@ class Figure:
     curves: Sequence[Column]
     x: str = ""
     by: str = ""
-    shown: Sequence[str] = ()
+    rows: int = MAX_DOTS
     marked: str = ""
     labels: str = ""
     covers: Sequence[str] = ()
@@ -145,10 +145,8 @@ class Figure:
         curves = [each for each in self.curves if each.heading in self.table.headings]
         stub = self.table.headings[: self.table.stub]
         rows = self.table.frame.to_dict("records")
-        if self.shown:
-            rows = [row for row in rows if {cell_text(row[name]) for name in stub} & {*self.shown}]
         if not self.x or any(isinstance(row[self.x], str) for row in rows):
-            return [self._dots(curve, rows[:MAX_DOTS]) for curve in curves]
+            return [self._dots(curve, rows[: self.rows]) for curve in curves]
         parts = _groups(rows, [name for name in stub if name not in (self.x, self.by, self.labels)])
         alone = len(curves) * len(parts) == 1
         return [self._lines(curve, words, part, alone=alone)

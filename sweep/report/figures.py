@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,16 +37,14 @@ from sweep.report.report_data import (
     BOTH,
     CONFIGURATION,
     IDS,
-    Analysis,
-    Grouping,
+    Groups,
     ReportData,
-    Settings,
-    best_first,
     configurations,
     course_of,
-    settings_of,
+    grouped,
+    notes_of,
 )
-from sweep.report.table import Column, Table, Value, each_cell, table_of
+from sweep.report.table import Column, Table, table_of
 from sweep.report.tradeoff_figure import trade_figure
 from sweep.tradeoff.pareto import configuration_label
 
@@ -98,8 +95,8 @@ SHORT_NAMES = {AREA: "area", "side_px": "size", "distance_m": "distance", "size_
 MIN_BINNED_SIZES = 20
 """From this many sizes on, the detection rate is drawn against bins of the area."""
 
-MAX_BINS, MAX_ROWS = 40, 24
-"""Groups of a numeric axis, and of any other."""
+MAX_BINS = 40
+"""Groups of a numeric axis."""
 
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
 """Angles that are lines of one configuration, and panels of several."""
@@ -124,96 +121,56 @@ def interval_note(data: ReportData) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# An analysis by configuration and groups of poses: what a figure shows.
+# Tables and figures of an analysis by configuration and groups of poses.
 
 
-@dataclass(frozen=True, eq=False)
-class Grouped:
-    """An analysis by configuration and groups of poses. No configuration is pooled.
+def configuration_table(
+    data: ReportData, summary: xr.Dataset, dims: Iterable[str], caption: str,
+    columns: Sequence[Column], counted: str = "looked_for",
+) -> Table:
+    """Return the table of an analysis (configuration, *dims), with 95 % intervals."""
+    dims = list(dims)
+    if summary.sizes[CONFIGURATION] > 1 or not dims:
+        dims = [CONFIGURATION, *dims]
+    else:
+        summary = summary.isel({CONFIGURATION: 0})
+    return table_of(summary, f"{caption}, with 95 % intervals", dims, columns, data.results,
+                    counted=counted)
 
-    Attributes
-    ----------
-    data
-        The store.
-    settings
-        The configurations.
-    summary
-        The analysis (configuration, *dims).
-    dims
-        Dimensions of the groups; the last one is along x.
-    notes
-        Sentences for the reader on bins and chosen values.
+
+def figure(
+    data: ReportData, summary: xr.Dataset, groups: Groups, name: str, title: str, text: str,
+    caption: str, columns: Sequence[Column], curves: Sequence[Column], *,
+    counted: str = "looked_for", by: str = "", covers: Sequence[str] = (),
+) -> Figure:
+    """Return a figure of `grouped`, the last of whose groups are along x.
+
+    Its caption also says what is pooled, and what is not drawn.
     """
-
-    data: ReportData
-    settings: Settings
-    summary: xr.Dataset
-    dims: tuple[str, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def several(self) -> bool:
-        """Whether there is more than one configuration."""
-        return self.summary.sizes[CONFIGURATION] > 1
-
-    def table(self, caption: str, columns: Sequence[Column], counted: str = "looked_for") -> Table:
-        """Return the table of all configurations, with 95 % intervals."""
-        summary = self.summary if self.several or not self.dims else (
-            self.summary.isel({CONFIGURATION: 0}))
-        named = [CONFIGURATION] if CONFIGURATION in summary.dims else []
-        return table_of(summary, f"{caption}, with 95 % intervals", [*named, *self.dims], columns,
-                        self.data.results, counted=counted)
-
-    def figure(
-        self, name: str, title: str, text: str, caption: str, columns: Sequence[Column],
-        curves: Sequence[Column], *, counted: str = "looked_for", by: str = "",
-        covers: Sequence[str] = (), marked: str = "",
-    ) -> Figure:
-        """Return a figure; its caption also says what is pooled, and what is not drawn."""
-        dims, count = self.dims, self.summary.sizes[CONFIGURATION]
-        if not by and (self.several or len(dims) > 1):
-            by = CONFIGURATION if self.several else self.data.label(dims[0])
-        order = best_first(self.data, self.settings)
-        cut = bool(dims) and count > MAX_LINES
-        names = self.summary[CONFIGURATION].values
-        return Figure(
-            name, title, sentences(
-                text,
-                f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
-                "over the whole grid; the table has all." if cut else "",
-                *self.notes, self.data.pooled(*dims, *self.settings.axes)),
-            self.table(caption, columns, counted), curves,
-            self.data.label(dims[-1]) if dims else "", by,
-            [str(names[k]) for k in order[:MAX_LINES]] if cut else (), marked, "", covers)
+    dims, count = list(groups), summary.sizes[CONFIGURATION]
+    if not by and (count > 1 or len(dims) > 1):
+        by = CONFIGURATION if count > 1 else data.label(dims[0])
+    return Figure(
+        name, title, sentences(
+            text,
+            f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
+            "over the whole grid; the table has all." if dims and count > MAX_LINES else "",
+            notes_of(data, groups), data.pooled(*dims, *configurations(data).axes)),
+        configuration_table(data, summary, dims, caption, columns, counted), curves,
+        data.label(dims[-1]) if dims else "", by, covers=covers)
 
 
-def grouped(
-    data: ReportData, analysis: Analysis, groups: Grouping | None = None,
-    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
-) -> Grouped:
-    """Return an analysis by configuration and groups.
-
-    ``stages`` are those whose settings make a difference: of the detection rate the detector's.
-    """
-    groups = groups or Grouping()
-    settings = settings_of(data, stages, without)
-    grouping = settings.grouping + groups
-    summary = settings.stacked(data.analysed(analysis, grouping))
-    return Grouped(data, settings, summary, groups.dims, grouping.notes)
-
-
-def along_axis(
-    data: ReportData, analysis: Analysis, along: str, stages: Sequence[Stage] = BOTH, *,
-    angles: bool = True,
-) -> Grouped:
-    """Return an analysis along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
-    axis = data.pipeline.axis(along)
-    groups = data.along(along, MAX_BINS if axis is None or axis.is_numeric else MAX_ROWS)
-    if angles and data.angle_axis and along != data.angle_axis:
-        several = len(settings_of(data, stages, (along,)).combinations) > 1
-        groups = data.along(data.angle_axis, MAX_ANGLE_PANELS if several else MAX_ANGLES,
-                            binned=not several) + groups
-    return grouped(data, analysis, groups, stages, (along,))
+def groups_along(
+    data: ReportData, along: str, stages: Sequence[Stage] = BOTH, *, angles: bool = True
+) -> Groups:
+    """Return the groups along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
+    groups = data.along(along, MAX_BINS)
+    if not (angles and data.angle_axis) or along == data.angle_axis:
+        return groups
+    # Angles are lines of one configuration, and panels of several.
+    compared = (*data.pipeline.experiment.target_axes, *data.pipeline.axes_of(*stages))
+    several = any(len(axis) > 1 and axis.name != along for axis in compared)
+    return {**data.along(data.angle_axis, MAX_ANGLE_PANELS if several else MAX_ANGLES), **groups}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -223,12 +180,14 @@ def along_axis(
 def _detection(data: ReportData) -> Figure | None:
     if data.size is None:
         return None
-    axis = data.size_axis
+    axis, stages = data.size_axis, (Stage.detection,)
     along = AREA if axis is None or data.length(axis) >= MIN_BINNED_SIZES else axis
     word = data.pipeline.target_word
     detected = f"the {word} is detected" + (", by at least one marker" * (word != "marker"))
-    return along_axis(data, detection_rate, along, (Stage.detection,)).figure(
-        "detection", f"Detection rate by {short_name(along)}",
+    groups = groups_along(data, along, stages)
+    return figure(
+        data, grouped(data, detection_rate, groups, stages), groups, "detection",
+        f"Detection rate by {short_name(along)}",
         f"Share of the poses looked for in which {detected}.", "Detection rate",
         (*RATES, Column("draws", "draws")), [DETECTED], covers=data.size_axes)
 
@@ -236,13 +195,14 @@ def _detection(data: ReportData) -> Figure | None:
 def _errors(data: ReportData) -> Figure | None:
     if data.size is None:
         return None
-    return along_axis(data, error_statistics, data.size).figure(
-        "errors", f"Errors of the pose by {short_name(data.size)}",
+    groups = groups_along(data, data.size)
+    return figure(
+        data, grouped(data, error_statistics, groups), groups, "errors",
+        f"Errors of the pose by {short_name(data.size)}",
         "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
         "relative to the true depth), and the solved poses that are nearer to the mirror of the "
         f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors",
-        (LOOKED_FOR, *ERRORS),
-        (*ERROR_CURVES, FLIPS), covers=data.size_axes)
+        (LOOKED_FOR, *ERRORS), (*ERROR_CURVES, FLIPS), covers=data.size_axes)
 
 
 def signed_error_statistics(
@@ -252,18 +212,17 @@ def signed_error_statistics(
     return error_statistics(results, per, bins, SIGNED_GROUPS)
 
 
-def signed_axis(data: ReportData) -> str | None:
-    """Return the axis along which bias is shown: of sizes, other numbers, or angles."""
-    along = course_of(data, data.per)[0]
-    return along if along not in (None, data.angle_axis) else data.size or data.angle_axis
-
-
 def _bias(data: ReportData) -> Figure | None:
-    along = signed_axis(data)
+    """Return the figure of bias along sizes, other numbers, or angles."""
+    along = course_of(data, data.per)[0]
+    if along in (None, data.angle_axis):
+        along = data.size or data.angle_axis
     if along is None:
         return None
-    return along_axis(data, signed_error_statistics, along, angles=False).figure(
-        "bias", f"Bias by {short_name(along)}",
+    groups = data.along(along, MAX_BINS)
+    return figure(
+        data, grouped(data, signed_error_statistics, groups), groups, "bias",
+        f"Bias by {short_name(along)}",
         "Mean error of the solved poses that are not flipped, estimated minus true: the range in "
         "percent of the true depth; x (right), y (down) and z (forward) of the "
         f"{data.pipeline.target_word}'s position in the camera's frame; yaw. The table also has "
@@ -280,11 +239,12 @@ def _configurations(data: ReportData) -> Figure | None:
     if not known.several:
         return None
     axes = {axis.name: axis for axis in data.pipeline.axes}
-    covers = [name for name, some in known.settings.axes.items()
+    covers = [name for name, some in known.axes.items()
               if len(some) == data.length(name)
               and (not axes[name].is_numeric or data.length(name) < MIN_DRAWN)]
-    return Grouped(data, known.settings, known.summary, (), known.settings.grouping.notes).figure(
-        "configurations", f"Configurations compared: {', '.join(known.settings.grouping.dims)}",
+    return figure(
+        data, known.summary, {}, "configurations",
+        f"Configurations compared: {', '.join(known.axes)}",
         "Share of the poses looked for that are solved, and the median errors, of each "
         "configuration; a pose that is not solved counts as an infinite error (right edge).",
         "Configurations", (LOOKED_FOR, *ERRORS), (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS),
@@ -305,26 +265,23 @@ def _outcomes(data: ReportData) -> Figure:
     names = [name for name in (data.size_axis, *data.scene_axes, data.size)
              if name is not None and name != IDS
              and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
-    axis = names[0] if names else None
-    found = grouped(data, failure_composition, data.along(axis, MAX_BARS) if axis else None)
-    counts = found.summary["count"].sum(
-        [name for name in found.summary["count"].dims if name != "outcome"])
-    count_of = {str(name): int(counts.sel(outcome=name)) for name in counts["outcome"].values}
+    groups = data.along(names[0], MAX_BARS) if names else {}
+    summary = grouped(data, failure_composition, groups)
+    counts = summary["count"].sum([name for name in summary["count"].dims if name != "outcome"])
+    count_of = {name: count for name, count in zip(
+        counts["outcome"].values.tolist(), counts.values.tolist(), strict=True) if count}
     excluded = outcomes(counted=False)
-    happened = [name for name, count in count_of.items() if count and name not in excluded]
-    left_out = ", ".join(f"{count_of[name]:,} {name}" for name in excluded if count_of.get(name))
-    total = found.summary["count"].where(found.summary["share"].notnull(), 0).sum("outcome")
-    summary = found.summary.sel(outcome=happened).assign(looked_for=total.broadcast_like(
-        found.summary["count"].sel(outcome=happened)).astype(int))
-    dims = ("outcome", *found.dims) if found.dims else ("outcome",)
-    shown = Grouped(data, found.settings, summary, dims, found.notes)
-    return shown.figure(
-        "failures", "Outcomes of the poses",
-        "Shares of the poses looked for" + (f", by {short_name(axis)}" if axis else "")
+    left_out = ", ".join(f"{count_of[name]:,} {name}" for name in excluded if name in count_of)
+    total = summary["count"].where(summary["share"].notnull(), 0).sum("outcome").astype(int)
+    happened = summary.sel(outcome=[name for name in count_of if name not in excluded])
+    share = Column("share, %", "share", 100)
+    return figure(
+        data, happened.assign(looked_for=total.broadcast_like(happened["count"])),
+        {"outcome": None, **groups}, "failures", "Outcomes of the poses",
+        "Shares of the poses looked for" + (f", by {short_name(names[0])}" if names else "")
         + ": solved, or the flag that says why not."
         + (f" Not counted in the shares: {left_out}." if left_out else ""),
-        "Outcomes", (LOOKED_FOR, Column("share, %", "share", 100)),
-        [Column("share, %", "share", 100)], by="outcome")
+        "Outcomes", (LOOKED_FOR, share), [share], by="outcome")
 
 
 # The place in the frame.
@@ -356,53 +313,49 @@ def _frame(data: ReportData) -> Figure | None:
     def over_frame(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
         return detection_rate(results.assign(place), per, bins)
 
-    return grouped(data, over_frame, Grouping(bins=tuple(
-        (name, (*np.linspace(0, 100, count + 1)[:-1].tolist(), float(np.nextafter(100, 101))))
-        for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS)))), (Stage.detection,)
-    ).figure(
-        "frame", "Detection by place in the frame",
+    cells = {name: (*np.linspace(0, 100, count + 1)[:-1].tolist(), float(np.nextafter(100, 101)))
+             for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS))}
+    return figure(
+        data, grouped(data, over_frame, cells, (Stage.detection,)), dict.fromkeys(cells), "frame",
+        "Detection by place in the frame",
         f"Detection rate by the place of the {data.pipeline.target_word}'s centre in the frame, "
         "in percent of its width and height from the top left corner.", "Detection rate by place",
         RATES, [DETECTED], by=data.label(DOWN))
 
 
 WEAKEST = 24
-"""Marker IDs that have a row of their own in the chart."""
+"""Marker IDs that have a row of their own in the figure."""
 
 
 def _ranking(data: ReportData) -> Figure | None:
+    """Return the weakest marker IDs of the first configuration's detector."""
     if data.length(IDS) < 2:
         return None
-    first, whose = first_detector(data)
-    summary = data.once("marker_ranking", lambda: marker_ranking(data.results.isel(first)))
+    known = configurations(data)
+    settings = {axis.name for axis in data.pipeline.axes_of(Stage.detection)} & known.axes.keys()
+    index = {name: known.axes[name][k] for name, k in known.combinations[0].items()
+             if name in settings}
+    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
+    whose = f": {configuration_label(used_settings(data.pipeline, values))}" if index else ""
+    summary = data.once("marker_ranking", lambda: marker_ranking(data.results.isel(index)))
     dims = [name for name in ("dictionary", IDS) if name in summary["detection_rate"].dims]
     ranked = summary.stack(marker=dims, create_index=False)
-    ranked = ranked.isel(marker=np.flatnonzero(ranked["looked_for"].values > 0))
+    ranked = ranked.isel(marker=ranked["looked_for"].values > 0)
     ranked = ranked.isel(marker=np.lexsort(
         (ranked[IDS].values, ranked["detection_rate"].values, ~ranked["weak"].values)))
-    names = [" ".join(str(ranked[dim].values[k]) for dim in dims)
-             for k in range(ranked.sizes["marker"])]
+    names = [" ".join(map(str, each)) for each in zip(
+        *(ranked[dim].values.tolist() for dim in dims), strict=True)]
     columns = (*RATES, Column("expected, %", "expected_rate", 100),
                Column("p, adjusted", "p_adjusted"), Column("weak", "weak"))
     table = table_of(ranked.assign_coords(marker=names), "IDs by detection rate, with 95 % "
                      "intervals", ["marker"], columns)
     return Figure(
-        "ranking", "Marker IDs, the weakest first" + (f": {whose}" if whose else ""), sentences(
+        "ranking", f"Marker IDs, the weakest first{whose}", sentences(
             f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. "
             f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
             "rate expected if all were alike, with an adjusted p-value under 0.05.",
             data.pooled(*dims)),
-        table, [DETECTED], shown=names[:WEAKEST], marked="weak", covers=(IDS,))
-
-
-def first_detector(data: ReportData) -> tuple[dict[str, int], str]:
-    """Return the detector's settings of the first configuration in order, and their label."""
-    known = configurations(data)
-    best = known.settings.combinations[known.order[0]]
-    names = {axis.name for axis in data.pipeline.axes_of(Stage.detection)}
-    index = {name: k for name, k in best.items() if name in names}
-    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
-    return index, configuration_label(used_settings(data.pipeline, values)) if index else ""
+        table, [DETECTED], rows=WEAKEST, marked="weak", covers=(IDS,))
 
 
 SIZE_COLUMNS = 12
@@ -425,10 +378,10 @@ def _bound(data: ReportData) -> Figure | None:
             {"any": data.results["bound"].isin(present_values(BoundStatus)).any()}))["any"]):
         return None
     along = data.size_axis or data.angle_axis
-    return grouped(
-        data, error_over_bound, data.along(along, SIZE_COLUMNS) if along else None
-    ).figure(
-        "bound", "Errors relative to the accuracy bound",
+    groups = data.along(along, SIZE_COLUMNS) if along else {}
+    return figure(
+        data, grouped(data, error_over_bound, groups), groups, "bound",
+        "Errors relative to the accuracy bound",
         "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not flipped "
         "and have a bound: 1 (dashed) is the best that an unbiased estimator can reach.",
         "RMSE over the bound", BOUND_CURVES, BOUND_CURVES)
@@ -444,16 +397,6 @@ FRONTAL_DEG = 5.0
 
 CONDITIONS = 8
 """The most sizes, or angles, that are told apart."""
-
-ANSWERS = {
-    ThresholdChoice.not_run: "no pose",
-    ThresholdChoice.found: "yes",
-    ThresholdChoice.not_needed: "not needed",
-    ThresholdChoice.too_few_draws: "too few draws to tell",
-    ThresholdChoice.none: "no threshold does",
-    ThresholdChoice.nothing_drawn: "nothing was drawn",
-}
-"""What the choice says, in the table."""
 
 KEPT = (Column("poses kept, % of the solved", "kept_rate", 100),
         Column("flips kept, % of the flips", "flips_kept_rate", 100))
@@ -477,7 +420,7 @@ def _ambiguity(data: ReportData) -> Figure | None:
             "largest angle", data.results[["viewing_angle_deg"]].max
     )["viewing_angle_deg"] > FRONTAL_DEG:
         return None
-    pooled = grouped(data, ambiguity).summary
+    pooled = grouped(data, ambiguity)
     curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values
                             & (pooled["flipped"] > 0).values)
     if not curved.size:
@@ -502,20 +445,15 @@ def threshold_tables(data: ReportData) -> list[Table]:
     if _ambiguity(data) is None:
         return []
     along = data.size or data.angle_axis
-    grouping = data.along(along, CONDITIONS) if along else Grouping()
-    table = grouped(data, ambiguity, grouping).summary
-    usual = {f"{column.variable}{end}": table[f"{column.variable}{end}"].sel(
-                 threshold=USUAL, drop=True)
-             for column in KEPT_AT_USUAL for end in ("", "_low", "_high")
-             if f"{column.variable}{end}" in table
-             and "threshold" in table[f"{column.variable}{end}"].dims}
-    words = xr.apply_ufunc(np.vectorize(
-        lambda flag: ANSWERS[ThresholdChoice(int(flag))], otypes=[object]), table["choice"])
+    groups = data.along(along, CONDITIONS) if along else {}
+    table = grouped(data, ambiguity, groups)
+    words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
+    choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
     wanted = 100 * float(table.attrs["flip_rate"])
     return [table_of(
-        table.assign(usual).assign(choice=words),
+        table.sel(threshold=USUAL, drop=True).assign(choice=choice),
         f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
-        [CONFIGURATION, *grouping.dims], KEPT_AT_USUAL, data.results)]
+        [CONFIGURATION, *groups], KEPT_AT_USUAL, data.results)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -542,8 +480,10 @@ def _effect(data: ReportData, name: str) -> Figure:
     """Return the figure of rates and errors along an axis or a drawn parameter."""
     axis = data.pipeline.axis(name)
     meaning = data.pipeline.parameters[name].meaning if axis is None else axis.meaning
-    return along_axis(data, error_statistics, name, angles=False).figure(
-        f"effect-{name}", f"The effect of {name}",
+    groups = data.along(name, MAX_BINS)
+    return figure(
+        data, grouped(data, error_statistics, groups), groups, f"effect-{name}",
+        f"The effect of {name}",
         "Detection rate, median and 95 % quantile (p95) of rotation and range error, and signed "
         f"mean of the range error (bias), by {name} ({meaning}). {INFINITE_ERRORS}", f"By {name}",
         (*RATES, *ERRORS), [DETECTED, *ERROR_CURVES, RANGE_BIAS])
@@ -579,7 +519,8 @@ def board_tables(data: ReportData) -> list[Table]:
 
 def signed_errors_table(data: ReportData) -> Table:
     """Return bias and spread in the camera's frame, with a row for each configuration."""
-    return grouped(data, signed_error_statistics).table(
+    return configuration_table(
+        data, grouped(data, signed_error_statistics), (),
         "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved")
 
 
@@ -609,21 +550,15 @@ def precision_tables(data: ReportData) -> list[Table]:
 
 def precision_table(table: xr.Dataset) -> Table:
     """Return a row for each quantity and configuration of `sweep.analysis.precision_reached`."""
-    configuration = table.attrs["configuration_dims"]
-    first = table["run"].isel(dict.fromkeys(configuration, 0)).values
-    rows = []
-    for k, name in enumerate(table["quantity"].values):
-        one = table.isel(quantity=k)
-        for at, part in each_cell(one, configuration):
-            half = part["half_width"].where(part["reached"].isin(
-                (Reached.reached, Reached.not_reached)))
-            rows.append([
-                str(name), " · ".join(map(str, at.values())) or "all",
-                Value(float(one["wanted"])), Value(float(half.max())),
-                *(int((part["reached"] == flag).sum()) for flag in Reached)])
-    return Table.of(
-        f"Precision of {first.size:,} conditions, which took {int(first.min()):,} to "
-        f"{int(first.max()):,} poses each: conditions by what was reached; of rates the "
+    kept = ["quantity", *table.attrs["configuration_dims"]]
+    reached, run = table["reached"], table["run"].isel(dict.fromkeys(kept[1:], 0)).values
+    pooled = [dim for dim in reached.dims if dim not in kept]
+    known = reached.isin((Reached.reached, Reached.not_reached))
+    counts = {each.name: (reached == each).sum(pooled) for each in Reached}
+    return table_of(
+        xr.Dataset({"wanted": table["wanted"].broadcast_like(counts["reached"]),
+                    "widest": table["half_width"].where(known).max(pooled), **counts}),
+        f"Precision of {run.size:,} conditions, which took {int(run.min()):,} to "
+        f"{int(run.max()):,} poses each: conditions by what was reached; of rates the "
         "half-width of the interval, of others relative to the value (bias: to the RMSE)",
-        ["quantity", "configuration", "wanted", "widest",
-         *(each.name.replace("_", " ") for each in Reached)], rows, stub=2)
+        kept, [Column(name.replace("_", " "), name) for name in ("wanted", "widest", *counts)])

@@ -51,52 +51,15 @@ DRAWN_BINS = 10
 """Bins of the area, and of a drawn parameter."""
 
 
-@dataclass(frozen=True, slots=True)
-class Grouping:
-    """How the poses are grouped.
-
-    Attributes
-    ----------
-    per
-        Axes whose values are groups.
-    bins
-        Axes, or the area, with the edges of bins that are groups.
-    chosen
-        Axes of which only the values at these indices are kept.
-    notes
-        Sentences for the reader about bins and chosen values.
-    """
-
-    per: tuple[str, ...] = ()
-    bins: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    chosen: tuple[tuple[str, tuple[int, ...]], ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def dims(self) -> tuple[str, ...]:
-        """Dimensions of an analysis of these groups."""
-        return self.per + tuple(name for name, _ in self.bins)
-
-    def __add__(self, other: Grouping) -> Grouping:
-        return Grouping(
-            self.per + other.per, self.bins + other.bins, self.chosen + other.chosen,
-            self.notes + other.notes,
-        )
+Groups = Mapping[str, tuple[float, ...] | None]
+"""Axis, area or drawn parameter -> edges of the bins that are groups; None: each value is one."""
 
 
-def bins_of(name: str, values: Floats, most: int) -> Grouping:
-    """Return the grouping of values (n,) into ``most`` bins of about as many each, none empty."""
+def bins_of(values: Floats, most: int) -> tuple[float, ...]:
+    """Return edges of bins of values (n,), of about as many each: at most so many, none empty."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
     edges[-1] = np.nextafter(edges[-1], np.inf)
-    note = f"Values of {name} are grouped into {len(edges) - 1} bins of about as many each."
-    return Grouping(bins=((name, tuple(edges.tolist())),), notes=(note,))
-
-
-def chosen_of(name: str, length: int, most: int) -> Grouping:
-    """Return the grouping by ``most`` of the ``length`` values of an axis, evenly spaced."""
-    chosen = tuple(np.linspace(0, length - 1, most).round().astype(int).tolist())
-    note = f"{most} of the {length:,} values of {name} are shown."
-    return Grouping((name,), chosen=((name, chosen),), notes=(note,))
+    return tuple(edges.tolist())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -245,13 +208,12 @@ class ReportData:
         """Return an axis' name with its unit, as on the axes of charts: ``distance, m``."""
         return axis_label(self.results, name)
 
-    # Groupings.
+    # Groups of poses.
 
-    def along(self, name: str, most: int = 40, *, binned: bool = True) -> Grouping:
-        """Return the grouping by an axis into at most ``most`` groups, or by bins of the area.
+    def along(self, name: str, most: int = 40) -> Groups:
+        """Return the groups along an axis, the area, or a drawn parameter.
 
-        The draws of a parameter are binned, too. If an axis is longer, its values are binned if
-        they are numeric and ``binned`` is set; otherwise some of them are chosen.
+        A longer axis of numbers is binned, as the area and draws are.
 
         Raises
         ------
@@ -259,17 +221,16 @@ class ReportData:
             If the axis does not exist.
         """
         if name == AREA:
-            return bins_of(name, self.areas, DRAWN_BINS)
+            return {name: bins_of(self.areas, DRAWN_BINS)}
+        values = self.results[name]
         if name in self.drawn_parameters:
-            return bins_of(name, np.ravel(self.results[name]).astype(np.float64), DRAWN_BINS)
+            return {name: bins_of(np.ravel(values).astype(np.float64), DRAWN_BINS)}
         axis = self.pipeline.axis(name)
         if axis is None:
             raise KeyError(name)
-        if len(axis) <= most:
-            return Grouping((name,))
-        if binned and axis.is_numeric:
-            return bins_of(name, np.asarray(self.results[name].values, dtype=np.float64), most)
-        return chosen_of(name, len(axis), most)
+        if len(axis) <= most or not axis.is_numeric:
+            return {name: None}
+        return {name: bins_of(values.values.astype(np.float64), most)}
 
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
@@ -280,30 +241,6 @@ class ReportData:
         return f"Pooled over {', '.join(names)}." if names else ""
 
     # Analyses.
-
-    def analysed(self, analysis: Analysis, grouping: Grouping | None = None) -> xr.Dataset:
-        """Return the result of an analysis, loaded; each is computed once.
-
-        Parameters
-        ----------
-        analysis
-            A function of `sweep.analysis` that takes results, per and bins.
-        grouping
-            Its groups are the first dimensions of the result, in this order.
-
-        Raises
-        ------
-        StoreError
-            If the store cannot be read.
-        """
-        grouping = grouping or Grouping()
-
-        def compute() -> xr.Dataset:
-            results = self.results.isel({name: list(some) for name, some in grouping.chosen})
-            return analysis(results, per=grouping.per, bins=dict(grouping.bins))
-
-        key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
-        return self.once(key, compute).transpose(*grouping.dims, ...)
 
     def once(self, key: Any, make: Callable[[], T]) -> T:
         """Return what ``make`` returns, a dataset loaded; it is called once for each key."""
@@ -393,10 +330,10 @@ def read_report_data(
 
 
 # --------------------------------------------------------------------------------------------------
-# The configurations of a store, their order, and the beliefs that are not the truth.
+# The configurations of a store, the best first, and the beliefs that are not the truth.
 #
-# A configuration is a combination of detector and estimator settings. They are compared, never
-# pooled; of a store with very many some are chosen.
+# A configuration is a combination of detector and estimator settings, and of targets. They are
+# compared, never pooled; of a store with very many some are chosen.
 
 MAX_CONFIGURATIONS = 30
 """Configurations that a table or a figure of all of them compares."""
@@ -404,96 +341,34 @@ MAX_CONFIGURATIONS = 30
 BOTH = (Stage.detection, Stage.estimation)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Combinations of the values of some axes of settings and targets.
+@dataclass(frozen=True, eq=False)
+class Configurations:
+    """The n configurations that a report compares, the best first.
+
+    Right beliefs stand first, of these the highest detection and solved rate, then the smallest
+    RMSE of rotation and range.
 
     Attributes
     ----------
     axes
-        Axis -> indices of its values.
-    grouping
-        Of analyses that keep them apart.
-    kept
-        Which of all combinations, the last axis fastest, are configurations of their own: the first
-        of those that differ in settings alone which they do not use.
+        Axis that tells them apart -> indices of the values that are compared.
+    combinations
+        Of each configuration, its place among these indices, by axis. Of those that differ only in
+        settings that they do not use there is one.
     names
-        The labels of those.
-    """
-
-    axes: dict[str, tuple[int, ...]]
-    grouping: Grouping
-    kept: tuple[int, ...]
-    names: tuple[str, ...]
-
-    @property
-    def combinations(self) -> list[dict[str, int]]:
-        """The index along each axis, of every configuration; one that is empty without axes."""
-        every = list(itertools.product(*self.axes.values()))
-        return [dict(zip(self.axes, every[k], strict=True)) for k in self.kept]
-
-    def stacked(self, table: xr.Dataset) -> xr.Dataset:
-        """Return a table by these axes with the dimension ``configuration`` in their place."""
-        dims = list(self.axes)
-        flat = table.stack({CONFIGURATION: dims}, create_index=False) if dims else (
-            table.expand_dims(CONFIGURATION))
-        flat = flat.isel({CONFIGURATION: list(self.kept)}).drop_vars(dims, errors="ignore")
-        named = flat.assign_coords({CONFIGURATION: list(self.names)})
-        return named.transpose(CONFIGURATION, ...).assign_attrs(table.attrs)
-
-
-def settings_of(
-    data: ReportData, stages: Sequence[Stage] = BOTH, without: Sequence[str] = (), *,
-    scene: Sequence[Axis] | None = None,
-) -> Settings:
-    """Return the combinations of the settings of some stages, and of axes of the scene.
-
-    If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
-    spaced. ``without`` are axes that are left out, since a figure is along them. ``scene`` are
-    those of targets by default.
-    """
-    scene = data.pipeline.experiment.target_axes if scene is None else scene
-    chosen = {axis.name: len(axis) for axis in (*scene, *data.pipeline.axes_of(*stages))
-              if len(axis) > 1 and axis.name not in without}
-    while math.prod(chosen.values()) > MAX_CONFIGURATIONS and max(chosen.values()) > 2:
-        chosen[max(chosen, key=lambda name: chosen[name])] -= 1
-    axes, grouping = {}, Grouping()
-    for name, length in chosen.items():
-        part = data.along(name, length, binned=False)
-        axes[name] = dict(part.chosen).get(name, tuple(range(length)))
-        grouping += part
-    values = [[data.results[name].values.tolist()[k] for k in some] for name, some in axes.items()]
-    every = [dict(zip(axes, each, strict=True)) for each in itertools.product(*values)]
-    kept = distinct(data.pipeline, every)
-    names = (configuration_label(used_settings(data.pipeline, every[k])) for k in kept)
-    return Settings(axes, grouping, tuple(kept), tuple(names))
-
-
-@dataclass(frozen=True, eq=False)
-class Configurations:
-    """The configurations that a report compares.
-
-    Attributes
-    ----------
-    settings
-        What tells them apart.
-    names
-        Their n labels.
+        Labels.
     wrong
         (n,) whether the estimator believes what is known not to be true; nowhere if that holds for
         all of them.
     summary
         `sweep.analysis.error_statistics` by configuration (n,).
-    order
-        (n,) indices: right beliefs first, of these by detection and solved rate, then by the RMSE
-        of rotation and range.
     """
 
-    settings: Settings
+    axes: Mapping[str, list[int]]
+    combinations: list[dict[str, int]]
     names: list[str]
     wrong: NDArray[np.bool_]
     summary: xr.Dataset
-    order: tuple[int, ...]
 
     @property
     def several(self) -> bool:
@@ -501,49 +376,111 @@ class Configurations:
         return len(self.names) > 1
 
 
-def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
-    """Return the configurations of a store, in order, by targets, too, or with them pooled.
+def stacked(
+    table: xr.Dataset, combinations: Sequence[Mapping[str, int]], names: Sequence[str]
+) -> xr.Dataset:
+    """Return a table by axes with the dimension ``configuration`` in their place."""
+    points = {axis: xr.DataArray([each[axis] for each in combinations], dims=CONFIGURATION)
+              for axis in combinations[0]}
+    flat = table.isel(points) if points else table.expand_dims(CONFIGURATION)
+    flat = flat.drop_vars([*points], errors="ignore")
+    return flat.assign_coords({CONFIGURATION: list(names)}).transpose(CONFIGURATION, ...)
 
-    Of a store with neither settings nor targets to compare, by the values of its effects.
+
+def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
+    """Return the configurations of a store, by targets, too, or with them pooled.
+
+    If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
+    spaced. Of a store with neither settings nor targets to compare, by the values of its effects.
     """
     return data.once(
         ("configurations", targets), lambda: _configurations(data, targets=targets))
 
 
 def _configurations(data: ReportData, *, targets: bool) -> Configurations:
-    settings = settings_of(data, scene=data.pipeline.experiment.target_axes if targets else ())
-    if targets and not settings.axes:
+    settings = [axis for axis in data.pipeline.axes_of(*BOTH) if len(axis) > 1]
+    several = [*(data.pipeline.experiment.target_axes if targets else ()), *settings]
+    if targets and not several:
         # Nothing else varies on the same draws: the values of an effect are what is compared.
-        settings = settings_of(data, scene=data.effect_axes)
-    summary = settings.stacked(data.analysed(error_statistics, settings.grouping))
-    axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
-    flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
-        [len(axis) for axis in axes])
-    flags = flags[np.ix_(*(settings.axes[axis.name] for axis in axes))] if axes else flags
-    lengths = [len(some) for some in settings.axes.values()]  # those of targets stand first
-    wrong = np.broadcast_to(flags, lengths).reshape(-1)[list(settings.kept)]
-    names = [name + WRONG * bool(flag) for name, flag in zip(settings.names, wrong, strict=True)]
+        several = list(data.effect_axes)
+    counts = {axis.name: len(axis) for axis in several}
+    while math.prod(counts.values()) > MAX_CONFIGURATIONS and max(counts.values()) > 2:
+        counts[max(counts, key=counts.__getitem__)] -= 1
+    axes = {axis.name: np.linspace(0, len(axis) - 1, counts[axis.name]).round().astype(int).tolist()
+            for axis in several}
+    every = [dict(zip(axes, index, strict=True))
+             for index in itertools.product(*map(range, counts.values()))]
+    kept, labels = _labelled(data, axes, every)
+    table = data.once(("errors", *axes), lambda: error_statistics(
+        data.results.isel(axes), per=list(axes)))
+    summary = stacked(table, kept, labels)
+    flags = np.reshape(wrong_configurations(data.pipeline, settings), list(map(len, settings)))
+    wrong = np.array([flags[tuple(axes[axis.name][each[axis.name]] for axis in settings)]
+                      for each in kept])
+    names = [label + WRONG * bool(flag) for label, flag in zip(labels, wrong, strict=True)]
 
     def column(name: str, missing: float) -> NDArray[np.float64]:
-        values = summary[name].values.astype(np.float64)
-        return np.where(np.isnan(values), missing, values)
+        return np.asarray(summary[name].fillna(missing), dtype=np.float64)
 
     order = np.lexsort((
         column("range_rmse_percent", np.inf), column("rotation_rmse_deg", np.inf),
-        -column("solved_rate", -1.0), -column("detection_rate", -1.0), wrong))
+        -column("solved_rate", -1.0), -column("detection_rate", -1.0), wrong)).tolist()
     return Configurations(
-        settings, names, wrong, summary.assign_coords({CONFIGURATION: names}),
-        tuple(order.tolist()))
+        axes, [kept[k] for k in order], [names[k] for k in order], wrong[order],
+        summary.assign_coords({CONFIGURATION: names}).isel({CONFIGURATION: order}))
 
 
-def best_first(data: ReportData, settings: Settings) -> list[int]:
-    """Return the combinations of some settings in the order of their best configurations."""
-    known = configurations(data)
-    ordered = [known.settings.combinations[k] for k in known.order]
+def _labelled(
+    data: ReportData, axes: Mapping[str, list[int]], combinations: list[dict[str, int]]
+) -> tuple[list[dict[str, int]], list[str]]:
+    """Return the combinations that differ in settings that they use, and their labels."""
+    values = {name: data.results[name].values[some].tolist() for name, some in axes.items()}
+    every = [{name: values[name][k] for name, k in each.items()} for each in combinations]
+    kept = distinct(data.pipeline, every)
+    return [combinations[k] for k in kept], [
+        configuration_label(used_settings(data.pipeline, every[k])) for k in kept]
 
-    def rank_of(each: dict[str, int]) -> int:
-        return next((rank for rank, one in enumerate(ordered) if each.items() <= one.items()),
-                    len(ordered))
 
-    ranks = [rank_of(each) for each in settings.combinations]
-    return sorted(range(len(ranks)), key=lambda k: (ranks[k], k))
+def grouped(
+    data: ReportData, analysis: Analysis, groups: Groups | None = None,
+    stages: Sequence[Stage] = BOTH,
+) -> xr.Dataset:
+    """Return an analysis by configuration and groups of poses, loaded; each is computed once.
+
+    Parameters
+    ----------
+    data
+        The store.
+    analysis
+        A function of `sweep.analysis` that takes results, per and bins.
+    groups
+        Its groups are dimensions of the result behind the configurations, in this order.
+    stages
+        Those whose settings make a difference: of the detection rate the detector's.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    """
+    known, groups = configurations(data), groups or {}
+    compared = {axis.name for axis in (
+        *data.pipeline.experiment.target_axes, *data.pipeline.axes_of(*stages))} - groups.keys()
+    axes = {name: some for name, some in known.axes.items() if name in compared}
+    places = dict.fromkeys(tuple(each[name] for name in axes) for each in known.combinations)
+    kept, labels = _labelled(data, axes, [dict(zip(axes, each, strict=True)) for each in places])
+    per = [*axes, *(name for name, edges in groups.items() if edges is None)]
+    bins = {name: edges for name, edges in groups.items() if edges is not None}
+    table = data.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
+        data.results.isel(axes), per=per, bins=bins))
+    return stacked(table, kept, labels).transpose(CONFIGURATION, *groups, ...)
+
+
+def notes_of(data: ReportData, groups: Groups) -> str:
+    """Return sentences for the reader about bins, and configurations that are left out."""
+    return " ".join([*(
+        f"{len(some)} of the {data.length(name):,} values of {name} are shown."
+        for name, some in configurations(data).axes.items()
+        if len(some) < data.length(name) and name not in groups), *(
+        f"Values of {name} are grouped into {len(edges) - 1} bins of about as many each."
+        for name, edges in groups.items() if edges is not None)])

@@ -158,9 +158,7 @@ def test_no_configuration_is_named_that_another_one_is_better_than_if_there_is_o
                 for k, verdict in enumerate(matrix[best].tolist())]
 
     names = [f"c{k}" for k in range(count)]
-    known = Configurations(
-        SimpleNamespace(combinations=[{}] * count, grouping=None), names,
-        np.zeros(count, bool), None, tuple(range(count)))
+    known = Configurations({}, [{}] * count, names, np.zeros(count, bool), None)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparisons, "_against_each", against)
         patch.setattr(comparisons, "configurations", lambda *_, **__: known)

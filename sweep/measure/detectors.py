@@ -18,7 +18,7 @@ from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.declared import PluginSetting
-from sweep.plugins.loading import call, real_numbers
+from sweep.plugins.loading import call, made, real_numbers
 from sweep.plugins.recording import is_recording
 from sweep.typing import Floats, Integers
 
@@ -390,7 +390,7 @@ class PluggedDetector:
         self._name = name
         self._record = record
         self._settings = settings
-        self._searches: dict[str, Callable[[NDArray[np.uint8]], Any]] = {}
+        self._search = lru_cache(maxsize=64)(self._new_search)
 
     def find(
         self, image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG002
@@ -400,87 +400,47 @@ class PluggedDetector:
         Raises
         ------
         PluginError
-            If the plug-in raises, or returns what cannot be a detection; in one line.
+            If the plug-in lacks the dictionary, cannot be made, raises, or returns what cannot be a
+            detection; in one line.
         """
-        search = self._searches.get(dictionary) or self.make(dictionary)
+        search = self._search(dictionary)
         own = np.array(image, order="C")  # what it does to its image reaches nobody else
         returned = call(self._name, search, own)
         if not np.array_equal(own, image):
             raise PluginError(f"{self._name}: changed the image that it was given; copy it first")
-        return self._checked(returned)
+        if not isinstance(returned, tuple) or len(returned) not in (2, 3):
+            raise PluginError(
+                f"{self._name}: returned a {type(returned).__name__}; expected a tuple "
+                "(corners, ids), or with rejected quadrilaterals as the third"
+            )
+        corners, ids, *rest = returned
+        quads = self._quadrilaterals("corners", corners)
+        rejected = list(self._quadrilaterals("rejected", rest[0] if rest else ())[:, None])
+        numbers = real_numbers(self._name, "ids", ids, (len(quads),), whole=True)
+        if (numbers < 0).any():
+            raise PluginError(
+                f"{self._name}: returned the ID {numbers.min()}; expected at least 0")
+        return list(quads[:, None]), numbers if len(quads) else None, rejected
 
-    def make(self, dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
-        """Return the plug-in's search for markers of a dictionary, made once.
-
-        Raises
-        ------
-        PluginError
-            If it does not have the dictionary, or cannot be made; in one line.
-        """
+    def _new_search(self, dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
+        """Return the plug-in's search for markers of a dictionary."""
         families = self._record.families
         if families is not None and dictionary not in families:
             raise PluginError(
                 f"{self._name}: no dictionary {dictionary}; it has {', '.join(families)}"
             )
         family = dictionary if families is None else families[dictionary]
-        search = call(self._name, self._record.make, self._settings, family)
-        if not callable(search):
-            raise PluginError(
-                f"{self._name}: make returns a {type(search).__name__}, not a function"
-            )
-        made: Callable[[NDArray[np.uint8]], Any] = search
-        self._searches[dictionary] = made
-        return made
-
-    def _checked(self, returned: Any) -> DetectorOutput:
-        """Return what a plug-in returned in our conventions."""
-        if not isinstance(returned, tuple) or len(returned) not in (2, 3):
-            raise PluginError(
-                f"{self._name}: returned a {type(returned).__name__}; expected a tuple "
-                "(corners, ids), or with rejected quadrilaterals as the third"
-            )
-        corners = self._quadrilaterals("corners", returned[0])
-        rejected = self._quadrilaterals("rejected", returned[2] if len(returned) > 2 else ())
-        try:
-            ids = np.asarray(returned[1])
-        except Exception:
-            raise PluginError(f"{self._name}: returned ids that are no array") from None
-        if ids.size == 0 and len(corners) == 0:
-            return [], None, list(rejected[:, None])
-        if ids.shape != (len(corners),):
-            raise PluginError(
-                f"{self._name}: returned ids of shape {ids.shape}; expected ({len(corners)},), "
-                "one of each marker"
-            )
-        if ids.dtype.kind not in "iu":
-            raise PluginError(
-                f"{self._name}: returned ids of type {ids.dtype}; expected whole numbers"
-            )
-        if np.ma.is_masked(returned[1]):
-            raise PluginError(f"{self._name}: returned ids of which some are masked")
-        if (ids > np.iinfo(np.int64).max).any():
-            raise PluginError(f"{self._name}: returned the ID {ids.max()}; expected below 2^63")
-        if (ids < 0).any():
-            raise PluginError(f"{self._name}: returned the ID {ids.min()}; expected at least 0")
-        return list(corners[:, None]), ids.astype(np.int64), list(rejected[:, None])
+        return made(self._name, self._record.make, self._settings, family)
 
     def _quadrilaterals(self, what: str, returned: Any) -> Floats:
         """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""
-        quads = real_numbers(self._name, what, returned)
-        if quads.size == 0 and quads.shape[:1] in ((0,), (1,)):
-            return np.empty((0, 4, 2))
-        if quads.ndim != 3 or quads.shape[1:] != (4, 2):
-            raise PluginError(
-                f"{self._name}: returned {what} of shape {quads.shape}; expected (n, 4, 2)"
-            )
+        quads = real_numbers(self._name, what, returned, (-1, 4, 2), finite=True)
         if len(quads) > MAX_MARKERS:
             raise PluginError(
                 f"{self._name}: returned {len(quads):,} {what} for one image; expected at most "
                 f"{MAX_MARKERS:,}"
             )
-        if not np.isfinite(quads).all():
-            raise PluginError(f"{self._name}: returned {what} that are not finite")
-        return quads[:, self._record.corner_order] - self._record.pixel_center
+        return np.asarray(quads[:, self._record.corner_order] - self._record.pixel_center)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -23,8 +23,7 @@ from sweep.measure.solver import OPENCV_SOLVERS, Solver
 from sweep.model.lens import COUNTS
 from sweep.plugins import EstimatorPlugin, Poses
 from sweep.plugins.declared import PluginSetting
-from sweep.plugins.loading import call, real_numbers
-from sweep.typing import Floats
+from sweep.plugins.loading import call, made, real_numbers
 
 # --------------------------------------------------------------------------------------------------
 # A plug-in's solver: what it returns is checked as our own solvers' poses are.
@@ -59,11 +58,7 @@ class PluggedEstimator:
         self._limit = reprojection_limit
         self._noise_px = corner_noise_px
         self.needs_images = record.needs_images
-        self._solve = call(name, record.make, settings)
-        if not callable(self._solve):
-            raise PluginError(
-                f"{name}: make returns a {type(self._solve).__name__}, not a function"
-            )
+        self._solve = made(name, record.make, settings)
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses that the plug-in finds, those that are credible.
@@ -100,34 +95,21 @@ class PluggedEstimator:
             raise PluginError(
                 f"{self._name}: returned half an alternative; expected its rotation and translation"
             )
-        arrays = {
-            name: None if value is None else self._array(name, value, (count, *shape))
-            for (name, value), shape in zip(
-                given._asdict().items(), ((3, 3), (3,), (6, 6), (3, 3), (3,)), strict=True
-            )
-        }
-        for name in ("rotation", "alternative_rotation"):
-            if (matrices := arrays[name]) is not None:
-                self._check_rotations(name, matrices)
+        shapes, arrays = ((3, 3), (3,), (6, 6), (3, 3), (3,)), {}
+        for (name, value), shape in zip(given._asdict().items(), shapes, strict=True):
+            if value is not None:
+                array = real_numbers(self._name, f"a {name}", value, (count, *shape))
+                array[~np.isfinite(array).reshape(count, -1).all(axis=1)] = np.nan
+                arrays[name] = array
+        for name in arrays.keys() & {"rotation", "alternative_rotation"}:
+            known = arrays[name][~np.isnan(arrays[name][:, 0, 0])]
+            gram = np.swapaxes(known, 1, 2) @ known
+            off = np.abs(gram - np.eye(3)).max(initial=0.0)
+            if off > ROTATION_ATOL or (np.linalg.det(known) < 0).any():
+                raise PluginError(
+                    f"{self._name}: returned a {name} that is no rotation matrix ({off:.2g} off)"
+                )
         return Poses(**arrays)
-
-    def _array(self, name: str, value: Any, shape: tuple[int, ...]) -> Floats:
-        array = real_numbers(self._name, f"values of {name}", value)
-        if array.shape != shape:
-            raise PluginError(
-                f"{self._name}: returned a {name} of shape {array.shape}; expected {shape}"
-            )
-        array[~np.isfinite(array).reshape(len(array), -1).all(axis=1)] = np.nan
-        return array
-
-    def _check_rotations(self, name: str, matrices: Floats) -> None:
-        known = matrices[~np.isnan(matrices[:, 0, 0])]
-        gram = np.swapaxes(known, 1, 2) @ known
-        off = np.abs(gram - np.eye(3)).max(initial=0.0)
-        if off > ROTATION_ATOL or (np.linalg.det(known) < 0).any():
-            raise PluginError(
-                f"{self._name}: returned a {name} that is no rotation matrix ({off:.2g} off)"
-            )
 
 
 # --------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,29 +25,6 @@ from sweep.plugins import Poses
 from sweep.plugins.declared import PluginSetting
 from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers
-
-
-class DetectionSource(Protocol):
-    """Where the detections of N scenes with one setting come from.
-
-    One that needs images gets them in windows; else its pixels are those of the frame.
-    """
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether scenes are rendered for it."""
-        ...
-
-    def __call__(self, row: int, image: Grey) -> SearchOutput:
-        """Return what is found in the image of scene ``row``."""
-        ...
-
-    def poses(self, found: Findings) -> Poses:
-        """Return the poses (N, 3, 3), (N, 3) in metres that come with what was found.
-
-        NaN where none does; None in the place of both if there never are any.
-        """
-        ...
 
 
 @dataclass(slots=True)
@@ -170,6 +146,15 @@ class RecordedSearch:
         return (
             np.concatenate(quads), np.array(found, dtype=np.int64), np.array(rows, dtype=np.int64)
         )
+
+
+DetectionSource = ImageSearch | RecordedSearch
+"""Where the detections of N scenes with one setting come from.
+
+One that needs images gets them in windows; else its pixels are those of the frame. Its ``poses``
+are those (N, 3, 3), (N, 3) in metres that come with what was found: NaN where none does, None in
+the place of both if there never are any.
+"""
 
 
 def detection_source(

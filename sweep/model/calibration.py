@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import codecs
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
@@ -22,27 +21,43 @@ from sweep.typing import Floats
 # Cameras in the files of calibration programs: OpenCV, ROS, Kalibr, PhotonVision.
 #
 # All of them put pixel (0, 0) at the centre of the top left pixel and have OpenCV's lens model
-# (Kalibr's and ROS's names for it: radtan, plumb_bob, rational_polynomial).
+# (Kalibr's and ROS's names for it: radtan, plumb_bob, rational_polynomial). They differ in names
+# and in forms of numbers, which the tables below have. Names are compared without case and without
+# what is no letter or digit.
 
-MATRIX_NAMES = (
-    "cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "k", "m", "mtx",
-)
-DISTORTION_NAMES = (
+MATRIX = ("cameramatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "k", "m", "mtx")
+DISTORTION = (
     "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distortion", "dist",
     "d",
 )
-SIZE_NAMES = ("imagesize", "resolution", "imgsize", "framesize", "calibrationsize")
-SD_NAMES = ("stddeviationsintrinsics", "stddevintrinsics", "stddevsintrinsics")
-COVARIANCE_NAMES = ("covarianceintrinsics", "intrinsicscovariance")
-"""Names are compared without case and without what is no letter or digit."""
+SIZE = ("imagesize", "resolution", "imgsize", "framesize", "calibrationsize")
+SD = ("stddeviationsintrinsics", "stddevintrinsics", "stddevsintrinsics")
+COVARIANCE = ("covarianceintrinsics", "intrinsicscovariance")
 
+MODEL_NAMES = ("distortionmodel", "lensmodel", "distortiontype")
 MODEL_COUNTS = {
     "plumbbob": (0, 4, 5), "radtan": (0, 4), "radialtangential": (0, 4), "none": (0,),
     "rationalpolynomial": (0, 4, 5, 8, 12, 14), "brownconrady": (0, 4, 5), "": COUNTS,
     "lensmodelpinhole": (0,), "lensmodelopencv": COUNTS, "lensmodelopencv4": (4,),
     "lensmodelopencv5": (5,), "lensmodelopencv8": (8,), "lensmodelopencv12": (12,),
 }
-"""Lens model -> the numbers of coefficients that it may have; other models are refused."""
+"""Lens model -> the numbers of coefficients that it may have."""
+
+_FRAME_AS_SENT = "give the calibration of the frame as it is sent"
+
+ALLOWED: tuple[tuple[tuple[str, ...], Iterable[str], str], ...] = (
+    (("xi",), (), "camera model omnidirectional (xi): not supported, only pinhole cameras are"),
+    (("cameramodel",), ("pinhole", ""),
+     "camera model {value}: not supported, only pinhole cameras are"),
+    (("fisheyemodel",), ("0", "false", "no", ""),
+     "a fisheye model: not supported, only OpenCV's pinhole lens model is"),
+    (MODEL_NAMES, MODEL_COUNTS,
+     "lens model {value}: not supported; only OpenCV's is (" + "plumb_bob, rational_polynomial, "
+     "radtan, none)"),
+    (("binningx", "binningy"), ("0", "1"),
+     "{name} = {value}: the matrix is that of the frame without binning; " + _FRAME_AS_SENT),
+)
+"""Names, the values that entries of these names may have, and why others are refused."""
 
 KINDS = (
     "a file of OpenCV's FileStorage (camera_matrix, distortion_coefficients, image_width, "
@@ -112,37 +127,21 @@ def _cameras(tree: Any) -> dict[str, dict[str, Any]]:
     """Return the cameras of a tree by name; the name of a single one may be empty."""
     if not isinstance(tree, dict):
         return {}
-    if isinstance(listed := tree.get("calibrations"), list):  # PhotonVision's settings
-        cameras: dict[str, dict[str, Any]] = {}
-        for node in listed:
-            if isinstance(node, dict) and _has_matrix(node):
-                width, height = _size(_by_name(node))
-                name = f"{width}x{height}"
-                if name in cameras and _calibration(cameras[name]) != _calibration(node):
-                    raise ValueError(f"two calibrations of {name} that differ; delete one of them")
-                cameras[name] = node
-        return cameras
     if _has_matrix(tree):
         return {"": tree}
-    numbered: dict[str, dict[str, Any]] = {}
-    rest = {}
+    listed = tree.get("calibrations")
+    if isinstance(listed, list):  # PhotonVision's settings, a camera for each frame size
+        return _mapping(
+            ("{}x{}".format(*_size(_by_name(node))), node) for node in listed if _has_matrix(node)
+        )
+    # A stereo pair has entries M1, D1, M2, D2; a single number k1 is a lens coefficient.
+    pairs: dict[str, dict[str, Any]] = {}
     for name, value in tree.items():
-        match = re.fullmatch(r"(.*?[A-Za-z])_?([0-9]{1,2})", str(name))
-        if match and _normal(match[1]) in (*MATRIX_NAMES, *DISTORTION_NAMES) and (
-            isinstance(value, (list, dict))  # a single number k1 is a lens coefficient
-        ):
-            numbered.setdefault(match[2], {})[match[1]] = value
-        else:
-            rest[name] = value
-    numbered = {name: {**rest, **node} for name, node in numbered.items() if _has_matrix(node)}
-    return numbered or {
-        str(name): node for name, node in tree.items()
-        if isinstance(node, dict) and _has_matrix(node)
-    }
-
-
-BASE64 = "$base64$"
-"""Beginning of numbers that OpenCV writes as text that is none."""
+        match = re.fullmatch(r"(.*?[A-Za-z])_?([0-9]{1,2})", name)
+        if match and _normal(match[1]) in MATRIX + DISTORTION and isinstance(value, (list, dict)):
+            pairs.setdefault(match[2], dict(tree))[match[1]] = value
+    nodes = pairs if any(map(_has_matrix, pairs.values())) else tree
+    return {name: node for name, node in nodes.items() if _has_matrix(node)}
 
 
 class _Entry(NamedTuple):
@@ -155,24 +154,14 @@ class _Entry(NamedTuple):
         """Return the error of its value."""
         return ValueError(f"{plain(self.name)}: {reason}")
 
-    def number(self) -> float:
-        """Return a finite number; ValueError if the value is none."""
-        try:
-            number = float(self.value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
-        if not abs(number) < 1e300:
-            raise self.fault(f"{plain(self.value)} is not a finite number")
-        return number
-
     def pixels(self) -> int:
         """Return a side of a frame."""
-        number = self.number()
+        (number,), _ = self.numbers()
         if number != int(number) or not 1 <= number <= 100_000:
             raise self.fault(f"{number:g}; expected whole pixels, from 1 to 100000")
         return int(number)
 
-    def numbers(self) -> tuple[list[float], tuple[int, int] | None]:
+    def numbers(self) -> tuple[list[float], tuple[int, ...] | None]:
         """Return a list's or a matrix' numbers, row by row, and its shape if it has one."""
         value, shape, single = self.value, None, False
         if isinstance(value, dict):
@@ -180,25 +169,22 @@ class _Entry(NamedTuple):
                 raise self.fault("a matrix without data")
             if "rows" in value and "cols" in value:
                 sides = [_Entry(f"{self.name}.{key}", value[key]) for key in ("rows", "cols")]
-                shape = int(sides[0].number()), int(sides[1].number())
+                shape = tuple(int(side.numbers()[0][0]) for side in sides)
+            # Digits enough for single precision stand for a number of single precision.
             value, single = value["data"], value.get("dt") == "f"
         if isinstance(value, str):
-            if value.startswith(BASE64):
-                raise self.fault("base64; write the file with numbers")
             value = value.split()
-        if not isinstance(value, list):
-            value = [] if value is None else [value]
-        if value and all(isinstance(row, list) for row in value):
-            shape = len(value), len(value[0])
-            value = [number for row in value for number in row]
-        numbers = [_Entry(self.name, each).number() for each in value]
-        if shape is not None and shape[0] * shape[1] != len(numbers):
-            expected = f"{shape[0]} x {shape[1]}"
-            raise self.fault(f"{expected}, but {len(numbers)} numbers; is it cut short?")
-        if single:
-            # Digits enough for single precision stand for a number of single precision.
-            numbers = [float(np.float32(number)) for number in numbers]
-        return numbers, shape
+        try:
+            array = np.array([] if value is None else value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self.fault(f"expected numbers of one shape, as text: {error}") from None
+        if not (np.abs(array) < 1e300).all():
+            raise self.fault(f"{plain(value)} is not finite")
+        shape = array.shape if array.ndim == 2 else shape
+        if shape is not None and math.prod(shape) != array.size:
+            expected = " x ".join(map(str, shape))
+            raise self.fault(f"{expected}, but {array.size} numbers; is it cut short?")
+        return array.astype(np.float32 if single else np.float64).ravel().tolist(), shape
 
 
 def _by_name(node: dict[str, Any]) -> dict[str, _Entry]:
@@ -206,8 +192,8 @@ def _by_name(node: dict[str, Any]) -> dict[str, _Entry]:
     return {_normal(name): _Entry(str(name), value) for name, value in node.items()}
 
 
-def _has_matrix(node: dict[str, Any]) -> bool:
-    return not _by_name(node).keys().isdisjoint(MATRIX_NAMES)
+def _has_matrix(node: Any) -> bool:
+    return isinstance(node, dict) and not _by_name(node).keys().isdisjoint(MATRIX)
 
 
 def _one(named: dict[str, _Entry], names: tuple[str, ...]) -> _Entry | None:
@@ -222,68 +208,37 @@ def _one(named: dict[str, _Entry], names: tuple[str, ...]) -> _Entry | None:
 
 def _calibration(node: dict[str, Any]) -> Calibration:
     named = _by_name(node)
-    counts = _check_model(named)
-    _check_region(named)
-    fx, fy, cx, cy = _matrix(_one(named, MATRIX_NAMES) or _Entry("", None))
-    lens = _one(named, DISTORTION_NAMES)
+    counts: tuple[int, ...] = COUNTS
+    for names, values, refusal in ALLOWED:
+        for name, value in (named[each] for each in names if each in named):
+            if _normal(value) not in values:
+                raise ValueError(refusal.format(name=name, value=plain(value)))
+            counts = MODEL_COUNTS[_normal(value)] if names is MODEL_NAMES else counts
+    width, height = _size(named)
+    region = named["roi"].value if "roi" in named else None
+    if isinstance(region, dict):  # ROS: only a part of the frame may be sent
+        whole = {"x_offset": 0, "y_offset": 0, "width": width, "height": height}
+        for name in whole.keys() & region.keys():
+            if _Entry(name, region[name]).numbers()[0] not in ([0], [whole[name]]):
+                raise ValueError(
+                    f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "
+                    f"frame; {_FRAME_AS_SENT}"
+                )
+    view = _matrix(_one(named, MATRIX) or _Entry("", None))
+    lens = _one(named, DISTORTION)
     if lens is None and counts != (0,):
         raise ValueError(
             "no distortion coefficients (distortion_coefficients, distCoeffs, D; an empty list "
             "if there is none)"
         )
     distortion = () if lens is None else _distortion(lens, counts)
-    width, height = _size(named)
     count = 4 + len(distortion)
-    sd, covariance = _one(named, SD_NAMES), _one(named, COVARIANCE_NAMES)
+    sd, covariance = _one(named, SD), _one(named, COVARIANCE)
     return Calibration(
-        width, height, fx, fy, cx, cy, distortion,
+        width, height, *view, distortion,
         () if sd is None else _deviations(sd, count),
         () if covariance is None else _covariance(covariance, count),
     )
-
-
-def _check_model(named: dict[str, _Entry]) -> tuple[int, ...]:
-    """Return the numbers of coefficients of the file's lens model; ValueError for other models."""
-    def value(key: str, default: str) -> Any:
-        return named[key].value if key in named else default
-
-    if "xi" in named or _normal(value("cameramodel", "pinhole")) not in ("pinhole", ""):
-        name = plain(value("cameramodel", "omnidirectional (xi)"))
-        raise ValueError(f"camera model {name}: not supported, only pinhole cameras are")
-    if str(value("fisheyemodel", "0")).lower() not in ("0", "false", "no", ""):
-        raise ValueError("a fisheye model: not supported, only OpenCV's pinhole lens model is")
-    counts: tuple[int, ...] = COUNTS
-    for key in ("distortionmodel", "lensmodel", "distortiontype"):
-        model = value(key, "")
-        if _normal(model) not in MODEL_COUNTS:
-            raise ValueError(
-                f"lens model {plain(model)}: not supported; only OpenCV's is (plumb_bob, "
-                "rational_polynomial, radtan, none)"
-            )
-        counts = MODEL_COUNTS[_normal(model)] if key in named else counts
-    return counts
-
-
-def _check_region(named: dict[str, _Entry]) -> None:
-    """Refuse the matrix of a frame of which only a part, or sums of pixels, are sent (ROS)."""
-    advice = "give the calibration of the frame as it is sent"
-    for key in ("binningx", "binningy"):
-        if key in named and named[key].number() > 1:
-            name, value = named[key]
-            raise ValueError(
-                f"{name} = {plain(value)}: the matrix is that of the frame without binning; "
-                f"{advice}"
-            )
-    region = named["roi"].value if "roi" in named else None
-    if isinstance(region, dict):
-        width, height = _size(named)
-        whole = {"x_offset": 0, "y_offset": 0, "width": width, "height": height}
-        for name, value in region.items():
-            if name in whole and _Entry(name, value).number() not in (0, whole[name]):
-                raise ValueError(
-                    f"roi with {name} = {plain(value)}: the matrix is that of the whole frame; "
-                    f"{advice}"
-                )
 
 
 def _matrix(entry: _Entry) -> tuple[float, float, float, float]:
@@ -321,18 +276,16 @@ def _size(named: dict[str, _Entry]) -> tuple[int | None, int | None]:
     for width, height in (("imagewidth", "imageheight"), ("width", "height")):
         if width in named and height in named:
             return named[width].pixels(), named[height].pixels()
-    entry = next((named[name] for name in SIZE_NAMES if name in named), None)
+    entry = next((named[name] for name in SIZE if name in named), None)
     if entry is None:
         return None, None
     name, value = entry
     if isinstance(value, dict):
         return _size(_by_name(value))
-    if isinstance(value, str):
-        entry = _Entry(name, re.split("[x, ]+", value.strip("[]() ")))
-    numbers, _ = entry.numbers()
-    if len(numbers) != 2:
-        raise entry.fault(f"{len(numbers)} numbers; expected width and height")
-    return _Entry(name, numbers[0]).pixels(), _Entry(name, numbers[1]).pixels()
+    sides = re.split("[x, ]+", value.strip("[]() ")) if isinstance(value, str) else value
+    if not isinstance(sides, list) or len(sides) != 2:
+        raise entry.fault(f"{plain(value)}; expected width and height")
+    return _Entry(name, sides[0]).pixels(), _Entry(name, sides[1]).pixels()
 
 
 _OF_EACH = "of fx, fy, cx, cy and each coefficient"
@@ -372,21 +325,22 @@ _COMMENT = re.compile(r"^[ \t]*//[^\n]*$", re.MULTILINE)
 def read_tree(content: bytes) -> Any:
     """Return the tree of a file's content.
 
+    What is not UTF-8 may be a comment, or a date in the locale's encoding: no camera's numbers are
+    outside of ASCII.
+
     Raises
     ------
     ValueError
         Why it has none, in words that follow the file's name and a colon.
     """
-    if content.startswith(b"\x1f\x8b"):
-        raise ValueError("compressed; unpack it")
-    text = _decoded(content).strip()
-    if "\0" in text:
-        raise ValueError("not text")
+    text = content.decode("utf-8-sig", errors="replace").strip()
     if not text:
         raise ValueError("empty")
+    if "\0" in text:
+        raise ValueError("not text, or compressed, or not UTF-8")
     try:
         if text.startswith("<"):
-            return _xml_tree(text)
+            return _element(ET.fromstring(text))  # noqa: S314  (Expat bounds entities)
         if text.startswith("{"):
             # OpenCV writes comments into JSON, each on a line of its own.
             return json.loads(_COMMENT.sub("", text), object_pairs_hook=_mapping)
@@ -400,27 +354,12 @@ def read_tree(content: bytes) -> Any:
         raise ValueError(f"not XML, JSON or YAML, or cut short: {reason}") from None
 
 
-def _decoded(content: bytes) -> str:
-    """Return the text of UTF-8, of UTF-16 with its mark, or else of Latin-1.
-
-    Windows' shells redirect in UTF-16. OpenCV's programs write the date in the locale's encoding,
-    and no camera's numbers are outside of ASCII.
-    """
-    try:
-        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            return content.decode("utf-16")
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def _mapping(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
-    """Return the dictionary of keys and values; ValueError if a key is there twice."""
+def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
+    """Return the dictionary of keys and values; ValueError if a key has two values."""
     tree: dict[str, Any] = {}
     for key, value in pairs:
-        if str(key) in tree:
+        if tree.setdefault(str(key), value) != value:
             raise ValueError(f"it has the key {plain(key)} twice")
-        tree[str(key)] = value
     return tree
 
 
@@ -430,20 +369,7 @@ class _TextLoader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignor
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
         """Return the dictionary of a node."""
         construct = self.construct_object
-        return _mapping([(construct(key, deep), construct(each, deep)) for key, each in node.value])
-
-
-_TextLoader.add_constructor("tag:yaml.org,2002:binary", lambda *_: BASE64)
-
-
-def _xml_tree(text: str) -> Any:
-    # Entities are declared in document types; storages have none.
-    if "<!DOCTYPE" in text:
-        raise ValueError("XML with a document type, which no camera file has")
-    root = ET.fromstring(text)  # noqa: S314  (no entities are declared)
-    if root.tag != "opencv_storage":
-        raise ValueError(f"XML of another kind: <{plain(root.tag)}>, not <opencv_storage>")
-    return _element(root)
+        return _mapping((construct(key, deep), construct(each, deep)) for key, each in node.value)
 
 
 def _element(element: ET.Element) -> Any:
@@ -452,7 +378,7 @@ def _element(element: ET.Element) -> Any:
         return (element.text or "").strip().strip('"')
     if all(child.tag == "_" for child in children):
         return [_element(child) for child in children]
-    return _mapping([(child.tag, _element(child)) for child in children])
+    return _mapping((child.tag, _element(child)) for child in children)
 
 
 # --------------------------------------------------------------------------------------------------

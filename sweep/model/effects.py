@@ -585,8 +585,8 @@ def checked_effect(
     """Return an effect's function that raises PluginError for results that are no levels."""
 
     def applied(levels: Floats, patch: Patch) -> Floats:
-        returned = real_numbers(name, "levels", call(name, apply, levels.copy(), patch))
-        return _checked(name, "levels", returned, levels.shape)
+        returned = call(name, apply, levels.copy(), patch)
+        return real_numbers(name, "levels", returned, levels.shape, finite=True)
 
     return applied
 
@@ -603,7 +603,7 @@ def checked_renderer(name: str, render: Callable[[Any], Any]) -> Render:
             )
         shape = (bottom - top, right - left)
         levels, share = (
-            _checked(name, what, real_numbers(name, what, each), shape)
+            real_numbers(name, what, each, shape, finite=True)
             for what, each in zip(("levels", "share"), returned, strict=True)
         )
         if ((share < 0) | (share > 1)).any():
@@ -611,11 +611,3 @@ def checked_renderer(name: str, render: Callable[[Any], Any]) -> Render:
         return levels, share
 
     return rendered
-
-
-def _checked(name: str, what: str, array: Floats, shape: tuple[int, ...]) -> Floats:
-    if array.shape != shape:
-        raise PluginError(f"{name}: returned {what} of shape {array.shape}; expected {shape}")
-    if not np.isfinite(array).all():
-        raise PluginError(f"{name}: returned {what} that are not finite")
-    return array

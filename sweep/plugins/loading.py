@@ -15,15 +15,15 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sweep.errors import PluginError
 from sweep.messages import nearest, nearest_file, plain
 from sweep.plugins import FACTORY, RECORDS, Plugin
 from sweep.plugins.recording import is_recording, recorded_detector
-from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # Output of plug-ins goes to the standard error: the standard output belongs to the command.
@@ -299,8 +299,33 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
             os._exit(1)
 
 
-def real_numbers(name: str, what: str, returned: Any) -> Floats:
-    """Return a plug-in's result as a new array of real numbers.
+def made(name: str, make: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return the function that a plug-in's ``make`` returns; raises as :func:`call`."""
+    function = call(name, make, *arguments)
+    if not callable(function):
+        raise PluginError(f"{name}: make returns a {type(function).__name__}, not a function")
+    return cast("Callable[..., Any]", function)
+
+
+def real_numbers(
+    name: str, what: str, returned: Any, shape: tuple[int, ...] = (), *,
+    finite: bool = False, whole: bool = False,
+) -> NDArray[Any]:
+    """Return a plug-in's result as a new array of real, or of whole numbers.
+
+    Parameters
+    ----------
+    name, what
+        The plug-in's name, and what it returned, in messages.
+    returned
+        What it returned.
+    shape
+        The shape that it must have; () for any. One that begins with -1, any number, is that of
+        nothing, too.
+    finite
+        Whether all numbers must be finite.
+    whole
+        Whether they must be integers.
 
     Raises
     ------
@@ -314,7 +339,15 @@ def real_numbers(name: str, what: str, returned: Any) -> Floats:
         raise PluginError(f"{name}: returned {what} that are no array of numbers") from None
     if np.ma.is_masked(returned):
         raise PluginError(f"{name}: returned {what} of which some are masked; expected NaN or none")
-    if array.dtype.kind not in "biuf":
+    kinds, words = ("iu", "whole") if whole else ("biuf", "real")
+    if array.size and array.dtype.kind not in kinds:
         raise PluginError(
-            f"{name}: returned {what} of type {array.dtype}; expected real numbers")
-    return np.array(array, dtype=np.float64)
+            f"{name}: returned {what} of type {array.dtype}; expected {words} numbers")
+    if shape[:1] == (-1,) and not array.size:
+        array = array.reshape(0, *shape[1:])
+    if shape and array.shape != shape and (-1, *array.shape[1:]) != shape:
+        expected = str(shape).replace("-1", "n")
+        raise PluginError(f"{name}: returned {what} of shape {array.shape}; expected {expected}")
+    if finite and not np.isfinite(array).all():
+        raise PluginError(f"{name}: returned {what} that are not finite")
+    return np.array(array, dtype=np.int64 if whole else np.float64)

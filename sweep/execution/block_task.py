@@ -31,24 +31,20 @@ from sweep.isolation.watchdog import ending_after
 from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision
 from sweep.store.blocks import (
+    Receipt,
     RunStore,
     begin_block,
     receipt_of,
+    recorded,
     withdraw_block,
     write_block,
 )
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
-from sweep.store.outcome import MAX_ROWS, recorded
 from sweep.store.provenance import changes, fingerprint
-from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
 # The task of a worker: compute one block, write it, and return its receipt.
-
-FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
-"""Rows of failures that a receipt may hold of each kind."""
-
 
 def other_here(pipeline: Pipeline, begun: Mapping[str, Any]) -> list[str]:
     """Return what this process has otherwise than a run began with: versions, plug-ins, files.
@@ -108,30 +104,23 @@ def _source(url: str, run_id: str, old: str) -> Source:
 
 
 @lru_cache(maxsize=2)
-def _itself(url: str, run_id: str) -> Source:
-    """Return a store as the source of its own cells, once in each process."""
-    store = _opened(url, run_id)
-    return Source.of(store.pipeline, store, frozenset())
-
-
-@lru_cache(maxsize=2)
 def _decider(url: str, run_id: str, rule: StoppingRule) -> Decider:
     """Make the rule by which sampling of a store stops once in each process."""
     return Decider.of(_opened(url, run_id), rule)
 
 
 def compute_blocks(
-    url: str,
-    run_id: str,
-    blocks: Sequence[Block],
-    decision: Decision | None,
-    reuse: Sequence[str] = (),
-    time_limit_s: float = TIME_LIMIT_S,
-    quota: Mapping[str, int] = FAILURE_QUOTA,
+    url: str, run_id: str, blocks: Sequence[Block], decision: Decision | None,
+    reuse: Sequence[str] = (), time_limit_s: float = TIME_LIMIT_S,
 ) -> list[Receipt]:
-    """Compute blocks one after another as :func:`compute_block` does; return their receipts."""
+    """Compute blocks one after another as :func:`compute_block` does.
+
+    Their receipts are returned without the failures, which the store has.
+    """
     return [
-        compute_block(url, run_id, block, reuse, time_limit_s, quota, decision) for block in blocks
+        dataclasses.replace(
+            compute_block(url, run_id, block, reuse, time_limit_s, decision), failures=())
+        for block in blocks
     ]
 
 
@@ -148,13 +137,8 @@ def _local_faults(url: str) -> Iterator[None]:
 
 
 def compute_block(
-    url: str,
-    run_id: str,
-    block: Block,
-    reuse: Sequence[str] = (),
-    time_limit_s: float = TIME_LIMIT_S,
-    quota: Mapping[str, int] = FAILURE_QUOTA,
-    decision: Decision | None = None,
+    url: str, run_id: str, block: Block, reuse: Sequence[str] = (),
+    time_limit_s: float = TIME_LIMIT_S, decision: Decision | None = None,
 ) -> Receipt:
     """Compute, write and commit one block; return its receipt, also if it is run twice.
 
@@ -171,8 +155,6 @@ def compute_block(
         Stores whose finished cells are read instead of computed.
     time_limit_s
         Block timeout in seconds.
-    quota
-        Rows of failures that the receipt may hold of each kind.
     decision
         What the needed scenes follow from; all scenes are needed without one. A block that is
         committed on another basis is computed again, its computed scenes taken from itself.
@@ -192,69 +174,68 @@ def compute_block(
             return before  # another process may write the store, too
         if decision is not None:
             needed = _decider(url, run_id, decision.rule).needed(block, decision)
+        sources = [_source(url, run_id, old) for old in reuse]
+        if before is not None:
+            done = frozenset([store.blocks.number(block)])
+            sources.insert(0, Source.of(store.pipeline, store, done))
         begun_before = begin_block(store, block)
         try:
-            return _compute_begun(
-                store, url, block, reuse, time_limit_s, quota, isolated=begun_before,
-                needed=needed, basis=None if decision is None else decision.basis,
-                before=before,
-            )
+            start = time.perf_counter()
+            values, receipt = _computed(
+                store, block, needed, sources, time_limit_s, isolated=begun_before)
+            seconds = receipt.seconds if before is None else {
+                stage: [sum(both) for both in itertools.zip_longest(
+                    before.seconds[stage], spent, fillvalue=0.0)]
+                for stage, spent in receipt.seconds.items()
+            }
+            return write_block(store, block, values, dataclasses.replace(
+                receipt, seconds=seconds, wall_s=time.perf_counter() - start, written=time.time(),
+                basis=None if decision is None else decision.basis))
         except Exception:
             if not begun_before:  # it did not end this process
                 withdraw_block(store, block)
             raise
 
 
-def _compute_begun(
-    store: RunStore, url: str, block: Block, reuse: Sequence[str], time_limit_s: float,
-    quota: Mapping[str, int], *, isolated: bool, needed: NDArray[np.bool_],
-    basis: int | None = None, before: Receipt | None = None,
-) -> Receipt:
-    """Compute, write and commit a block that is marked as begun.
+def _computed(
+    store: RunStore, block: Block, needed: NDArray[np.bool_], sources: Sequence[Source],
+    time_limit_s: float, *, isolated: bool,
+) -> tuple[dict[str, NDArray[Any]], Receipt]:
+    """Return the values of a block's ``needed`` scenes (N,), and what a receipt tells of them.
 
-    Only the ``needed`` scenes (N,) are computed; ``before`` is the receipt of the block as it was
-    committed on another basis.
+    Cells that a source has are taken from it, the others are computed.
     """
-    start = time.perf_counter()
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     need = np.broadcast_to(needed[:, None, None], shape).copy()
-    sources = [_source(url, store.run_id, old) for old in reuse]
-    if before is not None:
-        own = frozenset([store.blocks.number(block)])
-        sources.insert(0, dataclasses.replace(_itself(url, store.run_id), done=own))
     reused = read_cells(pipeline, block, sources) if sources and need.any() else None
     if reused is not None:
         need &= ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
-    cells, seconds, failures = CellsResult.not_run(pipeline.experiment, len(block)), _NO_SECONDS, []
+    cells = CellsResult.not_run(pipeline.experiment, len(block))
+    seconds: dict[str, list[float]] = {stage: [] for stage in cells.seconds}
     if len(rows):
         indices = [index[rows] for index in block.indices()]
         computed = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
         for name, columns in computed.columns.items():
             cells.columns[name][:, rows] = columns
-        seconds, failures = computed.seconds, computed.failures
+        seconds, cells.failures = computed.seconds, computed.failures
     values = {
         v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
         for v in store.variables
     }
     if reused is not None:
         values = {v.name: _merged(v, values, reused) for v in store.variables}
+    lengths = dict(zip(
+        (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
     for v in store.variables:
-        lengths = dict(zip(
-            (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
         mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
         values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
-    if before is not None:
-        seconds = {stage: [sum(both) for both in itertools.zip_longest(
-            before.seconds[stage], seconds[stage], fillvalue=0.0)] for stage in seconds}
-    receipt = Receipt(
+    processors = {processor()} if len(rows) else set()
+    return values, Receipt(
         run_id=store.run_id,
-        processors=tuple(sorted({
-            *([processor()] if len(rows) else []),
-            *(() if reused is None else reused.processors),
-        })),
+        processors=tuple(sorted(processors | (set() if reused is None else reused.processors))),
         scenes=len(block),
         computed={
             "scenes": len(rows),
@@ -264,12 +245,8 @@ def _compute_begun(
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
         seconds=seconds,
-        failures=recorded(pipeline, block, failures, rows.tolist(), quota),
-        wall_s=time.perf_counter() - start,
-        written=time.time(),
-        basis=basis,
+        failures=recorded(pipeline, block, cells.failures, rows.tolist()),
     )
-    return write_block(store, block, values, receipt)
 
 
 def _compute(
@@ -280,29 +257,19 @@ def _compute(
 
     What raises is a result only if it raises again in another process.
     """
-    cells = None if isolated else _computed_here(pipeline, indices, need, time_limit_s)
+    cells = None
+    if not isolated:
+        try:
+            with ending_after(WHOLE * time_limit_s):
+                cells = run_cells(pipeline.experiment, indices, need)
+        except MachineFaultError:
+            raise
+        except Exception:
+            cells = None  # it raises as a whole, as single scenes may
     if cells is None:
         cells = run_cells_isolated(pipeline, indices, need, time_limit_s)
     check_repeatable(pipeline, indices, need, cells, time_limit_s)
     return cells
-
-
-def _computed_here(
-    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_],
-    time_limit_s: float,
-) -> CellsResult | None:
-    """Compute cells in this process; None if that raises as a whole, as single scenes may."""
-    try:
-        with ending_after(WHOLE * time_limit_s):
-            return run_cells(pipeline.experiment, indices, need)
-    except MachineFaultError:
-        raise
-    except Exception:
-        return None
-
-
-_NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
-"""The cost of a block of which nothing was computed."""
 
 
 def _merged(

@@ -25,7 +25,7 @@ from sweep.isolation.child_process import (
     last_line,
 )
 from sweep.messages import notice
-from sweep.store.receipt import Receipt
+from sweep.store.blocks import Receipt
 
 # --------------------------------------------------------------------------------------------------
 # The loop: blocks are submitted as long as there is room, and what becomes of them is yielded.

@@ -395,13 +395,11 @@ def check_affordable(
         )
 
 
-def scene_s_of(store: RunStore, done: AbstractSet[int], timing: Timing | None = None) -> float:
-    """Return the mean seconds a scene of some committed blocks; without any, what was measured."""
+def scene_s_of(store: RunStore, done: AbstractSet[int]) -> float:
+    """Return the mean seconds a scene of some committed blocks; assumed if there are none."""
     some = sorted(done)[:SAMPLED_RECEIPTS]
     spent = [receipt.wall_s / receipt.scenes for _, receipt in receipts(store, some)]
-    if spent:
-        return statistics.fmean(spent)
-    return BLOCK_S / len(store.blocks[0]) if timing is None else timing.scene_s
+    return statistics.fmean(spent) if spent else BLOCK_S / len(store.blocks[0])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -26,8 +26,8 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
 from sweep.messages import notice
 from sweep.processor import differing_processors, processor
+from sweep.store.blocks import Receipt
 from sweep.store.provenance import fingerprint
-from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
 # The client of a cluster whose workers make the same numbers as this process.

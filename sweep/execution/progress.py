@@ -1,25 +1,15 @@
-"""Progress of a run: its display, and what is counted of blocks that were computed."""
+"""Progress of a run while it runs, and its display on stderr."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
-from sweep.errors import ArgumentError, RunError
-from sweep.execution.executors import Failed
-from sweep.execution.waves import AnyOrder, InWaves, Work, condition_count
-from sweep.experiment.parameters import Stage
-from sweep.measure.flags import DetectionStatus
+from sweep.errors import ArgumentError
 from sweep.messages import notice
-from sweep.store.blocks import RunStore, receipts
-from sweep.store.outcome import MAX_ROWS
-from sweep.store.receipt import Receipt
 
 # --------------------------------------------------------------------------------------------------
 # How far a run is, while it runs: the event after each block, and its display on stderr.
@@ -58,6 +48,14 @@ class Progress:
         if self.conditions is None:
             return f"{self.done:,} of {self.total:,} poses"
         return f"{self.settled:,} of {self.conditions:,} conditions done, {self.needed:,} poses"
+
+
+    @property
+    def share(self) -> tuple[float, float]:
+        """How much is done, and of how much."""
+        if self.conditions is None:
+            return self.done, self.total
+        return self.settled or 0, self.conditions
 
 
 ProgressReport = Callable[[Progress], None]
@@ -112,21 +110,27 @@ def progress_report(progress: bool | ProgressReport | None) -> Iterator[Progress
 
 @contextlib.contextmanager
 def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
-    """Show progress on stderr: a bar on a terminal, else a line every 30 s.
+    """Show progress on stderr: a bar on a terminal, else a line every :data:`LINE_INTERVAL_S`.
 
     ``ends``: with a line for the beginning and one for the end, however short the run is.
     """
-    if not _on_terminal():
-        yield ProgressLines(ends=ends)
+    if _on_terminal():
+        with _bar() as update:
+            yield lambda progress: update(progress.line, *progress.share)
         return
-    with _bar() as update:
-        def report(progress: Progress) -> None:
-            if progress.conditions is None:
-                update(progress.line, progress.done, progress.total)
-            else:
-                update(progress.line, progress.settled or 0, progress.conditions)
+    printed: float | None = None
 
-        yield report
+    def report(progress: Progress) -> None:
+        nonlocal printed
+        now = time.monotonic()
+        is_end = printed is None or progress.done == progress.total
+        if (ends and is_end) or (printed is not None and now > printed + LINE_INTERVAL_S):
+            notice(progress.line)
+            printed = now
+        elif printed is None:
+            printed = now
+
+    yield report
 
 
 def _on_terminal() -> bool:
@@ -152,119 +156,3 @@ def _bar() -> Iterator[Callable[[str, float, float], None]]:
         task = bar.add_task("starting", total=None)
         yield lambda what, done, total: bar.update(
             task, description=what, completed=done, total=total)
-
-
-class ProgressLines:
-    """Prints how far a run is every :data:`LINE_INTERVAL_S`; `sweep status` knows the rate.
-
-    ``ends``: also the first and the last time.
-    """
-
-    def __init__(self, *, ends: bool = False) -> None:
-        self._ends = ends
-        self._printed: float | None = None
-
-    def __call__(self, progress: Progress) -> None:
-        """Print a line, if the last one was long ago."""
-        now, first = time.monotonic(), self._printed is None
-        due = self._ends and (first or progress.done == progress.total)
-        due = due or (self._printed is not None and now > self._printed + LINE_INTERVAL_S)
-        if due:
-            notice(progress.line)
-        if first or due:
-            self._printed = now
-
-
-# --------------------------------------------------------------------------------------------------
-# What a run has done so far: its progress, counts of what was computed, failures by kind.
-
-MAX_FAILED_BLOCKS = 10
-"""Failed blocks after which a run ends."""
-
-
-class Tally:
-    """Counts the receipts of a run and the blocks that failed; reports progress.
-
-    Parameters
-    ----------
-    store
-        The store that is written.
-    waiting
-        Its blocks that wait: of a run in waves, they know how many conditions are settled.
-    report
-        Called with the progress after each block.
-    """
-
-    def __init__(
-        self, store: RunStore, waiting: AnyOrder | InWaves, report: ProgressReport | None = None
-    ) -> None:
-        self._store, self._waiting, self._report = store, waiting, report
-        self._done: Counter[str] = Counter()
-        self._failures: Counter[str] = Counter()
-        self._failed: list[tuple[str, bool]] = []
-        self.computed: Counter[str] = Counter()
-        """Blocks, scenes, detections and estimates that were computed and not reused."""
-
-    def begin(self, done: AbstractSet[int]) -> None:
-        """Count the blocks that are committed already.
-
-        Raises
-        ------
-        StoreError
-            If a receipt is damaged.
-        """
-        for _, receipt in receipts(self._store, done):
-            self._count(receipt)
-        self._notify()
-
-    def add(self, work: Work, result: list[Receipt] | Failed) -> None:
-        """Count what became of work.
-
-        Raises
-        ------
-        RunError
-            If so many blocks failed that no more are tried.
-        """
-        if isinstance(result, Failed):
-            block = self._store.blocks[work.numbers[0]]
-            self._failed.append((f"block {block}: {result.reason}", result.machine_fault))
-            if len(self._failed) >= MAX_FAILED_BLOCKS:
-                self.check()
-            return
-        for number, receipt in zip(work.numbers, result, strict=True):
-            self._waiting.committed(number, receipt)
-            self.computed.update({"blocks": 1, **receipt.computed})
-            self._count(receipt)
-            self._notify()
-
-    def quota(self) -> Mapping[str, int]:
-        """Return how many failures of each kind another receipt may list."""
-        return {kind: max(MAX_ROWS - self._failures[kind], 0) for kind in ("failed", "crashed")}
-
-    def check(self) -> None:
-        """Raise RunError if blocks failed: of one line if faults of machines are all there is."""
-        reasons = [reason for reason, _ in self._failed]
-        if reasons and all(machine_fault for _, machine_fault in self._failed):
-            more = f", and {len(reasons) - 1} blocks more likewise" if len(reasons) > 1 else ""
-            raise RunError(f"{self._store.url}: {reasons[0]}{more}")
-        if reasons:
-            listed = "\n".join(f"  {reason}" for reason in reasons)
-            raise RunError(f"{self._store.url}: {len(reasons)} blocks failed\n{listed}")
-
-    def _count(self, receipt: Receipt) -> None:
-        self._failures.update(failure.kind for failure in receipt.failures)
-        detected = dict(enumerate(receipt.detection)).get(DetectionStatus.detected, 0)
-        self._done.update(
-            scenes=receipt.scenes, needed=receipt.scenes_needed, detected=detected)
-
-    def _notify(self) -> None:
-        if self._report is None:
-            return
-        waves: dict[str, Any] = {}
-        if isinstance(self._waiting, InWaves):
-            count = condition_count(self._store.pipeline)
-            waves = {"needed": self._done["needed"], "conditions": count,
-                     "settled": int(self._waiting.settled_share * count)}
-        self._report(Progress(
-            self._done["scenes"], self._store.pipeline.size(Stage.scene), self._done["detected"],
-            **waves))

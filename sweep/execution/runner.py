@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib
 import math
 import os
 import time
-import tomllib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
-
-import tomlkit
 
 from sweep.errors import (
     ArgumentError,
@@ -24,11 +20,10 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK, TIME_LIMIT_S
-from sweep.execution.executors import SMALL_RUN_S, Children, Executor
+from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.forecast import (
     TIMING_LIMIT_S,
     TIMING_SHARE,
-    Timing,
     block_time_limit_s,
     blocks_of,
     check_affordable,
@@ -36,27 +31,26 @@ from sweep.execution.forecast import (
     measured_or_assumed,
     scene_s_of,
 )
-from sweep.execution.progress import ProgressReport, Tally
+from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.reuse import is_reusable, match
-from sweep.execution.status import (
-    Retry,
-    Summary,
-    close,
-    drop_failed,
-    failed_blocks,
-    summary_of,
-    summary_of_complete,
-)
-from sweep.execution.waves import InWaves, Waiting, Work, waiting_blocks
-from sweep.experiment.document import SEARCH
+from sweep.execution.status import Summary, close, drop_failed, failed_blocks, summary_of
+from sweep.execution.waves import Waiting, Work, condition_count, waiting_blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import MAX_TRIALS
 from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
+from sweep.measure.flags import DetectionStatus
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
-from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
+from sweep.store.blocks import (
+    Receipt,
+    RunStore,
+    check_whole,
+    committed,
+    drop_block,
+    missing_chunks,
+    receipts,
+)
 from sweep.store.lifecycle import (
     create_store,
     open_store,
@@ -73,55 +67,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.execution.on_cluster import Cluster
-
-
-# --------------------------------------------------------------------------------------------------
-# A store in waves that is continued by a stricter rule: what was computed stays.
-
-def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
-    """Give a store the rule of a pipeline of the same cells, and return the store as it is then.
-
-    Blocks that were committed under the former rule are decided again when the store is continued,
-    each from what it has.
-
-    Raises
-    ------
-    StoreError
-        If another process writes the store, or it cannot be written.
-    """
-    text = tightened_text(store.pipeline, pipeline)
-    with changing(store.url, store.storage):
-        reopen(store, dataclasses.replace(store.pipeline, text=text))
-    return open_store(store.url, "r+")
-
-
-def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
-    r"""Return a pipeline's text with the section by which sampling stops from another pipeline.
-
-    >>> begun, ours = (Pipeline.from_text(
-    ...     "[pose]\nside_px = 20\njitter_px = 1\n[search]\n"
-    ...     f"max_trials = 90\nprecision = {{ detection_rate = {width} }}")
-    ...     for width in (0.1, 0.05))
-    >>> print(tightened_text(begun, ours), end="")
-    [pose]
-    side_px = 20
-    jitter_px = 1
-    [search]
-    max_trials = 90
-    precision = {detection_rate = 0.05}
-    """
-    if ours.stopping is None:
-        raise TypeError(ours.stopping)
-    wanted = dict(tomllib.loads(ours.text)[SEARCH]) | {MAX_TRIALS: ours.stopping.max_trials}
-    document = tomlkit.parse(begun.text)
-    table = document[SEARCH]
-    for key in list(table):  # in its place, whatever it looks like
-        del table[key]
-    for key in sorted(wanted):
-        table[key] = tomlkit.inline_table() if isinstance(wanted[key], dict) else wanted[key]
-        if isinstance(wanted[key], dict):
-            table[key].update(wanted[key])
-    return tomlkit.dumps(document)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -197,16 +142,17 @@ def execute(
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
     begun = _store_to_continue(url, pipeline, overwrite)
-    again = set(failed_blocks(begun)) if retry_failed and begun is not None else set()
+    again = failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
-        return summary_of_complete(begun, started)
+        check_whole(begun)
+        return summary_of(begun, {}, time.perf_counter() - started, {})
     for line in pipeline.facts.notes:
         notice(line)
     if begun is not None and is_written(begun.storage):
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
-    done = set() if begun is None else committed(begun) - again
+    done = set() if begun is None else committed(begun) - again.keys()
     if begun is None:
         check_writable(url)
 
@@ -215,47 +161,41 @@ def execute(
         thread = stack.enter_context(ThreadPoolExecutor(1))
         child = child or Child(BLOCK_TASK)
         stack.callback(child.close)  # the thread waits for it
-        remote = scheduler is not None or client is not None
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
-        timing: Timing | None = None
-        if not done:
+        if begun is not None and done:
+            scene_s, left = scene_s_of(begun, done), 1 - len(done) / len(begun.blocks)
+        else:
             limit_s = min(TIMING_SHARE * (time_limit_s or TIME_LIMIT_S), TIMING_LIMIT_S)
             measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
-            timing = interrupts.await_result(measuring)
-        large = workers is not None or _work_s(pipeline, begun, done, timing) >= SMALL_RUN_S
+            # In waves, nobody knows how much more than the first one is needed.
+            scene_s, left = interrupts.await_result(measuring).scene_s, least_share(pipeline)
         executor: Executor
-        if remote:
+        if scheduler is not None or client is not None:
             from sweep.execution.on_cluster import connected  # noqa: PLC0415  (slow to import)
 
             executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
-            count = workers or default_workers()
-            executor = stack.enter_context(Children(child, count, at_once=large))
-        if begun is None:
-            if timing is None:
-                raise AssertionError(url)
-            blocks = blocks_of(
-                pipeline, timing.scene_s, executor.threads, block_s, time_limit_s)
-            scene_s = timing.scene_s
-        else:
-            blocks, scene_s = begun.blocks, scene_s_of(begun, done, timing)
+            large = left * pipeline.size(Stage.scene) * scene_s >= SMALL_RUN_S
+            executor = stack.enter_context(Children(
+                child, workers or default_workers(), at_once=large or workers is not None))
+        blocks = begun.blocks if begun is not None else blocks_of(
+            pipeline, scene_s, executor.threads, block_s, time_limit_s)
         if not (yes or sources):
-            left = len(blocks) - len(done)
-            check_affordable(url, pipeline, scene_s, executor.threads, len(blocks), left)
+            check_affordable(
+                url, pipeline, scene_s, executor.threads, len(blocks), len(blocks) - len(done))
         if begun is None:
             if overwrite and exists(url):
                 remove_store(url)
             begun = create_store(url, pipeline, blocks.extents)
-        retry = Retry()
         if stricter:
             begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
-            begun, retry = drop_failed(begun)
+            begun, again = drop_failed(begun)
         limit_s = block_time_limit_s(time_limit_s, scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
-    return summary_of(open_store(url), computed, time.perf_counter() - started, retry)
+    return summary_of(open_store(url), computed, time.perf_counter() - started, again)
 
 
 def recompute(
@@ -274,14 +214,13 @@ def recompute(
     """
     _check_arguments(workers, None, None, None, time_limit_s)
     each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
-    waiting = waiting_blocks(store, numbers)
+    limit_s = block_time_limit_s(time_limit_s, each_s)
     with (
         Interrupts() as interrupts, Child(BLOCK_TASK) as child,
         Children(child, workers or default_workers(), at_once=workers is not None) as executor,
         _continuable_errors(),
     ):
-        limit_s = block_time_limit_s(time_limit_s, each_s)
-        compute(store, waiting, Tally(store, waiting), executor, (), limit_s, interrupts)
+        compute(store, waiting_blocks(store, numbers), executor, (), limit_s, interrupts)
 
 
 def _check_arguments(
@@ -329,23 +268,23 @@ def _matching_sources(
     return sources
 
 
-def _work_s(
-    pipeline: Pipeline, unfinished: RunStore | None, done: AbstractSet[int], timing: Timing | None
-) -> float:
-    """Return the estimated seconds of work that are left when the blocks ``done`` are committed.
-
-    In waves, at least the first one is left.
-    """
-    if unfinished is not None:
-        blocks = unfinished.blocks
-        each_s = scene_s_of(unfinished, done, timing) * len(blocks[0])
-        return (len(blocks) - len(done)) * each_s
-    if timing is None:
-        return math.inf
-    return least_share(pipeline) * pipeline.size(Stage.scene) * timing.scene_s
-
-
 # The blocks, and the end
+
+
+def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
+    """Give a store a pipeline of the same cells and another rule of stopping; return it then.
+
+    Blocks that were committed under the former rule are decided again when the store is continued,
+    each from what it has.
+
+    Raises
+    ------
+    StoreError
+        If another process writes the store, or it cannot be written.
+    """
+    with changing(store.url, store.storage):
+        reopen(store, pipeline)
+    return open_store(store.url, "r+")
 
 
 def _compute_and_close(
@@ -357,22 +296,28 @@ def _compute_and_close(
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
-        waiting = waiting_blocks(
-            store, (number for number in range(len(store.blocks)) if number not in done))
-        tally = Tally(store, waiting, progress)
-        tally.begin(waiting.current if isinstance(waiting, InWaves) else done)
-        compute(store, waiting, tally, executor, sources, time_limit_s, interrupts)
+        left = (number for number in range(len(store.blocks)) if number not in done)
+        computed = compute(store, waiting_blocks(store, left, done), executor, sources,
+                           time_limit_s, interrupts, progress)
         _check_same_rule(store)
         if not store.finished:  # by another process that wrote it, too
             close(store)
-    return tally.computed
+    return computed
+
+
+MAX_FAILED_BLOCKS = 10
+"""Failed blocks after which a run ends."""
 
 
 def compute(
-    store: RunStore, waiting: Waiting, tally: Tally, executor: Executor, sources: Sequence[str],
-    time_limit_s: float, interrupts: Interrupts,
-) -> None:
-    """Compute the blocks that wait, and count them.
+    store: RunStore, waiting: Waiting, executor: Executor, sources: Sequence[str],
+    time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None = None,
+) -> Mapping[str, int]:
+    """Compute the blocks that wait.
+
+    Returns
+    -------
+    How many blocks, scenes, detections and estimates were computed and not reused.
 
     Raises
     ------
@@ -380,17 +325,65 @@ def compute(
         If blocks failed, or nothing can be computed any more.
     StoreReplacedError
         If the store was moved, deleted or replaced.
+    StoreError
+        If the receipt of a block that was committed before is damaged.
     """
-    url = absolute_url(store.url)
+    url, pipeline = absolute_url(store.url), store.pipeline
+    computed: Counter[str] = Counter()
+    committed_so_far: Counter[str] = Counter()
+    failed: list[tuple[str, bool]] = []
 
     def task(work: Work) -> tuple[Any, ...]:
         blocks = [store.blocks[number] for number in work.numbers]
-        return (url, store.run_id, blocks, work.decision, sources, time_limit_s, tally.quota())
+        return (url, store.run_id, blocks, work.decision, sources, time_limit_s)
 
+    def count(receipt: Receipt) -> None:
+        detected = sum(receipt.detection[DetectionStatus.detected :][:1])
+        committed_so_far.update(
+            scenes=receipt.scenes, needed=receipt.scenes_needed, detected=detected)
+
+    def report() -> None:
+        if progress is None:
+            return
+        waves = {}
+        if waiting.settled_share is not None:
+            conditions = condition_count(pipeline)
+            waves = {"needed": committed_so_far["needed"], "conditions": conditions,
+                     "settled": int(waiting.settled_share * conditions)}
+        progress(Progress(committed_so_far["scenes"], pipeline.size(Stage.scene),
+                          committed_so_far["detected"], **waves))
+
+    for _, receipt in receipts(store, waiting.current):
+        count(receipt)
+    report()
     with contextlib.closing(executor.map(waiting, task, time_limit_s, interrupts)) as results:
         for work, result in results:
-            tally.add(work, result)
-    tally.check()
+            if isinstance(result, Failed):
+                block = store.blocks[work.numbers[0]]
+                failed.append((f"block {block}: {result.reason}", result.machine_fault))
+                if len(failed) >= MAX_FAILED_BLOCKS:
+                    break
+                continue
+            for number, receipt in zip(work.numbers, result, strict=True):
+                waiting.committed(number, receipt)
+                computed.update({"blocks": 1, **receipt.computed})
+                count(receipt)
+                report()
+    _raise_failed(store.url, failed)
+    return computed
+
+
+def _raise_failed(url: str, failed: Sequence[tuple[str, bool]]) -> None:
+    """Raise RunError for blocks that failed, each with its reason and whether a machine did.
+
+    It has one line if faults of machines are all there is.
+    """
+    if failed and all(machine_fault for _, machine_fault in failed):
+        more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
+        raise RunError(f"{url}: {failed[0][0]}{more}")
+    if failed:
+        listed = "\n".join(f"  {reason}" for reason, _ in failed)
+        raise RunError(f"{url}: {len(failed)} blocks failed\n{listed}")
 
 
 def _check_same_rule(store: RunStore) -> None:

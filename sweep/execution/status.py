@@ -1,10 +1,11 @@
-"""The state of a store's run, its end, its retry, and the summary of a finished one."""
+"""The account of a run: what its receipts add up to, its end, its retry, its summary and status."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import time
+import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,9 +17,14 @@ from sweep.evaluation.block import bound_notes
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.grid import Axis
 from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
+from sweep.messages import plain
 from sweep.processor import differing_processors
 from sweep.store.blocks import (
+    MAX_PER_BLOCK,
+    FailedCell,
+    Receipt,
     RunStore,
     check_not_replaced,
     check_whole,
@@ -28,15 +34,6 @@ from sweep.store.blocks import (
 )
 from sweep.store.lifecycle import finish, open_store, reopen
 from sweep.store.lock import changing, is_written
-from sweep.store.outcome import (
-    MAX_ROWS,
-    Outcome,
-    failure_table,
-    first_cell,
-    outcome_of,
-    outcome_of_finished,
-)
-from sweep.store.receipt import FailedCell, Receipt
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,25 +42,27 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # What the receipts of a store add up to.
 
+MAX_ROWS = 1000
+"""Failed cells, and as many crashed ones, that are listed of a store; the flags count all."""
+
+
 @dataclass(slots=True)
 class Totals:
     """Receipts, added up.
 
     Attributes
     ----------
-    blocks
-        Number and receipt of each; without its failures, of which all are not kept in memory.
-    scenes, needed
-        Scenes of the blocks, and those of them that were needed.
+    blocks, scenes, needed
+        Blocks, scenes of these, and how many of the scenes were needed.
     detection, estimate
         Counts of cells; the flag is the index.
     processors
         Blocks by the features of the processors that computed them.
     cells
-        Failed and crashed cells, at most 1,000 of each kind.
+        Kind -> failed and crashed cells, at most :data:`MAX_ROWS` of each.
     """
 
-    blocks: list[tuple[int, Receipt]] = field(default_factory=list)
+    blocks: int = 0
     scenes: int = 0
     needed: int = 0
     detection: list[int] = field(default_factory=lambda: [0] * len(DetectionStatus))
@@ -72,25 +71,240 @@ class Totals:
     cells: dict[str, list[FailedCell]] = field(
         default_factory=lambda: {"failed": [], "crashed": []})
 
+    def add(self, receipt: Receipt) -> None:
+        """Add the receipt of another block."""
+        self.blocks += 1
+        self.scenes += receipt.scenes
+        self.needed += receipt.scenes_needed
+        self.processors.update(receipt.processors)
+        self._count(receipt.detection, receipt.estimate)
+        for cell in receipt.failures:
+            if len(self.cells[cell.kind]) < MAX_ROWS:
+                self.cells[cell.kind].append(cell)
+
+    def _count(self, *added: Sequence[int]) -> None:
+        for counts, more in zip((self.detection, self.estimate), added, strict=True):
+            for flag, count in enumerate(more):
+                counts[flag] += count
+
     @staticmethod
-    def of(store: RunStore, numbers: Iterable[int]) -> Totals:
-        """Add up the receipts of some committed blocks; StoreError if one is damaged."""
-        totals = Totals()
-        for number, receipt in receipts(store, numbers):
-            totals.blocks.append((number, dataclasses.replace(
-                receipt, failures=(), checksums={}, detection=[], estimate=[])))
-            totals.scenes += receipt.scenes
-            totals.needed += receipt.scenes_needed
-            totals.processors.update(receipt.processors)
-            for counts, added in (
-                (totals.detection, receipt.detection), (totals.estimate, receipt.estimate),
-            ):
-                for flag, count in enumerate(added):
-                    counts[flag] += count
-            for cell in receipt.failures:
-                if len(totals.cells[cell.kind]) < MAX_ROWS:
-                    totals.cells[cell.kind].append(cell)
+    def of_finished(store: RunStore) -> Totals:
+        """Return the counts that a finished store recorded; if cells failed, the listed ones.
+
+        Raises
+        ------
+        StoreError
+            If cells failed, and a receipt that may record them is damaged.
+        """
+        counts, totals = store.run_metadata["counts"], Totals()
+        totals._count(counts["detection"], counts["estimate"])
+        totals.processors.update(counts.get("processors") or {})
+        if any(totals.lost.values()):
+            listed = Totals()
+            for _, receipt in receipts(store, committed(store)):
+                listed.add(receipt)
+            totals.cells = listed.cells
         return totals
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """How many cells crashed and failed."""
+        return _lost(self.detection, self.estimate)
+
+
+def _lost(detection: Sequence[int], estimate: Sequence[int]) -> dict[str, int]:
+    """Return how many cells crashed and failed, from counts by flag."""
+    stages = _by_name(DetectionStatus, detection), _by_name(EstimateStatus, estimate)
+    return {kind: sum(counts[kind] for counts in stages) for kind in ("crashed", "failed")}
+
+
+def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:
+    """Return the counts of the flags that occur, by name."""
+    return Counter({
+        flag.name: count for flag, count in zip(flags, counts, strict=False) if count})
+
+
+# --------------------------------------------------------------------------------------------------
+# The outcome of a run in words: what failed and why, and whether anything was computed.
+
+LOUD_SHARE = 0.1
+"""Share of the cells that were tried, above which failures are told first."""
+
+MAX_GROUPS = 5
+"""Groups of failures that are listed; the others are counted."""
+
+MAX_REASON = 200
+
+NOT_TRIED = (
+    "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name,
+    DetectionStatus.not_needed.name,
+)
+"""Flags of cells on which a stage was not tried."""
+
+_VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
+"""Parts of messages that differ from cell to cell: addresses and numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureGroup:
+    """Cells that failed for the same reason.
+
+    Attributes
+    ----------
+    kind
+        "failed" (an exception was raised) or "crashed" (the process died).
+    stage
+        "scene", "detection" or "estimation".
+    reason
+        Type and message of the first cell's exception, or how its process died.
+    count
+        Recorded cells; a store records 1,000 of each kind.
+    at
+        The first cell, as ``sweep repro --at`` takes it.
+    """
+
+    kind: str
+    stage: str
+    reason: str
+    count: int
+    at: str
+
+
+def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
+    """Group failed cells by kind, stage, and message without its numbers; the largest first.
+
+    Examples
+    --------
+    >>> cells = [FailedCell(f"trial={n}", "failed", "scene", f"ValueError: {n} px") for n in (3, 8)]
+    >>> [(group.reason, group.count, group.at) for group in failure_groups(cells)]
+    [('ValueError: 3 px', 2, 'trial=3')]
+    """
+    first: dict[tuple[str, str, str], FailedCell] = {}
+    counts: dict[tuple[str, str, str], int] = {}
+    for cell in cells:
+        key = cell.kind, cell.stage, _VARYING.sub("#", cell.reason)
+        first.setdefault(key, cell)
+        counts[key] = counts.get(key, 0) + 1
+    groups = [
+        FailureGroup(cell.kind, cell.stage, plain(cell.reason, MAX_REASON), counts[key], cell.at)
+        for key, cell in first.items()
+    ]
+    return sorted(groups, key=lambda group: -group.count)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of the cells of a store.
+
+    Attributes
+    ----------
+    nothing_computed
+        Whether a stage was tried and failed on every cell.
+    failed_share
+        Share of the cells that failed or crashed, of those that a stage was tried on; the largest
+        of the stages.
+    failures
+        The cells that failed or crashed, by reason.
+    warnings
+        The same for a reader; and that nothing was detected, or no pose estimated. Empty if there
+        is nothing to tell.
+    advice
+        The command that recomputes one cell of each reason; empty where there is nothing to tell.
+    """
+
+    nothing_computed: bool
+    failed_share: float
+    failures: list[FailureGroup]
+    warnings: list[str]
+    advice: str
+
+
+def outcome_of(url: str, totals: Totals, first: str) -> Outcome:
+    """Return the outcome of the cells that a store holds.
+
+    Parameters
+    ----------
+    url
+        The store, for the command that repeats failures.
+    totals
+        What its receipts add up to.
+    first
+        A cell to look at where nothing was detected, as ``--at`` takes it.
+    """
+    groups = failure_groups([*totals.cells["failed"], *totals.cells["crashed"]])
+    stages = _by_name(DetectionStatus, totals.detection), _by_name(EstimateStatus, totals.estimate)
+    shares, lines = zip(*map(_lost_share, ("detections", "estimates"), stages), strict=True)
+    warnings = list(filter(None, lines))
+    advice = ""
+    if groups:
+        warnings += _listed(groups)
+        advice = repro_command(url, [group.at for group in groups])
+    if 1.0 not in shares and (nothing := _nothing_found(*stages)):
+        warnings.append(nothing)
+        advice = advice or f"{repro_command(url, [first])} -o scene.png"
+    warnings += differing_processors(totals.processors, "blocks")
+    return Outcome(1.0 in shares, max(shares), groups, warnings, advice)
+
+
+def outcome_of_store(store: RunStore, totals: Totals) -> Outcome:
+    """Return the outcome of the cells of a store, with what may surprise of its pipeline."""
+    first = selection_text(store.pipeline, {axis.name: 0 for axis in store.pipeline.axes})
+    outcome = outcome_of(store.url, totals, first)
+    outcome.warnings.extend(bound_notes(store.pipeline))
+    return outcome
+
+
+def _lost_share(cells: str, counts: Counter[str]) -> tuple[float, str]:
+    """Return the share of ``cells`` that failed or crashed, and a line on them if there are any."""
+    kinds = [kind for kind in ("failed", "crashed") if counts[kind]]
+    lost = counts["failed"] + counts["crashed"]
+    tried = counts.total() - sum(counts[flag] for flag in NOT_TRIED)
+    if not lost:
+        return 0.0, ""
+    if lost == tried:
+        return 1.0, f"nothing computed: all {lost:,} {cells} {' or '.join(kinds)}"
+    share = lost / tried
+    loud = "warning: " if share > LOUD_SHARE else ""
+    listed = " and ".join(f"{counts[kind]:,} {kind}" for kind in kinds)
+    percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
+    return share, f"{loud}{listed} of {tried:,} {cells} ({percent})"
+
+
+def _listed(groups: Sequence[FailureGroup]) -> list[str]:
+    lines = [
+        f"  {group.count:,} x {group.kind} in {group.stage}: {group.reason}"
+        for group in groups[:MAX_GROUPS]
+    ]
+    if len(groups) > MAX_GROUPS:
+        rest = sum(group.count for group in groups[MAX_GROUPS:])
+        lines.append(f"  {rest:,} x for {len(groups) - MAX_GROUPS:,} other reasons")
+    return lines
+
+
+def repro_command(url: str, cells: Sequence[str]) -> str:
+    """Return the command that recomputes cells of a store.
+
+    >>> repro_command("runs/a.zarr", ["trial=3", "dictionary=DICT_4X4_50"])
+    'sweep repro runs/a.zarr --at trial=3 --at dictionary=DICT_4X4_50'
+    """
+    chosen = [f"--at {shlex.quote(at)}" for at in cells[:MAX_GROUPS] if at]
+    return " ".join(["sweep repro", shlex.quote(url), *chosen])
+
+
+def _nothing_found(detection: Counter[str], estimate: Counter[str]) -> str:
+    """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
+    if not detection["detected"]:
+        flags: type[Flag] = DetectionStatus
+        counts, what = detection, "nothing was detected"
+    elif not any(estimate[flag.name] for flag in EstimateStatus if flag.present):
+        flags, counts, what = EstimateStatus, estimate, "no pose was estimated"
+    else:
+        return ""
+    needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
+    if not needed:
+        return ""
+    ((name, count),) = needed.most_common(1)
+    return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -108,7 +322,11 @@ def close(store: RunStore) -> None:
         If a receipt is damaged, a chunk is missing, or the store cannot be written.
     """
     check_not_replaced(store)
-    totals = Totals.of(store, check_whole(store, finished=True))
+    totals, costs = Totals(), {}
+    for number, receipt in receipts(store, check_whole(store, finished=True)):
+        totals.add(receipt)
+        if receipt.seconds["scene"]:
+            costs[number] = receipt.seconds
     counts: dict[str, Any] = {
         "detection": totals.detection, "estimate": totals.estimate,
         "processors": dict(totals.processors),
@@ -118,33 +336,30 @@ def close(store: RunStore) -> None:
             "needed": totals.needed, "conditions": condition_count(store.pipeline),
             "unsettled": unsettled_count(store),
         }
-    failures = failure_table(
-        [*totals.cells["failed"], *totals.cells["crashed"]],
-        lost(totals.detection, totals.estimate))
-    costs = [(number, receipt.seconds) for number, receipt in totals.blocks
-             if receipt.seconds["scene"]]
-    finish(store, {"cost": _cost(store, costs), "failures": failures}, counts)
+    finish(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
 
 
-def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
-    """Return how many cells failed and crashed, from counts by flag.
+def _failure_table(totals: Totals) -> xr.Dataset:
+    """Return the table of failures, with the total number of cells of each kind."""
+    import xarray as xr  # noqa: PLC0415  (slow to import)
 
-    Parameters
-    ----------
-    detection, estimate
-        Counts of cells; the flag is the index.
-    """
-    def count(flags: list[int], flag: int) -> int:
-        return flags[flag] if len(flags) > flag else 0
+    cells = [*totals.cells["failed"], *totals.cells["crashed"]]
 
-    return {
-        kind: count(detection, DetectionStatus[kind]) + count(estimate, EstimateStatus[kind])
-        for kind in ("crashed", "failed")
-    }
+    def column(name: str) -> tuple[tuple[str], Any]:
+        return ("failure",), np.array([getattr(cell, name) for cell in cells], dtype=object)
+
+    return xr.Dataset(
+        {name: column(name) for name in ("at", "kind", "stage", "text")},
+        attrs={
+            "long_name": "scenes that raised or ended their process",
+            "rows_kept": f"at most {MAX_ROWS} of each kind, and {MAX_PER_BLOCK} of a block",
+            **{f"{kind}_cells": count for kind, count in totals.lost.items()},
+        },
+    )
 
 
 def _cost(
-    store: RunStore, blocks: Sequence[tuple[int, Mapping[str, Sequence[float]]]]
+    store: RunStore, blocks: Mapping[int, Mapping[str, Sequence[float]]]
 ) -> xr.Dataset:
     """Return the cost group: seconds of each block per stage and configuration."""
     import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
@@ -160,18 +375,18 @@ def _cost(
 
     return xr.Dataset(
         {
-            "scene_s": (("block",), shaped([s["scene"][0] for _, s in blocks], [])),
+            "scene_s": (("block",), shaped([s["scene"][0] for s in blocks.values()], [])),
             "detection_s": (
                 ("block", *(axis.name for axis in settings)),
-                shaped([s["detection"] for _, s in blocks], settings),
+                shaped([s["detection"] for s in blocks.values()], settings),
             ),
             "estimation_s": (
                 ("block", *(axis.name for axis in both)),
-                shaped([s["estimation"] for _, s in blocks], both),
+                shaped([s["estimation"] for s in blocks.values()], both),
             ),
         },
         coords={
-            "block": [number for number, _ in blocks],
+            "block": list(blocks),
             **{axis.name: axis.coordinates().astype(object)
                if axis.coordinates().dtype.kind == "T" else axis.coordinates() for axis in both},
         },
@@ -182,28 +397,10 @@ def _cost(
 # --------------------------------------------------------------------------------------------------
 # Failed cells, tried again: the blocks that hold them are computed as if they never had been.
 
-@dataclass(frozen=True, slots=True)
-class Retry:
-    """Blocks that are computed again.
-
-    Attributes
-    ----------
-    blocks
-        Their numbers.
-    cells
-        How many of their cells had failed or crashed.
-    """
-
-    blocks: tuple[int, ...] = ()
-    cells: int = 0
-
-    def recovered(self, store: RunStore) -> int:
-        """Return how many of the cells neither failed nor crashed again."""
-        return self.cells - sum(_lost(receipt) for _, receipt in receipts(store, self.blocks))
-
-
-def failed_blocks(store: RunStore) -> dict[int, int]:
+def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict[int, int]:
     """Return the committed blocks in which cells failed or crashed, and how many did.
+
+    ``numbers``: the blocks that are looked at, by default all.
 
     Raises
     ------
@@ -211,12 +408,13 @@ def failed_blocks(store: RunStore) -> dict[int, int]:
         If a receipt is damaged.
     """
     return {
-        number: count for number, receipt in receipts(store, committed(store))
-        if (count := _lost(receipt))
+        number: count
+        for number, receipt in receipts(store, committed(store) if numbers is None else numbers)
+        if (count := sum(_lost(receipt.detection, receipt.estimate).values()))
     }
 
 
-def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
+def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
     """Drop the committed blocks in which cells failed or crashed, so that a run computes them.
 
     A finished store is marked unfinished before. A kill at any instant leaves a store that another
@@ -224,7 +422,7 @@ def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
 
     Returns
     -------
-    The store as it is then, and what was dropped.
+    The store as it is then; what was dropped, as :func:`failed_blocks` returns it.
 
     Raises
     ------
@@ -233,18 +431,11 @@ def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
     """
     with changing(store.url, store.storage):
         failed = failed_blocks(store)
-        if failed:
-            if store.finished:
-                reopen(store)
-            for number in failed:
-                drop_block(store, store.blocks[number])
-    if not failed:
-        return store, Retry()
-    return open_store(store.url, "r+"), Retry(tuple(failed), sum(failed.values()))
-
-
-def _lost(receipt: Receipt) -> int:
-    return sum(lost(list(receipt.detection), list(receipt.estimate)).values())
+        if failed and store.finished:
+            reopen(store)
+        for number in failed:
+            drop_block(store, store.blocks[number])
+    return open_store(store.url, "r+"), failed
 
 
 # --------------------------------------------------------------------------------------------------
@@ -307,51 +498,54 @@ class Summary(Outcome):
         return f"detected {self.detected:,} of {self.looked_for:,} looked for"
 
 
-def summary_of_complete(store: RunStore, started: float) -> Summary:
-    """Return the summary of a run into a store that was finished before it began.
+def summary_of(
+    store: RunStore, computed: Mapping[str, int], seconds: float, retried: Mapping[int, int]
+) -> Summary:
+    """Return the summary of a finished store from the counts that it recorded.
+
+    Parameters
+    ----------
+    store
+        The store.
+    computed
+        Blocks, scenes and estimates that this run computed; none of a store that was finished.
+    seconds
+        Duration of this run.
+    retried
+        Blocks that were computed again, and how many of their cells had failed.
 
     Raises
     ------
     StoreError
-        If blocks, or chunks of them, are missing.
+        If blocks, chunks of them, or receipts that tell of failures are missing.
     """
-    check_whole(store)
-    return summary_of(store, {}, time.perf_counter() - started)
-
-
-def summary_of(
-    store: RunStore, computed: Mapping[str, int], seconds: float, retry: Retry | None = None
-) -> Summary:
-    """Return the summary of a finished store from the counts that it recorded."""
-    retry = retry or Retry()
-    counts = store.run_metadata["counts"]
-    missing = lost(counts["detection"], counts["estimate"])
-    outcome = outcome_of_finished(store)
-    sampled = counts.get("sampled") or {}
+    totals = Totals.of_finished(store)
+    sampled = store.run_metadata["counts"].get("sampled") or {}
+    tried = sum(retried.values())
     return Summary(
         store=store.url,
         data=store.data_url,
         poses=store.pipeline.size(Stage.scene),
         results=math.prod(len(axis) for axis in store.pipeline.axes),
-        detected=counts["detection"][DetectionStatus.detected],
-        looked_for=looked_for(counts["detection"]),
+        detected=totals.detection[DetectionStatus.detected],
+        looked_for=looked_for(totals.detection),
         blocks=len(store.blocks),
         computed_blocks=computed.get("blocks", 0),
         computed_scenes=computed.get("scenes", 0),
         computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
-        crashed=missing["crashed"],
-        failed=missing["failed"],
-        **_told(outcome, *bound_notes(store.pipeline), *_unsettled_lines(store, sampled)),
-        retried=retry.cells,
-        recovered=retry.recovered(store),
+        crashed=totals.lost["crashed"],
+        failed=totals.lost["failed"],
+        **_fields(outcome_of_store(store, totals), *_unsettled_lines(store, sampled)),
+        retried=tried,
+        recovered=tried - sum(failed_blocks(store, retried).values()),
         needed=sampled.get("needed"),
         conditions=sampled.get("conditions"),
         unsettled=sampled.get("unsettled"),
     )
 
 
-def _told(outcome: Outcome, *more: str) -> dict[str, Any]:
+def _fields(outcome: Outcome, *more: str) -> dict[str, Any]:
     """Return the fields of an outcome, with more warnings."""
     told = {each.name: getattr(outcome, each.name) for each in dataclasses.fields(outcome)}
     return told | {"failed_share": round(outcome.failed_share, 6),
@@ -398,7 +592,7 @@ class Status(Outcome):
     detection, estimate
         Cells by flag; flags without cells are left out.
     looked_for
-        Cells of the detection that count in its rates, as in `sweep.execution.status.Summary`.
+        Cells of the detection that count in its rates, as in `Summary`.
     poses_per_s, seconds_left
         Rate over the last minute of work; time to the end at that rate. None if unknown, and of a
         store that nobody writes.
@@ -442,44 +636,36 @@ def status(url: str) -> Status:
         If there is no store, or it cannot be read.
     """
     store = open_store(url)
-    totals = Totals.of(store, check_whole(store))
+    totals, written = Totals(), []
+    for _, receipt in receipts(store, check_whole(store)):
+        totals.add(receipt)
+        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
     poses = store.pipeline.size(Stage.scene)
     in_waves = store.pipeline.stopping is not None
     writing = not store.finished and is_written(store.storage)
-    rate = poses_per_second([
-        WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed)
-        for _, receipt in totals.blocks])
-    outcome = outcome_of(
-        url, totals.detection, totals.estimate,
-        [*totals.cells["failed"], *totals.cells["crashed"]], first_cell(store))
+    rate = poses_per_second(written)
     return Status(
         store=url,
         title=store.pipeline.heading,
         finished=store.finished,
         being_written=writing,
         blocks=len(store.blocks),
-        blocks_done=len(totals.blocks),
+        blocks_done=totals.blocks,
         poses=poses,
         poses_done=totals.scenes,
         looked_for=looked_for(totals.detection),
-        detection=_by_flag(DetectionStatus, totals.detection),
-        estimate=_by_flag(EstimateStatus, totals.estimate),
+        detection=dict(_by_name(DetectionStatus, totals.detection)),
+        estimate=dict(_by_name(EstimateStatus, totals.estimate)),
         poses_per_s=rate,
         seconds_left=(poses - totals.scenes) / rate if rate and writing and not in_waves else None,
         crashed=totals.cells["crashed"],
         failed=totals.cells["failed"],
-        **_told(outcome, *differing_processors(totals.processors, "blocks"),
-                *bound_notes(store.pipeline)),
+        **_fields(outcome_of_store(store, totals)),
         needed=totals.needed if in_waves else None,
         settled=_settled(store),
         conditions=condition_count(store.pipeline) if in_waves else None,
         processors=dict(totals.processors),
     )
-
-
-def _by_flag(flags: type[Flag], counts: Sequence[int]) -> dict[str, int]:
-    """Return counts of cells by the flags that occur."""
-    return {flag.name: counts[flag] for flag in flags if counts[flag]}
 
 
 def _settled(store: RunStore) -> int | None:

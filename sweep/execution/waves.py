@@ -6,18 +6,17 @@ import json
 import math
 import zlib
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule, digest_of
 from sweep.sampling.rules import Decider, Decision, Waves, condition_axes, make_rule
-from sweep.store.blocks import RunStore, committed, receipts
-from sweep.store.receipt import Receipt
+from sweep.store.blocks import Receipt, RunStore, committed, receipts
 
 SETTLED_AT_ONCE = 64
 """Blocks of which nothing is needed that one task writes."""
@@ -34,28 +33,18 @@ class Work:
     decision: Decision | None = None
 
 
-class Waiting(Protocol):
-    """The blocks that wait to be computed."""
-
-    def next(self) -> Work | None:
-        """Return what can be computed now; None if nothing can, before more is committed."""
-
-    def committed(self, number: int, receipt: Receipt) -> None:
-        """Note that a block is committed."""
-
-
-def waiting_blocks(store: RunStore, numbers: Iterable[int]) -> AnyOrder | InWaves:
-    """Return some blocks of a store in the order in which they can be computed."""
-    if store.pipeline.stopping is None:
-        return AnyOrder(numbers)
-    return InWaves(store, set(numbers))
-
-
 class AnyOrder:
-    """Blocks that do not depend on each other, in the order of their numbers."""
+    """Blocks that do not depend on each other, in the order of their numbers.
 
-    def __init__(self, numbers: Iterable[int]) -> None:
+    ``done``: those that are committed before.
+    """
+
+    settled_share = None
+    """There are no conditions that could be settled."""
+
+    def __init__(self, numbers: Iterable[int], done: AbstractSet[int] = frozenset()) -> None:
         self._numbers = iter(numbers)
+        self.current = done
 
     def next(self) -> Work | None:
         """Return the next block."""
@@ -73,28 +62,6 @@ class _Known(NamedTuple):
     content: int
     needed: int
     scenes: int
-
-
-@dataclass(slots=True)
-class _Group:
-    """How far a group is.
-
-    Attributes
-    ----------
-    wave
-        The wave that is computed.
-    bases
-        For each wave from 1 to ``wave`` what it follows from.
-    settled
-        Whether nothing was needed in the wave before.
-    pending
-        Blocks of the wave (if it is settled, of all that is left) that are not committed yet.
-    """
-
-    wave: int = 0
-    bases: tuple[int, ...] = ()
-    settled: bool = False
-    pending: set[int] = field(default_factory=set)
 
 
 class InWaves:
@@ -116,11 +83,12 @@ class InWaves:
         assert sampling is not None  # noqa: S101  (there is a section that says so)
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._read = sorted({"detection", *sampling.variables})
-        self._first = zlib.crc32(digest_of(self._rule).encode())
         self._only = only
         self._known: dict[int, _Known] = {}
         self._ready: deque[Work] = deque()
-        self._groups: dict[int, _Group] = {}
+        # Of each group that was begun, the wave's blocks that are not committed yet, and what
+        # goes on when all are.
+        self._groups: dict[int, tuple[set[int], Iterator[list[Work]]]] = {}
         self._settled_shares: dict[int, float] = {}
         self.current: set[int] = set()
         """Numbers of the blocks that were committed on the basis that they have now."""
@@ -148,10 +116,10 @@ class InWaves:
     def committed(self, number: int, receipt: Receipt) -> None:
         """Note a committed block; the last one of a wave makes the next wave ready."""
         self._note(number, receipt)
-        group = self._waves.group(number)
-        self._groups[group].pending.discard(number)
-        if not self._groups[group].pending:
-            self._advance(group)
+        pending, works = self._groups[self._waves.group(number)]
+        pending.discard(number)
+        if not pending:
+            self._ready.extend(next(works, ()))
 
     def _note(self, number: int, receipt: Receipt) -> None:
         content = json.dumps([number, *(receipt.checksums.get(name, 0) for name in self._read)])
@@ -159,43 +127,59 @@ class InWaves:
             receipt.basis, zlib.crc32(content.encode()), receipt.scenes_needed, receipt.scenes)
 
     def _begin(self, group: int) -> None:
-        self._groups[group] = _Group()
-        self._advance(group)
+        pending: set[int] = set()
+        self._groups[group] = pending, (works := self._works(group, pending))
+        self._ready.extend(next(works, ()))
 
-    def _advance(self, group: int) -> None:
-        """Make the first wave ready of which blocks are not committed as they are to be."""
-        state, last = self._groups[group], len(self._waves.ends) - 1
+    def _works(self, group: int, pending: set[int]) -> Iterator[list[Work]]:
+        """Yield the work of each wave of a group; go on once nothing of it is ``pending``.
+
+        In a wave, these are the blocks that are not committed on what follows from the wave
+        before. Once nothing was needed in a wave, all that is left is one wave.
+        """
+        wave, last, settled = 0, len(self._waves.ends) - 1, False
+        bases: tuple[int, ...] = ()  # for each wave from 1 on what it follows from
+        digest = zlib.crc32(digest_of(self._rule).encode())
         while True:
-            stop = last if state.settled else state.wave
-            basis = state.bases[-1] if state.bases else None
-            numbers = list(self._waves.numbers(group, state.wave, stop))
-            waiting = [number for number in numbers
-                       if number not in self._known or self._known[number].basis != basis]
-            self.current.update(set(numbers).difference(waiting))
-            if waiting:
-                state.pending = set(waiting)
-                self._ready.extend(self._works(state, [
-                    number for number in waiting
-                    if self._only is None or number in self._only or number in self._known]))
-                return
+            stop = last if settled else wave
+            numbers = list(self._waves.numbers(group, wave, stop))
+            basis = bases[-1] if bases else None
+            pending.update(number for number in numbers if number not in self._known
+                           or self._known[number].basis != basis)
+            self.current.update(set(numbers) - pending)
+            if pending:
+                allowed = [number for number in numbers if number in pending and (
+                    self._only is None or number in self._only or number in self._known)]
+                decision = Decision(self._rule, wave, bases, settled) if bases else None
+                size = SETTLED_AT_ONCE if settled else 1
+                yield [Work(tuple(allowed[at : at + size]), decision)
+                       for at in range(0, len(allowed), size)]
+                continue
             found = [self._known.pop(number) for number in numbers]
             needed, scenes = sum(each.needed for each in found), sum(each.scenes for each in found)
             self._settled_shares[group] = 1.0 if stop == last else 1.0 - needed / scenes
             if stop == last:
-                del self._groups[group]
                 return
-            text = json.dumps([state.bases[-1] if state.bases else self._first,
-                               *(each.content for each in found)])
-            state.bases = (*state.bases, zlib.crc32(text.encode()))
-            state.settled = state.wave > 0 and needed == 0
-            state.wave += 1
+            digest = zlib.crc32(json.dumps([digest, *(each.content for each in found)]).encode())
+            bases = (*bases, digest)
+            settled = wave > 0 and needed == 0
+            wave += 1
 
-    def _works(self, state: _Group, numbers: list[int]) -> list[Work]:
-        size = SETTLED_AT_ONCE if state.settled else 1
-        decision = Decision(
-            self._rule, state.wave, state.bases, state.settled) if state.bases else None
-        return [Work(tuple(numbers[at : at + size]), decision)
-                for at in range(0, len(numbers), size)]
+
+Waiting = AnyOrder | InWaves
+"""The blocks that wait to be computed."""
+
+
+def waiting_blocks(
+    store: RunStore, numbers: Iterable[int], done: AbstractSet[int] = frozenset()
+) -> Waiting:
+    """Return some blocks of a store in the order in which they can be computed.
+
+    ``done``: the blocks that are committed.
+    """
+    if store.pipeline.stopping is None:
+        return AnyOrder(numbers, done)
+    return InWaves(store, set(numbers))
 
 
 def _rule_of(store: RunStore) -> StoppingRule:

@@ -32,7 +32,14 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.declared import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import make_rule, scenes_needed
-from sweep.store.blocks import BEGUN, RunStore, committed, receipts_or_faults
+from sweep.store.blocks import (
+    BEGUN,
+    Receipt,
+    RunStore,
+    committed,
+    receipt_key,
+    receipts_or_faults,
+)
 from sweep.store.files import read_files, sync
 from sweep.store.layout import checksum_of, is_sound
 from sweep.store.lifecycle import (
@@ -43,7 +50,6 @@ from sweep.store.lifecycle import (
     read_listed,
 )
 from sweep.store.lock import LOCKS, is_written
-from sweep.store.receipt import Receipt, receipt_key
 
 # --------------------------------------------------------------------------------------------------
 # What a verification finds, in one record that each check adds to.

@@ -27,7 +27,7 @@ from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plugins.declared import PluginSetting
-from sweep.store.outcome import selected
+from sweep.store.blocks import selected
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from sweep.analysis.requirements import (
     usual_conditions,
 )
 from sweep.errors import StoreError, SweepError
-from sweep.evaluation.block import bound_notes
+from sweep.execution.status import Totals, outcome_of_store
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import WORLD, Stage
@@ -32,7 +32,6 @@ from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
 from sweep.report.table import axis_label
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
-from sweep.store.outcome import outcome_of_finished
 from sweep.tradeoff.pareto import WRONG, configuration_label
 from sweep.typing import Floats
 
@@ -322,7 +321,7 @@ def read_report_data(
     required = tuple(require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
-        (*outcome_of_finished(store).warnings, *bound_notes(store.pipeline)),
+        tuple(outcome_of_store(store, Totals.of_finished(store)).warnings),
         tuple(each.text for each in parse_requirements(required)) if required else (),
         conditions(results, per, store.pipeline.require_per),
         command,

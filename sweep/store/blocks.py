@@ -7,9 +7,10 @@ import dataclasses
 import itertools
 import json
 import os
+import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from operator import floordiv
 from typing import Any, cast
@@ -22,8 +23,10 @@ from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
 from sweep.experiment.grid import Block, Blocks
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
+from sweep.measure.flags import DetectionStatus
 from sweep.store.files import (
     absent_files,
     delete_files,
@@ -34,9 +37,8 @@ from sweep.store.files import (
     write_document,
     write_files,
 )
-from sweep.store.layout import RECEIPTS, checksum_of, packed
+from sweep.store.layout import RECEIPTS, checksum_of, packed, unpacked
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
-from sweep.store.receipt import Receipt, receipt_key
 
 # --------------------------------------------------------------------------------------------------
 # An open store: where it lies, the pipeline that it belongs to, its arrays and its metadata.
@@ -182,10 +184,172 @@ class Chunks:
 
 
 # --------------------------------------------------------------------------------------------------
+# Receipts: what commits a block, the last file that is written of it. They are the checkpoint; that
+# a chunk exists says nothing.
+
+def receipt_key(number: int) -> str:
+    """Return the key of a block's receipt."""
+    return f"{RECEIPTS}/c/{number}"
+
+
+STAGES = ("scene", "detection", "estimation")
+
+
+@dataclass(frozen=True, slots=True)
+class FailedCell:
+    """A scene, or a scene with a configuration, that raised or whose process died.
+
+    Attributes
+    ----------
+    at
+        Its coordinates, as ``sweep repro --at`` takes them.
+    kind
+        "failed" (it raised) or "crashed" (its process died).
+    stage
+        "scene", "detection" or "estimation".
+    text
+        The end of the traceback, or how the process died.
+    """
+
+    at: str
+    kind: str
+    stage: str
+    text: str
+
+    @property
+    def reason(self) -> str:
+        """The first line of the exception's message in a traceback; of other texts the last."""
+        lines = self.text.strip().splitlines()
+        frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
+        raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
+            if frames else iter(())
+        return next(raised, lines[-1] if lines else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """What commits a block.
+
+    Attributes
+    ----------
+    run_id
+        The run that the store belongs to.
+    processors
+        Features of the processors that computed its cells, in order: several where cells were
+        taken from other stores, or computed on another basis before.
+    scenes
+        Number of scenes of the block.
+    computed
+        "scenes", "detections" and "estimates" -> how many were computed and not reused.
+    detection, estimate
+        How often each flag occurs, by its value.
+    seconds
+        Stage -> seconds for each configuration; empty where nothing was computed.
+    failures
+        The cells that failed or crashed, as far as they are recorded.
+    wall_s
+        Seconds from the block's start to its receipt.
+    written
+        Time at which it was computed, seconds since 1970.
+    checksums
+        Variable -> the CRC-32C at the end of its chunk.
+    block
+        The block's number; None until it is written.
+    basis
+        A digest of what the block's needed scenes follow from: the rule by which sampling stops,
+        and the results of earlier waves; None where all scenes are needed.
+    """
+
+    run_id: str
+    processors: Sequence[str]
+    scenes: int
+    computed: Mapping[str, int]
+    detection: Sequence[int]
+    estimate: Sequence[int]
+    seconds: Mapping[str, Sequence[float]]
+    failures: Sequence[FailedCell]
+    wall_s: float = 0.0
+    written: float = 0.0
+    checksums: Mapping[str, int] = field(default_factory=dict)
+    block: int | None = None
+    basis: int | None = None
+
+    @property
+    def scenes_needed(self) -> int:
+        """How many of its scenes were needed, for the precision that was asked for."""
+        unneeded = sum(self.detection[DetectionStatus.not_needed :][:1])
+        return self.scenes - unneeded * self.scenes // max(sum(self.detection), 1)
+
+    def to_bytes(self) -> bytes:
+        """Return the chunk that a store holds: a text of JSON, the bytes that Zarr writes."""
+        text = json.dumps(asdict(self), separators=(",", ":")).encode()
+        # As the codec "vlen-utf8" has it: how many texts, then the length of each before it.
+        return packed(struct.pack("<II", 1, len(text)) + text)
+
+    @classmethod
+    def from_bytes(cls, chunk: bytes | None) -> Receipt:
+        """Return the receipt that a chunk holds.
+
+        Raises
+        ------
+        ValueError
+            If the chunk is missing, fails its checksum, or holds something else.
+        """
+        if chunk is None:
+            raise ValueError("missing")
+        try:
+            content = json.loads(unpacked(chunk)[8:])
+            failures = tuple(FailedCell(**failure) for failure in content["failures"])
+            return cls(**content | {
+                "processors": tuple(content["processors"]), "failures": failures,
+            })
+        except (AttributeError, KeyError, TypeError, RuntimeError) as error:
+            raise ValueError(f"no receipt: {error}") from None
+
+
+MAX_PER_BLOCK = 100
+"""Failed cells, and as many crashed ones, that a receipt keeps; the flags count all of them."""
+
+MAX_CHARACTERS = 4000
+"""Characters that are kept of a traceback: its end."""
+
+
+def recorded(
+    pipeline: Pipeline, block: Block, failures: Sequence[Any], rows: Sequence[int]
+) -> tuple[FailedCell, ...]:
+    """Return the failures that a block's receipt keeps.
+
+    ``rows`` gives the number within the block of each scene that was computed.
+    """
+    kept: dict[str, list[FailedCell]] = {"failed": [], "crashed": []}
+    for failure in failures:
+        kind = "crashed" if failure.crashed else "failed"
+        if len(kept[kind]) < MAX_PER_BLOCK:
+            kept[kind].append(FailedCell(
+                selected(pipeline, block.cell(rows[failure.scene]), failure), kind, failure.stage,
+                failure.text[-MAX_CHARACTERS:],
+            ))
+    return tuple(itertools.chain(*kept.values()))
+
+
+def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
+    """Return the coordinates of a failure's cell, as ``sweep repro --at`` takes them."""
+    indices = {axis.name: k for axis, k in zip(pipeline.experiment.scene_axes, cell, strict=True)}
+    for number, stage in (
+        (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
+    ):
+        axes = pipeline.axes_of(stage)
+        if number is not None and axes:
+            index = np.unravel_index(number, [len(axis) for axis in axes])
+            indices |= {axis.name: int(k) for axis, k in zip(axes, index, strict=True)}
+    return selection_text(pipeline, indices)
+
+
+# --------------------------------------------------------------------------------------------------
 # Blocks of a store: begun, written, committed by their receipts, and dropped.
 #
 # A block's values are written first and its receipt last, so that a block is either complete or
-# absent. The receipts are the checkpoint; that a chunk exists says nothing.
+# absent.
 
 BEGUN = f"{RECEIPTS}/begun"
 """Folder of a mark for each block that was begun and is not committed."""
@@ -248,15 +412,9 @@ def write_block(
                 contents[store.chunks.key(name, number)] = content
                 checksums[name] = checksum_of(content)
             write_files(store.storage, contents)
-    return commit_block(
-        store, block, dataclasses.replace(receipt, checksums=checksums, block=number))
-
-
-def commit_block(store: RunStore, block: Block, receipt: Receipt) -> Receipt:
-    """Write a block's receipt, in the place of another one if there is one; return it."""
-    with translate_errors(store.url, "written"):
+        receipt = dataclasses.replace(receipt, checksums=checksums, block=number)
         check_not_replaced(store)
-        write_files(store.storage, {receipt_key(store.blocks.number(block)): receipt.to_bytes()})
+        write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
         withdraw_block(store, block)
     return receipt
 

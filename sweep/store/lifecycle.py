@@ -222,16 +222,10 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     files = planned_files(planned)
     metadata = {
         "format": FORMAT,
-        "name": pipeline.name,
-        "folder": pipeline.folder,
         "run_id": run_id,
         "block": list(extents),
-        "fingerprint": fingerprint(pipeline),
+        **_recorded(pipeline),
         "environment": environment(),
-        **(
-            {RECORDED: [plugin.to_json() for plugin in pipeline.plugins]}
-            if pipeline.plugins else {}
-        ),
         "created": utc_now(),
         "finished": False,
         "files": checksums(files),
@@ -264,6 +258,15 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
                 shutil.rmtree(building, ignore_errors=True)
                 raise
     return open_store(url, "r+")
+
+
+def _recorded(pipeline: Pipeline) -> dict[str, Any]:
+    """Return what a run's metadata tell of its pipeline beside the text."""
+    plugins = [plugin.to_json() for plugin in pipeline.plugins]
+    return {
+        "name": pipeline.name, "folder": pipeline.folder, "fingerprint": fingerprint(pipeline),
+        **({RECORDED: plugins} if plugins else {}),
+    }
 
 
 def _check_free(url: str) -> None:
@@ -459,10 +462,9 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
     Its groups go, since they sum the blocks up. A ``pipeline`` of the same cells is its own from
     then on. A kill at any instant leaves a store with one of the two.
     """
-    metadata = {
-        key: value for key, value in store.run_metadata.items()
-        if key not in ("finished_at", "counts")
-    }
+    metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline))
+    for ended in ("finished_at", "counts"):
+        metadata.pop(ended, None)
     files = {key: value for key, value in metadata["files"].items() if not is_of_table(key)}
     with translate_errors(store.url, "written"):
         write_root(store, {**metadata, "finished": False, "files": files}, pipeline)

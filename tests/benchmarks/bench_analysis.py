@@ -20,9 +20,8 @@ import numpy as np
 from benchmarks.tables import header, row
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.store.blocks import region, write_block
+from sweep.store.blocks import STAGES, Receipt, region, write_block
 from sweep.store.lifecycle import create_store, finish
-from sweep.store.receipt import STAGES, Receipt
 
 POSES = 10**7
 

@@ -33,17 +33,15 @@ from support.clusters import Cluster
 from support.commands import started
 from sweep.execution import on_cluster
 from sweep.execution.forecast import block_work_s
-from sweep.execution.progress import Tally
 from sweep.execution.runner import compute
 from sweep.execution.status import status
 from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
-from sweep.store.blocks import committed, receipts
+from sweep.store.blocks import Receipt, committed, receipt_key, receipts
 from sweep.store.files import write_files
 from sweep.store.layout import RECEIPTS
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.receipt import Receipt, receipt_key
 
 PROCESSES = 2
 WORKERS, WAVES, BLOCK_S = (64, 256, 1000), 4, None
@@ -171,9 +169,8 @@ def measured(store, client, block_s, interrupts, scheduler):
     number, threads = len(store.blocks), sum(client.nthreads().values())
     spent = {name: cpu_s(process) for name, process in processes.items()}
     begun = time.perf_counter()
-    waiting = AnyOrder(range(number))
-    compute(store, waiting, Tally(store, waiting, lambda _: None), on_cluster.OnCluster(client),
-            (), block_s, interrupts)
+    compute(store, AnyOrder(range(number)), on_cluster.OnCluster(client), (), block_s, interrupts,
+            lambda _: None)
     wall = time.perf_counter() - begun
     found = [receipt for _, receipt in receipts(store, range(number))]
     busy_s = sum(receipt.wall_s for receipt in found)
@@ -200,7 +197,7 @@ def stored(count, folder):
     calls = {
         "open_store": lambda: open_store(store.url),
         "committed": lambda: committed(store),
-        "continue": lambda: Tally(store, AnyOrder(())).begin(committed(store)),
+        "continue": lambda: sum(1 for _ in receipts(store, committed(store))),
         "status": lambda: status(store.url),
         "sweep.open": lambda: sweep.open(store.url),
     }

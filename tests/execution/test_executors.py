@@ -31,7 +31,6 @@ from sweep.execution import executors, on_cluster
 from sweep.execution.block_task import other_here
 from sweep.execution.executors import Children
 from sweep.execution.on_cluster import OnCluster, Worker, connected
-from sweep.execution.progress import Tally
 from sweep.execution.runner import compute, execute
 from sweep.execution.status import close
 from sweep.execution.waves import AnyOrder
@@ -90,7 +89,7 @@ def suicide(*_):
 def compute_in(store, child):
     waiting = AnyOrder(range(len(store.blocks)))
     with child, Interrupts() as interrupts, Children(child, 1, at_once=True) as executor:
-        compute(store, waiting, Tally(store, waiting), executor, (), 60, interrupts)
+        compute(store, waiting, executor, (), 60, interrupts)
 
 
 @pytest.mark.system

@@ -18,19 +18,25 @@ from sweep.cli import main
 from sweep.errors import MachineFaultError, RunError
 from sweep.execution.block_task import compute_block
 from sweep.execution.on_cluster import OnCluster
-from sweep.execution.progress import Tally
 from sweep.execution.runner import compute, execute
-from sweep.execution.status import WrittenBlock, close, poses_per_second, status
+from sweep.execution.status import (
+    Totals,
+    WrittenBlock,
+    close,
+    failure_groups,
+    outcome_of,
+    poses_per_second,
+    status,
+)
 from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.store.blocks import begin_block, committed
+from sweep.store.blocks import FailedCell, begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.locations import exists
 from sweep.store.lock import writing
-from sweep.store.outcome import FailedCell, failure_groups, outcome_of
 
 TRACEBACK = """Traceback (most recent call last):
   File "a.py", line 3, in f
@@ -43,7 +49,9 @@ TRACEBACK = """Traceback (most recent call last):
 def outcome(detection, estimate, cells):
     counts = [[given.get(flag.name, 0) for flag in flags]
               for flags, given in ((DetectionStatus, detection), (EstimateStatus, estimate))]
-    return outcome_of("a b.zarr", *counts, cells, "trial=0")
+    totals = Totals(
+        detection=counts[0], estimate=counts[1], cells={"failed": cells, "crashed": []})
+    return outcome_of("a b.zarr", totals, "trial=0")
 
 
 def lost_cell(message, at, kind="failed", stage="estimation"):
@@ -236,11 +244,9 @@ def run_on(client, url):
         str(url), FAULTY, (1,)
     )
     done = committed(store)
-    waiting = AnyOrder(number for number in range(len(store.blocks)) if number not in done)
+    left = (number for number in range(len(store.blocks)) if number not in done)
     with writing(store.url, store.storage), Interrupts() as interrupts:
-        tally = Tally(store, waiting)
-        tally.begin(done)
-        compute(store, waiting, tally, OnCluster(client), (), 600.0, interrupts)
+        compute(store, AnyOrder(left, done), OnCluster(client), (), 600.0, interrupts)
         close(store)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]

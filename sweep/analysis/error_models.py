@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from sweep.analysis.poses import (
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.schema import cf_attributes
-from sweep.measure.flags import DetectionStatus, Flag, flag, uncounted_values
+from sweep.measure.flags import Flag, flag
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.typing import Floats, Integers, Masks
 
@@ -282,15 +283,6 @@ def choose_knots(values: Floats, count: int) -> Floats:
     return np.asarray(values[numbers])
 
 
-def candidate_counts(most: int) -> list[int]:
-    """Return numbers of knots to try, up to one a value.
-
-    >>> candidate_counts(1), candidate_counts(7), candidate_counts(20)
-    ([1], [2, 3, 4, 6, 7], [2, 3, 4, 6, 8])
-    """
-    return [count for count in KNOTS if count < most] + ([most] if most <= KNOTS[-1] else [])
-
-
 def select_knots(
     first: BinSums, second: BinSums, values: Sequence[Floats], gain: float = GAIN
 ) -> list[Floats]:
@@ -306,73 +298,38 @@ def select_knots(
         By how much one more knot must raise the log-likelihood of each half by the fit to the other
         half, summed over the halves.
     """
-    counts = [candidate_counts(len(each)) for each in values]
+    counts = [[count for count in KNOTS if count < len(each)] + (
+        [len(each)] if len(each) <= KNOTS[-1] else []) for each in values]
 
-    def knots_at(numbers: Sequence[int]) -> list[Floats]:
-        return [choose_knots(each, some[k])
-                for each, some, k in zip(values, counts, numbers, strict=True)]
-
-    def score(numbers: Sequence[int]) -> float:
-        knots = knots_at(numbers)
+    def tried(numbers: Sequence[int]) -> tuple[float, list[int], list[Floats]]:
+        """Return how well numbers of knots, by their indices in ``counts``, describe the poses."""
+        knots = [choose_knots(each, some[k])
+                 for each, some, k in zip(values, counts, numbers, strict=True)]
         penalty = differences(knots)
         a, b = (hat_basis(each.at, knots) for each in (first, second))
         total = fit_error(first, a, penalty).score(second, b)
         total += fit_error(second, b, penalty).score(first, a)
-        return total - gain * len(penalty)
+        return total - gain * len(penalty), [*numbers], knots
 
-    chosen = [0] * len(values)
-    best = score(chosen)
+    best = tried([0] * len(values))
     while True:
-        tried = [
-            [*chosen[:axis], number, *chosen[axis + 1:]]
-            for axis, some in enumerate(counts)
-            for number in range(chosen[axis] + 1, min(chosen[axis] + 3, len(some)))
-        ]
-        scores = [score(numbers) for numbers in tried]
-        if not scores or max(scores) <= best:
-            return knots_at(chosen)
-        best = max(scores)
-        chosen = tried[scores.index(best)]
-
-
-def union(knots: Sequence[Sequence[Floats]]) -> list[Floats]:
-    """Return, of each axis, the knots of all; what is linear between some is so between all.
-
-    >>> [each.tolist() for each in union([[np.array([0, 2])], [np.array([0, 1, 2])]])]
-    [[0, 1, 2]]
-    """
-    return [np.unique(np.concatenate(each)) for each in zip(*knots, strict=True)]
-
-
-def grid_points(knots: Sequence[Floats]) -> Floats:
-    """Return the points (n, axes) of a grid, the last axis fastest."""
-    return np.stack([each.ravel() for each in np.meshgrid(*knots, indexing="ij")], axis=-1)
+        chosen = best[1]
+        steps = [tried([*chosen[:axis], number, *chosen[axis + 1:]])
+                 for axis, some in enumerate(counts)
+                 for number in range(chosen[axis] + 1, min(chosen[axis] + 3, len(some)))]
+        if not steps or (better := max(steps, key=itemgetter(0)))[0] <= best[0]:
+            return best[2]
+        best = better
 
 
 # --------------------------------------------------------------------------------------------------
 # Conditions of error models: their bins in a dataset, and the joint region that was seen.
-
-PREDICTORS = {"distance_m": True, "side_px": True, "viewing_angle_deg": False}
-"""Name of a predictor -> whether its logarithm is what the model is linear in."""
-
-CONDITIONS = PREDICTORS | {"bearing_deg": False}
-"""The predictors, and the bearing: models do not depend on it, but hold where it was seen."""
-
-MAX_BINS = {"distance_m": 16, "side_px": 8, "viewing_angle_deg": 16}
-"""Bins of the fit into which values are put that are not a few."""
-
-MAX_CELLS = {"distance_m": 12, "side_px": 6, "viewing_angle_deg": 12}
-"""The same of the cells in which the fit is judged."""
 
 MAX_VALUES = 24
 """Distinct values up to which each has a bin of its own."""
 
 SAME = 1e-6
 """Values that differ by less, relatively (angles: in degrees / 100), are the same."""
-
-VARIES = {"distance_m": 1.02, "side_px": 1.02, "viewing_angle_deg": 1.0, "bearing_deg": 1.0}
-"""Ratio of the largest value to the smallest (angles: difference in degrees) from which on a
-predictor varies."""
 
 FRONTAL_DEG = 5.0
 """Smallest viewing angles and bearings up to here: the model begins at 0."""
@@ -396,6 +353,103 @@ by the root of it sums and differences may leave the seen ones, too."""
 
 
 @dataclass(frozen=True)
+class Condition:
+    """A condition that errors depend on, or that was seen with others.
+
+    Attributes
+    ----------
+    words, units
+        What tables call it, and its unit.
+    logarithmic
+        Whether the model is linear in its logarithm.
+    tolerance
+        Ratio of the largest value to the smallest (angles: difference in degrees) from which on it
+        varies.
+    bins, cells
+        Bins of the fit, and cells in which the fit is judged, into which values are put that are
+        not a few.
+    """
+
+    words: str
+    units: str
+    logarithmic: bool
+    tolerance: float
+    bins: int = 0
+    cells: int = 0
+
+    def scaled(self, values: ArrayLike) -> Floats:
+        """Return values as the model is linear in them."""
+        return np.asarray(np.log(values) if self.logarithmic else values, dtype=np.float64)
+
+    def wider(self, low: float, high: float) -> tuple[float, float]:
+        """Return ends that are farther out by as much as counts as the same."""
+        if self.logarithmic:
+            return low / self.tolerance, high * self.tolerance
+        return low - self.tolerance, high + self.tolerance
+
+    def varies(self, values: Floats) -> bool:
+        """Return whether the last of the sorted values is another than the first."""
+        return bool(values[-1] > self.wider(values[0], values[0])[1])
+
+    def middles(self, groups: Sequence[Floats] | Floats) -> Floats:
+        """Return the values between neighbouring groups of sorted values."""
+        last = np.array([group[-1] for group in groups[:-1]])
+        first = np.array([group[0] for group in groups[1:]])
+        return np.asarray(np.sqrt(last * first) if self.logarithmic else (last + first) / 2)
+
+    def edges(self, values: Floats, count: int, *, single: bool) -> Floats:
+        """Return edges of one bin a value, or of ``count`` bins of about as many values each.
+
+        A ``single`` bin, of what does not vary, is as wide as what counts as the same. The ends of
+        others are so far out that rounding puts no pose outside; angles that begin near 0 begin
+        at 0.
+        """
+        if single:
+            return np.maximum(self.wider(values[0], values[-1]), 0.0)
+        inner = self.middles(values[:, None]) if len(values) <= MAX_VALUES else (
+            np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))[1:-1])
+        ends = values[[0, -1]]
+        margin = 2.0 * SAME * ends if self.logarithmic else 100.0 * SAME
+        low, high = ends + np.array([-1.0, 1.0]) * margin
+        if not self.logarithmic and low <= FRONTAL_DEG:
+            low = 0.0
+        return np.concatenate([[low], inner, [high]])
+
+    def between(self, values: Floats) -> Floats | None:
+        """Return the middles between the few values, None if there are many.
+
+        Values that jitter spreads by no more than what counts as the same are one.
+
+        >>> CONDITIONS["bearing_deg"].between(
+        ...     np.array([*np.linspace(0.0, 0.1, 99), 20.0])).tolist()
+        [10.05]
+        """
+        groups: Sequence[Floats] = list(values[:, None])
+        if len(values) > MAX_VALUES:
+            same = math.log(self.tolerance) if self.logarithmic else self.tolerance
+            jumps = np.diff(self.scaled(values)) > same
+            groups = np.split(values, np.flatnonzero(jumps) + 1)
+            if len(groups) > MAX_VALUES or any(map(self.varies, groups)):
+                return None
+        return self.middles(groups)
+
+
+CONDITIONS = {
+    "distance_m": Condition("the distance along the optical axis", "m", True, 1.02, 16, 12),
+    "side_px": Condition("the side of the black square, were it parallel to the image", "px",
+                         True, 1.02, 8, 6),
+    "viewing_angle_deg": Condition("the angle between the marker's normal and the line of sight",
+                                   "degree", False, 1.0, 16, 12),
+    "bearing_deg": Condition("the angle between the line of sight and the optical axis", "degree",
+                             False, 1.0),
+}
+"""Models do not depend on the last, but hold where it was seen."""
+
+PREDICTORS = ("distance_m", "side_px", "viewing_angle_deg")
+"""What models depend on."""
+
+
+@dataclass(frozen=True)
 class Bins:
     """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
 
@@ -409,11 +463,11 @@ class Bins:
         """Numbers of bins."""
         return tuple(len(each) - 1 for each in self.edges)
 
-    def numbers(self, *values: Floats) -> tuple[Integers, NDArray[np.bool_]]:
+    def numbers(self, values: Sequence[Floats]) -> tuple[Integers, Masks]:
         """Return the flat numbers of the bins of points, and which points are in a bin."""
         inside = np.ones(values[0].shape, dtype=bool)
         flat = np.zeros(values[0].shape, dtype=np.int64)
-        for each, edges in zip(values, self.edges, strict=True):
+        for each, edges in zip(values, self.edges, strict=False):
             number = np.searchsorted(edges, each, side="right") - 1
             number = np.where(each == edges[-1], len(edges) - 2, number)
             inside &= (number >= 0) & (number < len(edges) - 1)
@@ -442,81 +496,59 @@ def focal_size_of(results: xr.Dataset) -> xr.DataArray:
 
 
 def bins_and_cells(
-    results: xr.Dataset, focal_size: xr.DataArray, found: Mapping[str, Floats]
+    found: Mapping[str, Floats], poses: int, *, collinear: bool
 ) -> tuple[Bins, Bins]:
     """Return the bins that models are fitted to, and the wider cells in which they are judged.
 
     Few distinct values, of an axis, have a bin and a cell each; others, which were drawn, have some
-    of about as many poses each. ``found``: the `distinct_values`.
+    of about as many poses each.
+
+    Parameters
+    ----------
+    found
+        The `distinct_values`.
+    poses
+        Scenes of the dataset.
+    collinear
+        Whether the side follows from the distance: then it has one bin, as what does not vary.
     """
-    found = {name: found[name] for name in PREDICTORS}
-    collinear = float(focal_size.max()) <= float(focal_size.min()) * VARIES["side_px"]
-    # The side that follows from the distance has one bin, as what does not vary.
-    single = {name for name, values in found.items() if not _varies(name, values)}
-    if collinear and "distance_m" not in single:
-        single.add("side_px")
-    drawn = [name for name, values in found.items()
-             if name not in single and len(values) > MAX_VALUES]
-    poses = _pose_count(results)
-    others = math.prod(len(values) for name, values in found.items()
-                       if name not in single and name not in drawn)
-    many = max(2, int((poses / (POSES_A_CELL * others)) ** (1.0 / max(len(drawn), 1))))
-    bins, cells = (
-        Bins(tuple(
-            _domain(name, values) if name in single
-            else _with_margin(name, _edges(name, values, min(most, limits[name])))
-            for name, values in found.items()
-        )) for most, limits in ((max(MAX_BINS.values()), MAX_BINS), (many, MAX_CELLS)))
-    return bins, cells
+    varying = [name for name in PREDICTORS if CONDITIONS[name].varies(found[name])]
+    if collinear and "distance_m" in varying:
+        varying = [name for name in varying if name != "side_px"]
+    few = [name for name in varying if len(found[name]) <= MAX_VALUES]
+    others = math.prod(len(found[name]) for name in few)
+    many = max(2, int((poses / (POSES_A_CELL * others)) ** (
+        1.0 / max(len(varying) - len(few), 1))))
+
+    def bins(count: Callable[[Condition], int]) -> Bins:
+        return Bins(tuple(
+            CONDITIONS[name].edges(
+                found[name], count(CONDITIONS[name]), single=name not in varying)
+            for name in PREDICTORS))
+
+    return bins(lambda each: each.bins), bins(lambda each: min(many, each.cells))
 
 
 def region_cells(
-    results: xr.Dataset, found: Mapping[str, Floats]
+    found: Mapping[str, Floats], poses: int, trials: int
 ) -> tuple[Bins, tuple[int, ...]]:
     """Return the cells of conditions that poses are in or not, and which conditions were drawn.
 
     Few distinct values, of an axis, have a cell each, also those that jitter spreads a little;
     others have some cells of about as many values each.
     """
-    middles = {name: _between(name, values) for name, values in found.items()}
-    drawn = [name for name, middle in middles.items() if middle is None]
-    others = math.prod(len(middle) + 1 for middle in middles.values() if middle is not None)
+    middles = [CONDITIONS[name].between(values) for name, values in found.items()]
+    drawn = tuple(k for k, middle in enumerate(middles) if middle is None)
     # Values that go together along an axis make fewer combinations.
-    others = min(others, _pose_count(results) // results.sizes.get(DRAWS, 1))
-    many = _pose_count(results) / (POSES_A_REGION_CELL * others)
+    others = min(math.prod(len(middle) + 1 for middle in middles if middle is not None),
+                 poses // trials)
+    many = poses / (POSES_A_REGION_CELL * others)
     count = min(max(1, int(many ** (1.0 / max(len(drawn), 1)))), MAX_REGION_CELLS)
-    edges = []
-    for name, values in found.items():
-        middle = middles[name]
-        if middle is None:
-            middle = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1))[1:-1])
-        edges.append(np.concatenate([[-np.inf], middle, [np.inf]]))
-    return Bins(tuple(edges)), tuple(k for k, name in enumerate(found) if name in drawn)
-
-
-def _pose_count(results: xr.Dataset) -> int:
-    return math.prod(results.sizes[name] for name in results["true_tvec_m"].dims if name != "xyz")
-
-
-def _between(name: str, values: Floats) -> Floats | None:
-    """Return the middles between the few values of a condition, None if it has many.
-
-    Values that jitter spreads by no more than what counts as the same are one.
-
-    >>> _between("bearing_deg", np.array([*np.linspace(0.0, 0.1, 99), 20.0])).tolist()
-    [10.05]
-    """
-    logarithmic, same = CONDITIONS[name], VARIES[name]
-    if len(values) <= MAX_VALUES:
-        last, first = values[:-1], values[1:]
-    else:
-        jumps = np.diff(np.log(values)) > math.log(same) if logarithmic else np.diff(values) > same
-        groups = np.split(values, np.flatnonzero(jumps) + 1)
-        if len(groups) > MAX_VALUES or any(_varies(name, group) for group in groups):
-            return None
-        last, first = (np.array([group[k] for group in some])
-                       for some, k in ((groups[:-1], -1), (groups[1:], 0)))
-    return np.asarray(np.sqrt(last * first) if logarithmic else (last + first) / 2)
+    shares = np.linspace(0.0, 1.0, count + 1)[1:-1]
+    return Bins(tuple(
+        np.concatenate([[-np.inf], np.unique(np.quantile(values, shares))
+                        if middle is None else middle, [np.inf]])
+        for middle, values in zip(middles, found.values(), strict=True))), drawn
 
 
 def region_directions(found: Mapping[str, Floats]) -> Floats:
@@ -525,11 +557,10 @@ def region_directions(found: Mapping[str, Floats]) -> Floats:
     In ln(distance), ln(side), viewing angle and bearing. The fifth is ln(fx size); then follow, of
     two conditions that vary, sum and difference in units of their ranges.
     """
-    ranges = [np.ptp(np.log(values) if CONDITIONS[name] else values)
-              for name, values in found.items()]
-    unit = np.eye(len(ranges))
-    rows = [*unit, unit[0] + unit[1]]
-    varying = [k for k, (name, values) in enumerate(found.items()) if _varies(name, values)]
+    unit, rows = np.eye(len(found)), [*np.eye(len(found)), np.eye(len(found))[:2].sum(axis=0)]
+    ranges = [np.ptp(CONDITIONS[name].scaled(values)) for name, values in found.items()]
+    varying = [k for k, (name, values) in enumerate(found.items())
+               if CONDITIONS[name].varies(values)]
     for a, b in itertools.combinations(varying, 2):
         rows += [unit[a] / ranges[a] + sign * unit[b] / ranges[b] for sign in (1.0, -1.0)]
     return np.stack(rows)
@@ -543,19 +574,19 @@ def region_ends(directions: Floats, reach: Floats, draws: Floats) -> tuple[Float
     the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
     """
     high, low = np.split(reach * np.repeat([1.0, -1.0], len(directions)), 2, axis=-1)
-    same = np.array([math.log(VARIES[name]) if logarithmic else VARIES[name]
-                     for name, logarithmic in CONDITIONS.items()])
+    logarithmic = np.array([each.logarithmic for each in CONDITIONS.values()])
+    same = np.array([math.log(each.tolerance) if each.logarithmic else each.tolerance
+                     for each in CONDITIONS.values()])
     # Knots at the ends lie 2e-6 outside the poses.
-    rounding = np.where(list(CONDITIONS.values()), 3.0 * SAME, 200.0 * SAME)
+    rounding = np.where(logarithmic, 3.0 * SAME, 200.0 * SAME)
     alone = [*range(len(same)), 0]  # ln(fx size) has the tolerance of ln(distance)
     count = len(alone)
     margin = np.repeat(SLACK + np.sqrt(CORNER / draws)[:, None], low.shape[1], axis=1)
     margin[:, :count] = np.where(
         high[:, :count] - low[:, :count] <= same[alone], same[alone], rounding[alone])
     margin[:, count - 1] = np.maximum(margin[:, count - 1], 2.0 * rounding[0])  # of two ends
-    wider = low - margin
-    frontal = ~np.array(list(CONDITIONS.values())) & (wider[:, : len(same)] <= FRONTAL_DEG)
-    ends = np.where(frontal, 0.0, wider[:, : len(same)])
+    wider = (low - margin)[:, : len(same)]
+    ends = np.where(~logarithmic & (wider <= FRONTAL_DEG), 0.0, wider)
     # Where an angle begins at 0, its sums and differences reach as much farther.
     margin[:, count:] += (low[:, : len(same)] - ends) @ np.abs(directions[count:]).T
     low, high = low - margin, high + margin
@@ -563,81 +594,28 @@ def region_ends(directions: Floats, reach: Floats, draws: Floats) -> tuple[Float
     return low, high
 
 
-def _domain(name: str, values: Floats) -> Floats:
-    """Return the ends of the domain of what does not vary: as wide as what counts as the same."""
-    low, high = values[0], values[-1]
-    if PREDICTORS[name]:
-        return np.array([low / VARIES[name], high * VARIES[name]])
-    return np.array([max(low - VARIES[name], 0.0), high + VARIES[name]])
-
-
-def _with_margin(name: str, edges: Floats) -> Floats:
-    """Return edges whose ends are so far out that rounding puts no pose outside.
-
-    Viewing angles that begin near 0 begin at 0.
-    """
-    ends = edges[[0, -1]]
-    margin = 2.0 * SAME * ends if PREDICTORS[name] else 100.0 * SAME
-    low, high = ends + np.array([-1.0, 1.0]) * margin
-    if name == "viewing_angle_deg" and low <= FRONTAL_DEG:
-        low = 0.0
-    return np.concatenate([[low], edges[1:-1], [high]])
-
-
-def distinct_values(results: xr.Dataset, focal_size: xr.DataArray) -> dict[str, Floats]:
-    """Return the distinct values (n,) of each condition among the poses looked for.
+def distinct_values(columns: Columns[SightErrors]) -> dict[str, Floats]:
+    """Return the sorted values (n,) of each condition among the poses looked for, the same once.
 
     Raises
     ------
     DatasetError
         If no pose was looked for.
     """
-    position = results["true_tvec_m"].reset_coords(drop=True).compute()
-    distance = position.isel(xyz=2, drop=True)
-    angle = xr.apply_ufunc(
-        viewing_angle_of, results["true_rvec"].reset_coords(drop=True).compute(), position,
-        input_core_dims=[["xyz"], ["xyz"]])
-    bearing = xr.apply_ufunc(bearing_of, position, input_core_dims=[["xyz"]])
-    seen = results["detection"].reset_coords(drop=True)
-    counted = ~seen.isin(uncounted_values(DetectionStatus)) & (distance > 0)
-    counted = counted.any([dim for dim in counted.dims if dim not in position.dims])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        side = focal_size / distance
-    found = {
-        "distance_m": _distinct(distance.where(counted)),
-        "side_px": _distinct(side.where(counted)),
-        "viewing_angle_deg": _distinct(angle.where(counted), absolute=True),
-        "bearing_deg": _distinct(bearing.where(counted), absolute=True),
-    }
-    if not all(len(values) for values in found.values()):
-        raise DatasetError("no pose was looked for: there are no errors to model")
+    def of_block(poses: SightErrors, _: tuple[slice, ...]) -> list[Floats]:
+        used = poses.looked_for & (poses.distance_m > 0)
+        return [np.unique(poses.used(each, used)) for each in poses.conditions]
+
+    found = {}
+    for (name, condition), parts in zip(
+            CONDITIONS.items(), zip(*columns.map(of_block), strict=True), strict=True):
+        values = np.unique(np.concatenate(parts))
+        values = values[np.isfinite(values)]
+        if not len(values):
+            raise DatasetError("no pose was looked for: there are no errors to model")
+        least = SAME * values[1:] if condition.logarithmic else 100 * SAME
+        found[name] = values[np.concatenate([[True], np.diff(values) > least])]
     return found
-
-
-def _distinct(values: xr.DataArray, *, absolute: bool = False) -> Floats:
-    """Return the sorted values, those that are the same once."""
-    flat = np.unique(values.to_numpy())
-    flat = flat[np.isfinite(flat)]
-    if not len(flat):
-        return np.asarray(flat)
-    step = np.diff(flat)
-    return np.asarray(
-        flat[np.concatenate([[True], step > (100 * SAME if absolute else SAME * flat[1:])])])
-
-
-def _varies(name: str, values: Floats) -> bool:
-    """Return whether the last of the sorted values is another than the first."""
-    low, high, least = values[0], values[-1], VARIES[name]
-    return bool(high > low * least if CONDITIONS[name] else high - low > least)
-
-
-def _edges(name: str, values: Floats, count: int) -> Floats:
-    """Return edges of one bin a value, or of bins of about as many distinct values each."""
-    if len(values) <= MAX_VALUES:
-        middle = np.sqrt(values[:-1] * values[1:]) if PREDICTORS[name] else (
-            (values[:-1] + values[1:]) / 2)
-        return np.concatenate([values[:1], middle, values[-1:]])
-    return np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
 
 
 def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
@@ -648,14 +626,13 @@ def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
     """
     knots = []
     columns = moments.reshape(*bins.shape, 4)
-    for axis, (logarithmic, edges) in enumerate(
-            zip(PREDICTORS.values(), bins.edges, strict=True)):
+    for axis, (name, edges) in enumerate(zip(PREDICTORS, bins.edges, strict=True)):
         others = tuple(k for k in range(len(bins.shape)) if k != axis)
         count, total = np.moveaxis(columns[..., [0, 1 + axis]].sum(axis=others), -1, 0)
         middle = total[count > 0] / count[count > 0]
-        ends = np.log(edges[[0, -1]]) if logarithmic else edges[[0, -1]]
         if len(middle) > 1:
-            middle = np.unique(np.concatenate([ends[:1], middle[1:-1], ends[1:]]))
+            low, high = CONDITIONS[name].scaled(edges[[0, -1]])
+            middle = np.unique([low, *middle[1:-1], high])
         knots.append(middle)
     return knots
 
@@ -702,16 +679,6 @@ class Use(Flag):
     rarely_solved = flag(6, "Less than 90 % of the poses are solved: must not be used.")
 
 
-
-
-UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree",
-         "bearing_deg": "degree"}
-WORDS = {
-    "distance_m": "the distance along the optical axis",
-    "side_px": "the side of the black square, were it parallel to the image",
-    "viewing_angle_deg": "the angle between the marker's normal and the line of sight",
-    "bearing_deg": "the angle between the line of sight and the optical axis",
-}
 
 
 def error_models(results: xr.Dataset) -> xr.Dataset:
@@ -775,68 +742,75 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     """
     kept = [name for name in axes_of(results) if is_kept(name, results)]
     kept_dimensions(results, kept)
-    pose_arrays(results, SIGNED_INPUTS)
+    inputs = pose_arrays(results, SIGNED_INPUTS)
     _check_drawn(results, kept)
     focal_size = focal_size_of(results)
-    found = distinct_values(results, focal_size)
-    bins, cells = bins_and_cells(results, focal_size, found)
-    (region, drawn), directions = region_cells(results, found), region_directions(found)
-    inputs = pose_arrays(results, SIGNED_INPUTS) | {
+    inputs |= {
         HALF: (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS),
         FOCAL_SIZE: focal_size}
     columns = Columns(arranged(results, inputs, kept)[1], SightErrors)
+    found = distinct_values(columns)
+    poses = math.prod(
+        size for name, size in results["true_tvec_m"].sizes.items() if name != "xyz")
+    least, most = float(focal_size.min()), float(focal_size.max())
+    bins, cells = bins_and_cells(
+        found, poses, collinear=most <= least * CONDITIONS["side_px"].tolerance)
+    region, drawn = region_cells(found, poses, results.sizes[DRAWS])
+    directions = region_directions(found)
     moments = columns.sums(functools.partial(_moments, bins))
     _check_solved(moments, results, kept)
     values = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
     selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), values)
                  for k in range(len(QUANTITIES))] for model in moments]
     shown = [choose_knots(values[0], SHOWN_DISTANCES), *(each[:1] for each in values[1:])]
-    knots = union([each for model in selected for each in [*model, shown]])
+    # All errors are given at the knots of all: what is linear between some is so between all.
+    knots = [np.unique(np.concatenate(each)) for each in zip(
+        shown, *(own for model in selected for own in model), strict=True)]
     # The model of each half, by which the other is judged:
     # (models, halves, knots, quantities, 2).
     fitted = np.array([
         [[(fit.bias, fit.log_variance) for fit in _fits(half, own, knots)] for half in model]
         for model, own in zip(moments, selected, strict=True)]).transpose(0, 1, 4, 2, 3)
     judged = columns.sums(functools.partial(_within, cells, knots, fitted))
-    seen = columns.sums(lambda poses, _: _counted(region, poses))
+    seen = columns.sums(lambda poses, _: _add(region, poses, poses.looked_for, [1.0]))
     reach = columns.sums(lambda poses, _: _reach(directions, poses), np.maximum)
-    tables = []
-    for number, (whole, own) in enumerate(zip(moments.sum(axis=1), selected, strict=True)):
-        tables.append({
-            **_knot_variables(_fits(whole, own, knots), knots), **_exponents(whole),
-            **_cell_variables(judged[number], cells),
-            **_region_variables(region, drawn, directions, seen[number], reach[number]),
-            "knots": (("quantity", "predictor"), np.array([[*map(len, each)] for each in own]),
-                      cf_attributes("knots that the error needs", "1"))})
+    whole = moments.sum(axis=1)
+    table = {
+        **_knot_variables([_fits(*each, knots) for each in zip(whole, selected, strict=True)],
+                          knots),
+        **_exponents(whole), **_cell_variables(judged, cells),
+        **_region_variables(region, drawn, directions, seen.sum(axis=(1, 3)), reach),
+        "knots": (("quantity", "predictor"), np.array(
+            [[[*map(len, own)] for own in model] for model in selected]),
+            cf_attributes("knots that the error needs", "1"))}
     shape = tuple(results.sizes[name] for name in kept)
     variables: dict[str, Any] = {
-        name: ((*kept, *dims), np.stack([table[name][1] for table in tables]).reshape(
-            (*shape, *first.shape)), attributes)
-        for name, (dims, first, attributes) in tables[0].items()}
+        name: ((*kept, *dims), array.reshape((*shape, *array.shape[1:])), attributes)
+        for name, (dims, array, attributes) in table.items()}
     variables["direction_weight"] = (("direction", "condition"), directions, cf_attributes(
         "weights of ln(distance), ln(side), viewing angle and bearing", ""))
     coordinates: dict[str, Any] = {
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
-    for (name, logarithmic), at_knots, edges in zip(
-            PREDICTORS.items(), knots, cells.edges, strict=True):
-        attributes = {"units": UNITS[name], "long_name": f"knots of {WORDS[name]}"}
+
+    def described(name: str, words: str) -> dict[str, str]:
+        return {"units": CONDITIONS[name].units, "long_name": f"{words} {CONDITIONS[name].words}"}
+
+    for name, at_knots, edges in zip(PREDICTORS, knots, cells.edges, strict=True):
         # A knot at an end must not leave the domain by the rounding of its logarithm.
-        plain = at_knots
-        if logarithmic:
-            plain = np.clip(np.exp(at_knots), edges[0], edges[-1])
-        coordinates[name] = (name, plain, attributes)
+        plain = np.clip(np.exp(at_knots), edges[0], edges[-1]) if (
+            CONDITIONS[name].logarithmic) else at_knots
+        coordinates[name] = name, plain, described(name, "knots of")
         for ending, ends in (("low", edges[:-1]), ("high", edges[1:])):
-            coordinates[f"cell_{name}_{ending}"] = (f"cell_{name}", ends, {
-                "units": UNITS[name], "long_name": f"{ending} end of cells of {WORDS[name]}"})
+            coordinates[f"cell_{name}_{ending}"] = (
+                f"cell_{name}", ends, described(name, f"{ending} end of cells of"))
     for name, edges in zip(CONDITIONS, region.edges, strict=True):
-        coordinates[f"region_{name}"] = (f"region_{name}", edges[:-1], {
-            "units": UNITS[name], "long_name": f"low end of cells of the region of {WORDS[name]}"})
-    focal = focal_size.astype(np.float64)
+        coordinates[f"region_{name}"] = (
+            f"region_{name}", edges[:-1], described(name, "low end of cells of the region of"))
     return with_sampling(xr.Dataset(variables, coordinates, attrs={
-        "focal_size_px_m": float(focal.mean()),
-        "focal_size_varies": int(float(focal.max()) > float(focal.min()) * (1 + 1e-9)),
+        "focal_size_px_m": float(focal_size.mean()),
+        "focal_size_varies": int(most > least * (1 + 1e-9)),
     }), results)
 
 
@@ -844,7 +818,9 @@ def _fits(
     moments: Floats, own: Sequence[Sequence[Floats]], knots: Sequence[Floats]
 ) -> list[Fit]:
     """Return the fits of the errors with their own knots, at those of all."""
-    points, fits = grid_points(knots), []
+    # Points of the grid of all knots, the last axis fastest.
+    points = np.stack([each.ravel() for each in np.meshgrid(*knots, indexing="ij")], axis=-1)
+    fits = []
     for quantity, of_error in enumerate(own):
         sums = BinSums.of(moments, quantity)
         fit = fit_error(sums, hat_basis(sums.at, of_error), differences(of_error))
@@ -888,95 +864,101 @@ def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> 
                 f"error model needs {MIN_POSES} or more: more trials, or larger sides")
 
 
-def _region_variables(
-    region: Bins, drawn: Sequence[int], directions: Floats, counts: Floats, reach: Floats
-) -> Table:
-    """Return the joint region of the conditions that was seen.
-
-    ``counts`` (halves, cells, 1) are the poses looked for, ``reach`` their projections.
-    """
-    cells = counts.sum(axis=(0, 2)).reshape(region.shape)
-    of_grid = cells.sum(axis=tuple(drawn))
-    draws = np.where(of_grid > 0, of_grid, np.inf).min()
-    low, high = region_ends(directions, reach[None], np.array([draws]))
-    return {
-        "region_low": (("direction",), low[0], cf_attributes(
-            "smallest weighted sum of a direction in the region", "")),
-        "region_high": (("direction",), high[0], cf_attributes(
-            "largest weighted sum of a direction in the region", "")),
-        "region_seen": (tuple(f"region_{name}" for name in CONDITIONS), cells > 0, cf_attributes(
-            "whether a cell of the conditions has poses", "1")),
-    }
-
-
 def _metres(distance_m: Floats) -> Floats:
     """Return what errors (quantities, distances) are multiplied with: positions with distances."""
     scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
     return np.asarray(scale * distance_m + (1.0 - scale))
 
 
-def _knot_variables(fits: Sequence[Fit], knots: Sequence[Floats]) -> Table:
+def _region_variables(
+    region: Bins, drawn: Sequence[int], directions: Floats, counts: Floats, reach: Floats
+) -> Table:
+    """Return the joint region of the conditions that was seen.
+
+    ``counts`` (models, cells) are the poses looked for, ``reach`` their projections.
+    """
+    cells = counts.reshape(-1, *region.shape)
+    of_grid = cells.sum(axis=tuple(1 + k for k in drawn)).reshape(len(cells), -1)
+    draws = np.where(of_grid > 0, of_grid, np.inf).min(axis=1)
+    low, high = region_ends(directions, reach, draws)
+    return {
+        "region_low": (("direction",), low, cf_attributes(
+            "smallest weighted sum of a direction in the region", "")),
+        "region_high": (("direction",), high, cf_attributes(
+            "largest weighted sum of a direction in the region", "")),
+        "region_seen": (tuple(f"region_{name}" for name in CONDITIONS), cells > 0, cf_attributes(
+            "whether a cell of the conditions has poses", "1")),
+    }
+
+
+def _knot_variables(fits: Sequence[Sequence[Fit]], knots: Sequence[Floats]) -> Table:
     """Return sigma and bias of each error at the knots, with their intervals."""
-    shape = (len(QUANTITIES), *map(len, knots))
+    shape = (-1, len(QUANTITIES), *map(len, knots))
     metres = _metres(np.exp(knots[0]))[:, :, None, None]
+    bias, bias_error, log_variance, error = np.moveaxis(np.array([
+        [(fit.bias, fit.bias_error, fit.log_variance, fit.log_variance_error) for fit in model]
+        for model in fits]), 2, 0)
     table: Table = {}
     for (ending, words), side in zip(INTERVAL.items(), (0.0, -1.0, 1.0), strict=True):
-        by_name = {
-            "sigma": ("standard deviation of the error", [np.exp(0.5 * (
-                fit.log_variance + side * DEVIATIONS * fit.log_variance_error)) for fit in fits]),
-            "bias": ("mean error, estimated minus true", [
-                fit.bias + side * DEVIATIONS * fit.bias_error for fit in fits])}
-        table |= {f"{name}{ending}": (
-            ("quantity", *PREDICTORS), np.stack(values).reshape(shape) * metres,
-            cf_attributes(f"{words}{meaning}", "m, radian"))
-            for name, (meaning, values) in by_name.items()}
+        for name, meaning, values in (
+            ("sigma", "standard deviation of the error",
+             np.exp(0.5 * (log_variance + side * DEVIATIONS * error))),
+            ("bias", "mean error, estimated minus true", bias + side * DEVIATIONS * bias_error),
+        ):
+            table[f"{name}{ending}"] = (
+                ("quantity", *PREDICTORS), values.reshape(shape) * metres,
+                cf_attributes(f"{words}{meaning}", "m, radian"))
     return table
 
 
 def _cell_variables(halves: Floats, bins: Bins) -> Table:
-    """Return whether the model may be used in cells; ``halves`` (halves, cells, columns)."""
-    sums = halves.sum(axis=0)
-    looked_for, solved, flipped, n = np.rint(sums[:, : len(COUNTS)]).astype(np.int64).T
-    shown = slice(len(COUNTS), len(COUNTS) + len(QUANTITIES))
+    """Return whether models may be used in cells; ``halves`` (models, halves, cells, columns)."""
+    sums = halves.sum(axis=1)
+    looked_for, solved, flipped, n = np.moveaxis(
+        np.rint(sums[..., : len(COUNTS)]).astype(np.int64), -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        coverage, camera = np.split(sums[:, len(COUNTS):] / n[:, None], 2, axis=1)
+        within, camera = np.split(halves[..., len(COUNTS):], 2, axis=-1)
+        coverage, in_camera = (each.sum(axis=1) / n[..., None] for each in (within, camera))
         flip_rate, solved_rate = flipped / solved, solved / looked_for
-        of_half = halves[..., shown] / halves[..., [COUNTS.index("judged")]]
-        spread, spread_of_half = (np.sqrt(NOMINAL * (1.0 - NOMINAL) / count)[..., None]
-                                  for count in (n, halves[..., COUNTS.index("judged")]))
+        judged = halves[..., [COUNTS.index("judged")]]
+        spread, spread_of_half = (
+            np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[..., None], judged))
+        of_half = within / judged
     # Limits are wider by a standard error, of each half by two.
     low, high = (
         (sign * (coverage - limit) > spread) | (
-            sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=0)
+            sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=1)
         for sign, limit in zip((-1.0, 1.0), COVERAGE, strict=True))
     use = np.select(
-        [(looked_for == 0)[:, None], (solved_rate < MIN_DETECTION)[:, None],
-         (flip_rate > MAX_FLIPS)[:, None], (n < MIN_JUDGED)[:, None], low, high],
+        [*(each[..., None] for each in (
+            looked_for == 0, solved_rate < MIN_DETECTION, flip_rate > MAX_FLIPS, n < MIN_JUDGED)),
+         low, high],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
         Use.holds).astype(np.uint8)
     cells = tuple(f"cell_{name}" for name in PREDICTORS)
-    by_quantity = {
-        "coverage": (coverage, cf_attributes("share of held-out errors within two sigma of the "
-                                             "bias", "1")),
-        "camera_coverage": (camera, cf_attributes(
-            "the same along and about the camera's own axes", "1")),
-        "use": (use, cf_attributes("whether the model may be used", "", flags=Use))}
-    by_cell = {
-        "judged": (n, "held-out poses that were judged"),
-        "looked_for": (looked_for, "poses looked for"),
-        "solved_rate": (solved_rate, "solved of the poses looked for"),
-        "flip_rate": (flip_rate, "nearer to the mirror of the truth, of the solved")}
-    return {name: (("quantity", *cells), values.T.reshape(-1, *bins.shape), attributes)
-            for name, (values, attributes) in by_quantity.items()} | {
-        name: (cells, values.reshape(bins.shape), cf_attributes(meaning, "1"))
-        for name, (values, meaning) in by_cell.items()}
+    table: Table = {
+        name: (("quantity", *cells), np.moveaxis(values, -1, 1).reshape(
+            -1, len(QUANTITIES), *bins.shape), attributes)
+        for name, values, attributes in (
+            ("coverage", coverage, cf_attributes(
+                "share of held-out errors within two sigma of the bias", "1")),
+            ("camera_coverage", in_camera, cf_attributes(
+                "the same along and about the camera's own axes", "1")),
+            ("use", use, cf_attributes("whether the model may be used", "", flags=Use)))}
+    return table | {
+        name: (cells, values.reshape(-1, *bins.shape), cf_attributes(meaning, "1"))
+        for name, values, meaning in (
+            ("judged", n, "held-out poses that were judged"),
+            ("looked_for", looked_for, "poses looked for"),
+            ("solved_rate", solved_rate, "solved of the poses looked for"),
+            ("flip_rate", flip_rate, "nearer to the mirror of the truth, of the solved"))}
 
 
 def _exponents(moments: Floats) -> Table:
     """Return the power of the distance, or of the side, with which sigma goes."""
-    values = np.full((3, len(QUANTITIES)), np.nan)
-    for k in range(len(QUANTITIES)):
-        sums = BinSums.of(moments, k)
+    values = np.full((3, len(moments), len(QUANTITIES)), np.nan)
+    for model, k in np.ndindex(*values.shape[1:]):
+        sums = BinSums.of(moments[model], k)
         axis = 0 if np.ptp(sums.at[:, 0]) > 0.05 or np.ptp(sums.at[:, 1]) < 0.05 else 1
         if np.ptp(sums.at[:, axis]) < 0.05:
             continue
@@ -985,7 +967,7 @@ def _exponents(moments: Floats) -> Table:
         fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
         metres = 1.0 if axis == 0 and k < 3 else 0.0
         half = DEVIATIONS * 0.5 * fit.log_variance_error[0]
-        values[:, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
+        values[:, model, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
     words = "power of the distance (of the side, if only that varies) with which sigma goes"
     return {f"exponent{ending}": (("quantity",), each, cf_attributes(text + words, "1"))
             for (ending, text), each in zip(INTERVAL.items(), values, strict=True)}
@@ -1016,25 +998,12 @@ class SightErrors(Poses):
         return np.asarray(self[DEPTH], dtype=np.float64)
 
     @cached_property
-    def side_px(self) -> Floats:
-        """The black square's side (...), were it parallel to the image: fx · size / distance."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
-
-    @cached_property
-    def viewing_angle_deg(self) -> Floats:
-        """Angle (...) between the marker's normal and the line of sight."""
-        return viewing_angle_of(self["true_rvec"], self["true_tvec_m"])
-
-    @cached_property
-    def bearing_deg(self) -> Floats:
-        """Angle (...) between the line of sight and the optical axis."""
-        return bearing_of(self["true_tvec_m"])
-
-    @property
     def conditions(self) -> tuple[Floats, ...]:
-        """Distance, side, viewing angle and bearing, each (...)."""
-        return self.distance_m, self.side_px, self.viewing_angle_deg, self.bearing_deg
+        """`CONDITIONS`, each (...); the side is fx · size / distance."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            side = np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
+        return (self.distance_m, side, viewing_angle_of(self["true_rvec"], self["true_tvec_m"]),
+                bearing_of(self["true_tvec_m"]))
 
     @cached_property
     def in_camera(self) -> Floats:
@@ -1066,7 +1035,7 @@ def _add(bins: Bins, poses: SightErrors, used: Masks, columns: Sequence[Any]) ->
 
     ``used`` has the shape of the poses' flags; columns are (n,) of all used ones, or 1 each.
     """
-    number, inside = bins.numbers(*poses.conditions[: len(bins.edges)])
+    number, inside = bins.numbers(poses.conditions)
     groups, size = len(poses.detection), math.prod(bins.shape)
     flat = (np.arange(groups).reshape(-1, 1, 1, 1) * HALVES + poses[HALF]) * size + number
     at = np.broadcast_to(flat, used.shape)[used]
@@ -1074,11 +1043,6 @@ def _add(bins: Bins, poses: SightErrors, used: Masks, columns: Sequence[Any]) ->
     sums = [np.bincount(at, np.where(within, each, 0.0), groups * HALVES * size)
             for each in columns]
     return np.stack(sums, axis=-1).reshape(groups, HALVES, size, len(columns)).astype(float)
-
-
-def _counted(bins: Bins, poses: SightErrors) -> Floats:
-    """Return the numbers of poses looked for, (groups, halves, bins, 1)."""
-    return _add(bins, poses, poses.looked_for, [1.0])
 
 
 def _reach(directions: Floats, poses: SightErrors) -> Floats:
@@ -1206,9 +1170,8 @@ def model_errors(
         np.searchsorted(cell_edges(model, name)[1:-1], value, side="right")
         for name, value in zip(PREDICTORS, (distance, side, angle), strict=True)),
         model["flip_rate"].shape)
-    knots = [np.log(model[name].values) if logarithmic else model[name].values
-             for name, logarithmic in PREDICTORS.items()]
-    basis = hat_basis(at[:, : len(knots)], knots)
+    basis = hat_basis(at[:, : len(PREDICTORS)], [
+        CONDITIONS[name].scaled(model[name].values) for name in PREDICTORS])
     bias = model["bias"].values / _metres(model["distance_m"].values)[:, :, None, None]
     flat = (len(QUANTITIES), -1)
     values = {
@@ -1298,11 +1261,10 @@ def _seen(model: xr.Dataset, at: Floats, *, any_bearing: bool) -> Masks:
         free = weights[:, -1] == 0
         at, weights, low, high = at[:, :-1], weights[free, :-1], low[free], high[free]
         cells = np.asarray(cells.any(axis=-1))
-    plain = [np.exp(value) if logarithmic else value
-             for value, logarithmic in zip(at.T, CONDITIONS.values(), strict=False)]
     numbers = tuple(
-        np.searchsorted(model[f"region_{name}"].values[1:], value, side="right")
-        for value, name in zip(plain, CONDITIONS, strict=False))
+        np.searchsorted(model[f"region_{name}"].values[1:], np.exp(value) if (
+            condition.logarithmic) else value, side="right")
+        for value, (name, condition) in zip(at.T, CONDITIONS.items(), strict=False))
     with np.errstate(invalid="ignore"):
         projected = at @ weights.T
     return np.asarray(((low <= projected) & (projected <= high)).all(axis=1) & cells[numbers])

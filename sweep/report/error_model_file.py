@@ -14,8 +14,6 @@ from sweep.analysis.error_models import (
     CONDITIONS,
     PREDICTORS,
     QUANTITIES,
-    UNITS,
-    WORDS,
     Use,
     cell_edges,
     error_models,
@@ -102,8 +100,8 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
         "frame": FRAME, "formula": FORMULA,
         "errors": "estimated minus true; rotations as rotation vector of R_est R_trueᵀ; poses that "
                   "are solved and not flipped",
-        "units": UNITS,
-        "conditions": dict(WORDS),
+        "units": {name: each.units for name, each in CONDITIONS.items()},
+        "conditions": {name: each.words for name, each in CONDITIONS.items()},
         "flags": {each.name: each.meaning for each in Use},
         "warnings": warnings_of(models),
         "models": [
@@ -139,7 +137,7 @@ def _region(model: xr.Dataset) -> dict[str, Any]:
 
 def _logarithms(name: str, values: Any) -> Any:
     """Return values of a condition as they stand in u."""
-    return (np.log(values) if CONDITIONS[name] else np.asarray(values)).tolist()
+    return CONDITIONS[name].scaled(values).tolist()
 
 
 def _quantity(model: xr.Dataset) -> dict[str, Any]:
@@ -182,13 +180,12 @@ def warnings_of(models: xr.Dataset) -> list[str]:
             name == "side_px" and models.sizes["distance_m"] > 1
             and not models.attrs["focal_size_varies"]):
             value = float(models[name][0])
-            lines.append(f"{name} did not vary ({value:.4g} {UNITS[name]}): the models hold "
-                         "there alone")
+            lines.append(f"{name} did not vary ({value:.4g} {CONDITIONS[name].units}): the models "
+                         "hold there alone")
     bearing = models["direction_weight"].values[:, list(CONDITIONS).index("bearing_deg")] == 1
     low, high = (float(extreme(models[f"region_{end}"].values[..., bearing]))
                  for end, extreme in (("low", np.min), ("high", np.max)))
-    lines.append(f"bearings from {low:.4g} to {high:.4g} {UNITS['bearing_deg']}: the models hold "
-                 "there alone")
+    lines.append(f"bearings from {low:.4g} to {high:.4g} degree: the models hold there alone")
     return [*lines, *ALWAYS]
 
 

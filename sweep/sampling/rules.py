@@ -6,11 +6,10 @@ import dataclasses
 import importlib
 import math
 from bisect import bisect_right
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,33 +82,29 @@ class GroupResults:
         return tuple(b - a for a, b in zip(self.starts, self.stops, strict=True))
 
 
-class Stopping(Protocol):
-    """A rule of stopping for one pipeline; a frozen dataclass may have the properties as fields.
+@dataclass(frozen=True, slots=True)
+class Stopping:
+    """A rule of stopping for one pipeline.
 
-    Modules of rules are imported when a run starts: what is slow to import is imported in `needed`.
+    Attributes
+    ----------
+    ends
+        Numbers of trials at which waves end, increasing; the last one is ``max_trials``.
+    variables
+        The dataset's variables that it reads.
+    coupled
+        Names of the scene axes, not ``trial``, along which cells are decided together: those that
+        are pooled, or searched along.
+    needed
+        Returns for each scene of a group, shape ``results.shape``, whether it is needed. It must be
+        a function of the results alone, the same in every process, and of one value along an axis
+        that is not coupled whatever the group's others are.
     """
 
-    @property
-    def ends(self) -> tuple[int, ...]:
-        """Numbers of trials at which waves end, increasing; the last one is ``max_trials``."""
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """The dataset's variables that it reads."""
-
-    @property
-    def coupled(self) -> tuple[str, ...]:
-        """Names of the scene axes, not ``trial``, along which cells are decided together.
-
-        Those that are pooled, or searched along.
-        """
-
-    def needed(self, results: GroupResults) -> Masks:
-        """Return for each scene of a group, shape ``results.shape``, whether it is needed.
-
-        It must be a function of the results alone, the same in every process, and of one value
-        along an axis that is not coupled whatever the group's others are.
-        """
+    ends: tuple[int, ...]
+    variables: tuple[str, ...]
+    coupled: tuple[str, ...]
+    needed: Callable[[GroupResults], Masks]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -224,10 +219,6 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
 # --------------------------------------------------------------------------------------------------
 # Which scenes of a block are needed: a rule applied to what is committed of earlier waves.
 
-HELD_BYTES = 200_000_000
-"""Results of groups that a process keeps, so that each wave reads only the one before it."""
-
-
 @dataclass(frozen=True, slots=True)
 class Decision:
     """What the scenes of a block follow from.
@@ -257,19 +248,6 @@ class Decision:
 
 
 @dataclass(slots=True)
-class _Held:
-    """Values of a group: those of the waves before the last of ``bases``, and what they decide."""
-
-    bases: tuple[int, ...]
-    values: dict[str, NDArray[Any]]
-    needed: Masks | None = None
-
-    @property
-    def bytes(self) -> int:
-        return sum(values.nbytes for values in self.values.values())
-
-
-@dataclass(slots=True)
 class Decider:
     """Applies a rule to a store's committed results.
 
@@ -285,7 +263,8 @@ class Decider:
     pipeline: Pipeline
     rule: Stopping
     waves: Waves
-    _held: OrderedDict[tuple[int, ...], _Held] = field(default_factory=OrderedDict)
+    _decided: dict[Block, tuple[tuple[int, ...], Masks]] = field(default_factory=dict)
+    """The bases of each group's last decision, and its mask: other blocks of a wave ask, too."""
 
     @staticmethod
     def of(store: RunStore, rule: StoppingRule) -> Decider:
@@ -319,23 +298,26 @@ class Decider:
 
     def of_group(self, span: Block, decision: Decision) -> Masks:
         """Return for each scene of a group, along the condition axes, whether a wave needs it."""
-        held = self._held.get(span.starts)
-        if held is not None and held.bases == decision.bases and held.needed is not None:
-            return held.needed  # of another block of the wave
-        values = self._values(span, decision)
+        bases, mask = self._decided.get(span, ((), np.empty(0, dtype=bool)))
+        if bases == decision.bases:
+            return mask
+        last = self.waves.ends[decision.wave - 1]
+        values = {name: self._read(name, span, last)
+                  for name in dict.fromkeys(("detection", *self.rule.variables))}
+        if (values["detection"] == DetectionStatus.not_run).any():
+            raise StoreError(
+                f"{self.store.url}: trials below {last} of group {span} are not committed")
         kept = [k for k in range(len(span.starts)) if k != self.waves.trial]
         results = GroupResults(
             self.pipeline,
             tuple(span.starts[k] for k in kept), tuple(span.stops[k] for k in kept),
-            decision.wave, self.waves.ends[decision.wave - 1],
-            {name: values[name] for name in self.rule.variables},
+            decision.wave, last, {name: values[name] for name in self.rule.variables},
         )
         mask = np.array(self.rule.needed(results), dtype=bool)
         if mask.shape != results.shape:
             raise ValueError(f"a rule gave {mask.shape} for scenes {results.shape}")
         mask &= ~self._settled(values["detection"], kept)
-        if span.starts in self._held:
-            self._held[span.starts].needed = mask
+        self._decided[span] = decision.bases, mask
         return mask
 
     def _settled(self, detection: NDArray[Any], kept: list[int]) -> Masks:
@@ -346,39 +328,12 @@ class Decider:
         settled = unneeded.all(axis=-1).all(axis=coupled, keepdims=True)
         return np.asarray(settled)
 
-    def _values(self, span: Block, decision: Decision) -> Mapping[str, NDArray[Any]]:
-        """Return the values of a group before a wave, of the rule's variables and of detection."""
-        held = self._held.pop(span.starts, None)
-        at = 0 if held is None else len(held.bases)
-        if held is None or held.bases != decision.bases[:at]:
-            held, at = _Held((), {}), 0
-        names = dict.fromkeys(("detection", *self.rule.variables))
-        first = self.waves.ends[at - 1] if at else 0
-        last = self.waves.ends[decision.wave - 1]
-        if first < last:
-            axis = len(span.starts) - 1
-            for name in names:
-                new = self._read(name, span, first, last)
-                held.values[name] = (
-                    np.concatenate([held.values[name], new], axis=axis) if at else new
-                )
-            if (held.values["detection"] == DetectionStatus.not_run).any():
-                raise StoreError(
-                    f"{self.store.url}: trials below {last} of group {span} are not committed"
-                )
-        held.bases, held.needed = decision.bases, None
-        self._held[span.starts] = held
-        while len(self._held) > 1 and sum(e.bytes for e in self._held.values()) > HELD_BYTES:
-            self._held.popitem(last=False)
-        return held.values
-
-    def _read(self, name: str, span: Block, first: int, last: int) -> NDArray[Any]:
-        """Return a variable's values of trials [first, last) in the dimensions of the results."""
+    def _read(self, name: str, span: Block, last: int) -> NDArray[Any]:
+        """Return a variable's values of the trials below ``last``, as `GroupResults` has them."""
         pipeline, trial = self.pipeline, self.waves.trial
         variable = next(each for each in self.store.variables if each.name == name)
-        starts = tuple(first if k == trial else start for k, start in enumerate(span.starts))
         stops = tuple(last if k == trial else stop for k, stop in enumerate(span.stops))
-        part = region(variable, pipeline, Block(starts, stops))
+        part = region(variable, pipeline, Block(span.starts, stops))
         names, order = variable.dimensions(pipeline), result_dimensions(pipeline, variable)
         return np.asarray(self.store.array(name)[part]).transpose(
             [names.index(each) for each in order])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.messages import refusal
-from sweep.sampling.rules import GroupResults, condition_axes, result_dimensions
+from sweep.sampling.rules import GroupResults, Stopping, condition_axes, result_dimensions
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -141,31 +140,7 @@ def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Ma
 # --------------------------------------------------------------------------------------------------
 # A rule: what the results of earlier waves decide, and where more trials decide the rest.
 
-@dataclass(frozen=True, slots=True)
-class Search:
-    """Attributes as `sweep.sampling.rules.Stopping` has them.
-
-    Attributes
-    ----------
-    open_cells
-        Returns where trials are needed, over some axes of the scene, of the dataset of a group.
-    """
-
-    ends: tuple[int, ...]
-    variables: tuple[str, ...]
-    coupled: tuple[str, ...]
-    open_cells: Callable[[xr.Dataset], xr.DataArray]
-
-    def needed(self, results: GroupResults) -> Masks:
-        """Return for each scene of a group whether it is needed."""
-        names = [axis.name for axis in condition_axes(results.pipeline)]
-        dataset = group_dataset(results)
-        wanted = self.open_cells(dataset)
-        pooled = {name: dataset.sizes[name] for name in names if name not in wanted.dims}
-        return np.asarray(wanted.expand_dims(pooled).transpose(*names).values)
-
-
-def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Search:
+def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Stopping:
     """Return the rule of a pipeline's search.
 
     Raises
@@ -182,8 +157,17 @@ def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Search:
         variables = [name for each in parse_requirements(rule.requirements)
                      for name in each.requirable.variables]
     free = rule.among if rule.is_choice else rule.per
-    return Search(rule.ends, tuple(dict.fromkeys([*ESTIMATE_INPUTS, *variables])),
-                  tuple(axis.name for axis in axes if axis.name not in free), open_cells)
+
+    def needed(results: GroupResults) -> Masks:
+        dataset = group_dataset(results)
+        wanted = open_cells(dataset)  # over some axes of the scene
+        pooled = {axis.name: dataset.sizes[axis.name] for axis in axes
+                  if axis.name not in wanted.dims}
+        return np.asarray(
+            wanted.expand_dims(pooled).transpose(*(axis.name for axis in axes)).values)
+
+    return Stopping(rule.ends, tuple(dict.fromkeys([*ESTIMATE_INPUTS, *variables])),
+                    tuple(axis.name for axis in axes if axis.name not in free), needed)
 
 
 def _limit(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:

@@ -200,8 +200,7 @@ def test_a_solver_s_faults_never_pass_as_solved(tmp_path, returned, status, told
 
 @pytest.mark.parametrize(("result", "told"), [
     ("light * float('nan')", "returned levels that are not finite"),
-    ("light[1:]", "returned levels of shape"),
-    ("None", "returned levels of type object; expected real numbers"),
+    ("light[1:]", "returned levels of shape"), ("None", "returned levels of type object"),
     ("1 / 0", "raises ZeroDivisionError"),
 ])
 def test_an_effect_s_faults_are_its_scene_s(tmp_path, result, told):

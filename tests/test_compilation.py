@@ -56,21 +56,6 @@ def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package
     assert float(second) == float(interpreted)
 
 
-@pytest.mark.evidence
-def test_read_only_package_is_compiled_once_for_the_user(package, tmp_path):
-    (package / "sweep" / "model" / "__pycache__").write_text("a file: no folder can be made")
-    own = str(tmp_path / "home")
-    environment = {"HOME": own, "XDG_CACHE_HOME": f"{own}/.cache"}
-    value, interpreted = run(UNIT, top=package, **environment)
-    assert float(value) == float(interpreted)
-    assert list(tmp_path.glob("home/.cache/**/renderers._unit*.nbc"))
-    cached, hits = run(
-        "import sweep.model.renderers as s; from sweep.compilation import is_cached; "
-        "cached = is_cached(s.__name__, '_unit'); s._unit(5); "
-        "print(cached, sum(s._unit.stats.cache_hits.values()))", top=package, **environment)
-    assert (cached, hits) == ("True", "1")
-
-
 FRACTION = """
 from sweep.compilation import compiled
 

@@ -89,15 +89,6 @@ def test_flag_is_reached_by_a_real_scene(expected, settings):
     assert flags(*settings) == [expected]
 
 
-def test_marker_misread_with_much_error_correction_is_a_wrong_id():
-    found = flags(
-        "dictionary=DICT_4X4_1000", "errorCorrectionRate=1.0", "marker_id=[0, 1, 2]",
-        "side_px={linspace=[10, 13, 7]}", "tilt_deg=[40, 60]", "azimuth_deg=[20, 75]",
-        "roll_deg={linspace=[0, 80, 9]}",
-    )
-    assert (np.bincount(found, minlength=6)[1:5] > 0).all()
-
-
 def written(folder, *markers):
     """Write a white frame with markers (ID, side, left, top) of DICT_5X5_50 as "clutter.png"."""
     image = np.full((480, 640), 255, dtype=np.uint8)
@@ -115,23 +106,6 @@ def test_clutter_that_decodes_where_the_marker_is_counts_as_a_wrong_id(tmp_path)
     around = written(tmp_path, (5, 210, 215, 135))
     assert flags(around, "side_px=6", "marker_id=7", folder=tmp_path) == [DetectionStatus.wrong_id]
     assert flags("background=255", "side_px=6", "marker_id=7") == [DetectionStatus.rejected]
-
-
-FAR_MARKERS = [
-    "side_px=[5, 9, 11, 13, 16, 30]", "tilt_deg=[0, 50]", "azimuth_deg=30", "roll_deg=77"
-]
-
-
-@pytest.mark.parametrize("marker_id", [3, 11], ids=["other ID", "same ID"])
-def test_false_marker_elsewhere_in_the_frame_changes_no_flag(tmp_path, marker_id):
-    alone = flags("background=255", "marker_id=11", *FAR_MARKERS)
-    assert {*alone} >= {
-        DetectionStatus.detected,
-        DetectionStatus.rejected,
-        DetectionStatus.no_candidate,
-    }
-    beside = written(tmp_path, (marker_id, 100, 30, 40), (marker_id, 60, 550, 300))
-    assert flags(beside, "marker_id=11", *FAR_MARKERS, folder=tmp_path) == alone
 
 
 def test_numbers_exist_exactly_where_the_flags_say_so():

@@ -63,18 +63,6 @@ def test_no_scene_is_flagged_failed_by_a_fault_of_the_machine(fault, place):
     assert not run_cells(PIPELINE, [np.arange(4)]).failures
 
 
-def test_solver_of_a_user_that_meets_a_fault_of_the_machine_raises_it(monkeypatch):
-    class Solver:
-        needs_images = False
-
-        def __call__(self, _):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("sweep.evaluation.block.build", lambda _: Solver())
-    with pytest.raises(MachineFaultError, match="No space left on device"):
-        run_cells(PIPELINE, [np.arange(4)])
-
-
 @pytest.mark.parametrize("place", ["render_all", "build"])
 def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(place):
     warm_up(PIPELINE)

@@ -7,7 +7,6 @@ from support.blocks import run_block
 from support.lengths import lengths
 from support.searching import searched
 from support.windows import corners_of, outcomes_elsewhere
-from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.grid import Block
@@ -80,22 +79,6 @@ def compared(scenes, setting):
     difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
     assert difference.max(initial=0.0) <= limit_px(setting, scenes.frame[0, 0])
     return difference, len(exceptions)
-
-
-PINNED = {
-    "marker": {"dictionary": "DICT_6X6_250", "marker_id": 17}, "scene": {"background": 255},
-    "pose": {
-        "side_px": 10.376535841555254, "tilt_deg": 20.68056882444784,
-        "azimuth_deg": 215.69171069220565, "roll_deg": 319.86845927813033,
-        "bearing_x_deg": 8.876074845458405, "bearing_y_deg": 21.136956593398267,
-    },
-}
-
-
-def test_pose_that_a_margin_of_16_px_lost_to_the_apriltag_search_is_found_as_in_the_frame():
-    """Rejected in the frame and no candidate in a window with 16 px around it."""
-    scenes = build_scenes(Pipeline.from_dict(PINNED).experiment.scene_values([]), 1)
-    assert not compared(scenes, DetectorSetting(cornerRefinementMethod="apriltag"))[1]
 
 
 @pytest.mark.parametrize("refinement", REFINEMENTS)
@@ -191,12 +174,6 @@ def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
         if found.shape != expected.shape:
             found = found[:, :, :, 1:]
         np.testing.assert_array_equal(found, expected, err_msg=name)
-
-
-def test_deglitching_is_refused():
-    """OpenCV's aprilTagDeglitch reads memory that it never wrote, at the image's border."""
-    with pytest.raises(PipelineError, match="aprilTagDeglitch = 1"):
-        paired("cornerRefinementMethod=apriltag", "aprilTagDeglitch=1")
 
 
 BOARDS = {

@@ -20,10 +20,6 @@ distance_m = 0.4
 GRID = 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.01'
 
 
-def beside(**keys):
-    return "\n[[board.distractors]]\n" + "".join(f"{k} = {v}\n" for k, v in keys.items())
-
-
 TABLE = 'kind = "markers"\n' + "".join(
     f"[[board.markers]]\nmarker_id = {k}\nx_m = {x}\ny_m = 0\n" for k, x in ((1, 0), (2, 0.1)))
 

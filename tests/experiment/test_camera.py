@@ -9,8 +9,6 @@ import pytest
 
 import sweep
 from support.here import calls_here
-from support.lengths import first_of
-from sweep.cli import main
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
@@ -76,17 +74,6 @@ def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
     assert pipeline(camera).facts.camera["square"]
 
 
-@pytest.mark.parametrize("focal_length", first_of([3.6, 12.5, 4.0, 6.0], 2))
-def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(focal_length):
-    rng = np.random.default_rng(3)
-    for k in rng.integers(1, 6_000, 30).tolist():
-        camera = {"width_px": 4 * k, "height_px": 3 * k, "focal_length_mm": focal_length}
-        both = {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6}
-        expected = [focal_length / 4.8 * (4 * k), focal_length / 3.6 * (3 * k)]
-        sides = [{name: both[name] for name in given} for given in ((), both, ["sensor_width_mm"])]
-        assert all(view(camera | given)[:2] == expected for given in sides)
-
-
 # 2. --set and --at.
 
 @pytest.mark.parametrize(("camera", "setting", "left"), [
@@ -116,27 +103,6 @@ def test_sides_of_a_board_s_markers_are_their_own():
     })
     assert board.facts.camera["side_px"] == pytest.approx((3, 24))
     assert "the markers' sides are 3 to 24 px" in board.facts.camera_line
-
-
-@pytest.mark.long
-def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
-    file, store = tmp_path / "p.toml", tmp_path / "p.zarr"
-    file.write_text(
-        "[camera]\nhfov_deg = 60\n[marker]\nsize_m = 0.1\n[axes]\ndistance_m = [0.5, 1]\n"
-    )
-    with calls_here():
-        assert main(["run", str(file), "--store", str(store)]) == 0
-    first = capsys.readouterr().out.splitlines()[0]
-    assert first.startswith("camera: 640 x 480 px, fx = fy = 554.256 px, HFOV 60°, VFOV 46.83°")
-    attributes = sweep.open(store).attrs
-    fx = 320 / math.tan(math.radians(30))
-    assert attributes["camera_fx_px"] == attributes["camera_fy_px"] == pytest.approx(fx)
-    assert attributes["camera_hfov_deg"] == pytest.approx(60)
-    assert attributes["nearest_side_px"] == pytest.approx(fx * 0.1 / 0.5)
-    assert attributes["farthest_side_px"] == pytest.approx(fx * 0.1)
-    page = tmp_path / "p.html"
-    assert main(["report", str(store), "-o", str(page)]) == 0
-    assert "fx = fy = 554.256 px, HFOV 60°" in page.read_text()
 
 
 @pytest.mark.parametrize(("sections", "line"), [

@@ -20,8 +20,6 @@ from sweep.model.scene import build_scenes
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 SCIPY = "SciPy's `Rotation`"
-ANGLE_DEG = 1e-12
-"""Of an angle in degrees: 2e-14 rad, some hundred roundings."""
 
 def made(pose, axes=None, seed=1, **sections):
     """Return the values and scenes of a pipeline's whole grid."""
@@ -30,29 +28,6 @@ def made(pose, axes=None, seed=1, **sections):
     indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
     values = pipeline.experiment.scene_values(indices)
     return values, build_scenes(values, int(np.prod(lengths)))
-
-
-def viewing_angle_deg(scenes):
-    normal = scenes.rotation[:, :, 2]
-    line = -scenes.translation / np.linalg.norm(scenes.translation, axis=1, keepdims=True)
-    sine = np.linalg.norm(np.cross(normal, line), axis=1)
-    return np.degrees(np.arctan2(sine, np.sum(normal * line, axis=1)))
-
-
-EXTREME = {
-    "distance_m": [0.001, 0.7, 1000], "bearing_x_deg": [-80, 0, 33], "bearing_y_deg": [-5, 80],
-    "azimuth_deg": [0, 77, 251], "roll_deg": [0, -130],
-}
-
-
-def test_view_angle_is_the_angle_to_the_line_of_sight_at_the_extremes():
-    angles = [0, 1e-6, 45, 89.9, 180]
-    values, scenes = made({}, {"view_angle_deg": angles, **EXTREME})
-    expected = values["view_angle_deg"].broadcast(len(scenes))
-    np.testing.assert_allclose(viewing_angle_deg(scenes), expected, atol=ANGLE_DEG)
-    np.testing.assert_allclose(
-        scenes.translation[:, 2], values["distance_m"].values, rtol=0, atol=0
-    )
 
 
 def drawn(pose, count):
@@ -263,15 +238,3 @@ def test_places_in_metres_are_the_truth():
     np.testing.assert_array_equal(scenes.translation, np.stack(expected, axis=1))
     mixed = made({"x_m": 0.2, "bearing_y_deg": 10, "distance_m": 2})[1].translation[0]
     np.testing.assert_array_equal(mixed, [0.2, 2 * np.tan(np.radians(10)), 2])
-
-
-def test_draws_depend_on_the_distribution_and_not_on_axis_or_fixed():
-    drawn = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 60]}}
-    one = key_draws({"azimuth_deg": 30, **drawn})
-    two = key_draws(drawn, {"azimuth_deg": [30, 60]})
-    np.testing.assert_array_equal(one, two[:3])
-    assert (one != two[3:]).all()
-    other = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 61]}, "azimuth_deg": 30}
-    assert (key_draws(other) != one).all()
-    tilt = {"distance_m": 1, "tilt_deg": {"uniform": [0, 60]}, "azimuth_deg": 30}
-    assert (key_draws(tilt) != one).all()

@@ -1,11 +1,10 @@
-"""Targets of markers in several planes: images against rays, hidden markers, what is refused."""
+"""Targets of markers in several planes: images against rays, and hidden markers."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from support.blocks import run_cells
-from sweep.errors import PipelineError
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
@@ -188,22 +187,3 @@ def test_markers_around_the_camera_leave_the_image_of_those_before_it():
     assert result.columns["marker_detection"][0].tolist() == [
         [DetectionStatus.detected, *[DetectionStatus.not_visible] * 3]
     ]
-
-
-@pytest.mark.parametrize(("change", "fault"), [
-    ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp, photometric"),
-    ({"scene": {"curvature_per_m": 1.0}}, "it absent, for prints with z_m or tilt_deg"),
-    ({"scene": {"renderer": "warp"}}, "exact, for prints"),
-    ({"estimator": {"solver": "photometric_real"}}, "one of iterative, sqpnp, epnp, photometric"),
-    ({"detector": {"refineDetectedMarkers": True}}, "false, for prints"),
-])
-def test_what_needs_a_plane_is_refused(change, fault):
-    with pytest.raises(PipelineError, match=fault):
-        pipeline(CUBE, **change)
-
-
-def test_markers_that_overlap_in_their_plane_are_refused():
-    tilted = [marker(k, 0.0, 0.02 * k, 0.0, tilt=90, azimuth=90) for k in range(2)]
-    with pytest.raises(PipelineError, match="do not overlap"):
-        pipeline(tilted)
-    assert pipeline([marker(0, 0, 0, 0), marker(1, 0, 0, 0.01)]) is not None

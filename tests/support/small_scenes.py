@@ -29,15 +29,18 @@ background = 90.4
 """A marker of 20 px in a frame of 57 x 45 px, with a quiet zone that is seen."""
 
 
-def scenes_of(settings=(), text=SMALL):
+def scenes_of(settings=(), text=SMALL, index=0):
     read = Pipeline.from_text if isinstance(text, str) else Pipeline.from_dict
     pipeline = read(text, list(settings))
-    first = [np.array([0])] * len(pipeline.experiment.scene_axes)
-    return build_scenes(pipeline.experiment.scene_values(first), 1)
+    indices = [np.array([index])] * len(pipeline.experiment.scene_axes)
+    return build_scenes(pipeline.experiment.scene_values(indices), 1)
 
 
-def image_of(settings=(), window=None, text=SMALL):
-    """The image (h, w) in a window (left, top, right, bottom), by default the whole frame."""
-    scenes = scenes_of(settings, text)
+def image_of(settings=(), window=None, text=SMALL, index=0):
+    """The image (h, w) in a window (left, top, right, bottom), by default the whole frame.
+
+    ``index``: of the value on every axis.
+    """
+    scenes = scenes_of(settings, text, index)
     window = window or (0, 0, *scenes.frame[0].tolist())
     return render_all(scenes, np.array([0]), marker_boxes(scenes), np.array([window]))[0]

@@ -283,7 +283,7 @@ def announce_compilation(pipeline: Pipeline) -> None:
         length for needed, module, name, length in (
             (True, "model.coverage", "accumulate", COMPILATION_S),
             (fits, "measure.likelihood", "descend", LIKELIHOOD_S),
-            ("photometric_real" in solvers, "measure.photometric", "locate_photograph",
+            ("photometric_real" in solvers, "measure.photograph", "locate_photograph",
              PHOTOGRAPH_S))
         if needed and not library.compilation.is_cached(f"sweep.{module}", name))
     if seconds:

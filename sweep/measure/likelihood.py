@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import choose_when_compiled, compiled
 from sweep.declaration import parameter
+from sweep.measure.estimation import covariance_elsewhere, pose_covariance, solve_positive
 from sweep.measure.flags import BoundStatus
 from sweep.model import coverage
 from sweep.model.board import (
@@ -41,73 +42,6 @@ from sweep.model.pose import rotations, vectors
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
 from sweep.typing import Floats, Integers, Masks
-
-# --------------------------------------------------------------------------------------------------
-# Systems of equations with a positive definite matrix, and the covariance of a pose.
-
-@compiled
-def solve_positive(matrix: Floats, right: Floats) -> bool:
-    """Solve matrix · x = right in place; return False if the matrix is not positive definite.
-
-    Scaled to a unit diagonal, then by Cholesky's factors; a pivot must be above 1e-11.
-    """
-    n = matrix.shape[0]
-    scale, factor = np.empty(n), np.empty((n, n))
-    for i in range(n):
-        if not (matrix[i, i] > 0.0 and matrix[i, i] < math.inf):
-            return False
-        scale[i] = 1.0 / math.sqrt(matrix[i, i])
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total > 1e-11:
-                factor[i, i] = math.sqrt(total)
-            else:
-                return False
-    for column in range(right.shape[1]):
-        for i in range(n):
-            total = right[i, column] * scale[i]
-            for k in range(i):
-                total -= factor[i, k] * right[k, column]
-            right[i, column] = total / factor[i, i]
-        for i in range(n - 1, -1, -1):
-            total = right[i, column]
-            for k in range(i + 1, n):
-                total -= factor[k, i] * right[k, column]
-            right[i, column] = total / factor[i, i]
-        for i in range(n):
-            right[i, column] *= scale[i]
-    return True
-
-
-@compiled
-def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
-    """Return the covariance (6, 6) of the pose in radians and metres, and whether it exists."""
-    free = information.shape[0]
-    inverse = np.eye(free)
-    exists = solve_positive(information, inverse)
-    for i in range(POSE):
-        for j in range(POSE):
-            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
-            inverse[i, j] *= variance * unit
-    return inverse[:POSE, :POSE].copy(), exists
-
-
-def covariance_elsewhere(covariance: Floats, arm: Floats) -> Floats:
-    """Return a covariance (6, 6) of a pose for another point of the same body.
-
-    ``arm`` (3,) leads to it from the pose's origin, in the camera frame: a turn by a small ω moves
-    it by ω x arm.
-    """
-    x, y, z = arm.tolist()
-    moves = np.eye(POSE)
-    moves[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-    return np.asarray(moves @ covariance @ moves.T)
-
 
 # --------------------------------------------------------------------------------------------------
 # The likelihood of a target's pixels: fitted to an image, and how sharp it is at the truth.
@@ -305,13 +239,21 @@ def plane_of(state: Floats, view: MarkerView) -> Floats:
 
 
 @compiled
+def product(left: Floats, right: Floats) -> Floats:
+    """Return the product of two matrices, summed in the order of their rows."""
+    product = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(left.shape[0]):
+        for k in range(left.shape[1]):
+            for j in range(right.shape[1]):
+                product[i, j] += left[i, k] * right[k, j]
+    return product
+
+
+@compiled
 def _sheet_plane(state: Floats, in_frame: Floats) -> Floats:
     """Return a sheet's plane (3, 3) at a state, from that in the target's frame."""
-    rotation, plane = rotation_of(state), np.zeros((3, 3))
+    plane = product(rotation_of(state), in_frame)
     for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                plane[i, j] += rotation[i, k] * in_frame[k, j]
         plane[i, 2] += state[POSITION][i]
     return plane
 
@@ -426,17 +368,10 @@ def moved_state(state: Floats, step: Floats, least_spread_px: float) -> Floats:
     shrink = min(1.0, MAX_TURN / max(turn, 1e-300))
     shrink = min(shrink, MAX_SHIFT / max(shift, 1e-300))
     moved = state.copy()
-    before, position = rotation_of(state), state[POSITION]
-    after, moved_position = rotation_of(moved), moved[POSITION]
-    turned_by = np.empty((1, 3))
-    for k in range(3):
-        turned_by[0, k] = shrink * step[k]
-    rotation = rotations(turned_by)[0]
+    position, moved_position = state[POSITION], moved[POSITION]
+    turn_by = (shrink * step[:3]).reshape(1, 3)
+    overwrite(moved[ROTATION], product(rotations(turn_by)[0], rotation_of(state)).ravel())
     for i in range(3):
-        for j in range(3):
-            after[i, j] = 0.0
-            for k in range(3):
-                after[i, j] += rotation[i, k] * before[k, j]
         moved_position[i] = position[i] + shrink * step[3 + i] * abs(state[DEPTH])
     if len(step) > POSE:
         squared = state[SPREAD] ** 2
@@ -650,14 +585,241 @@ def squares(image: Floats) -> float:
 @compiled
 def turn_between(state: Floats, other: Floats) -> float:
     """Return the angle between two states' rotations in radians, stable for small angles."""
-    rotation, other_rotation = rotation_of(state), rotation_of(other)
-    difference = np.zeros((1, 3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                difference[0, i, j] += rotation[i, k] * other_rotation[j, k]
-    turn = vectors(difference)[0]
+    turn = vectors(product(rotation_of(state), rotation_of(other).T).reshape(1, 3, 3))[0]
     return math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+
+
+# --------------------------------------------------------------------------------------------------
+# The best minimum and the next one, from several starts.
+#
+# The sum of squares of a small image has several minima: the two planar solutions, and poses with
+# edges on wrong pixels. So there are several starts. Each is first fitted to the means of 2 x 2
+# pixels, for which the model holds as well and whose minima are wider. Starts that end far above
+# the best are dropped, the others are fitted to the pixels; the best is compared with the minimum
+# that is reached from its mirror. If none explains the pixels, the starts are fitted to them
+# directly.
+
+COARSE_STEPS, FINE_STEPS = 15, 30
+
+SAME_TURN_RAD = 1e-3
+"""Fits whose rotations differ by less than this are the same."""
+
+EXCESS = 5.0
+"""Deviation of the residuals' variance, in its standard deviations, above which the model does not
+explain the pixels."""
+
+
+class Search(NamedTuple):
+    """How far fits go.
+
+    Attributes
+    ----------
+    coarsely_settled, settled
+        Squared standard deviations of the last undamped step, of means of 2 x 2 pixels and of
+        pixels.
+    hopeless
+        Excess of chi-square over the best coarse fit's above which a start is abandoned.
+    """
+
+    coarsely_settled: float
+    settled: float
+    hopeless: float
+
+
+EXACT = Search(NEARLY_SETTLED, SETTLED, 100.0)
+
+@compiled
+def is_settled(levels: Floats, most: float, states: Floats, k: int) -> bool:
+    """Return whether the k-th coarse fit is hopeless, or the same as an earlier one."""
+    if not levels[k] < most:
+        return True
+    for m in range(k):
+        if turn_between(states[k], states[m]) < SAME_TURN_RAD and levels[m] < most:
+            return True
+    return False
+
+
+@compiled
+def locate(
+    seen: Any, work: Any, freedom: int, coarse: Any, coarse_work: Any, starts: Floats,
+    search: Search, information: Floats,
+) -> tuple[Floats, float, bool, Floats]:
+    """Return the best minimum of the sum of squared residuals, and the next one.
+
+    Parameters
+    ----------
+    seen, work, freedom
+        As :func:`descend` takes them.
+    coarse, coarse_work
+        What is seen in the means of 2 x 2 pixels.
+    starts
+        (K, 18) states; those behind the camera are skipped.
+    search
+        How far fits go.
+    information
+        Overwritten, as by :func:`descend`.
+
+    Returns
+    -------
+    tuple
+        The state (18,), its sum of squares, infinite without a pose, whether the minimum was
+        reached, and the state of the next best minimum; NaN if there is none.
+    """
+    count, free = len(starts), len(information)
+    coarse_freedom = max(freedom // 4, 1)
+    states = starts.copy()
+    trial_information = np.empty((free, free))
+
+    def coarse_fit(state: Floats, worth: float) -> float:
+        """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
+        state[SPREAD] *= 0.5
+        state[GREY_LEVELS] = 0.0
+        level, _ = descend(
+            coarse, state, coarse_work, coarse_freedom, COARSE_STEPS,
+            search.coarsely_settled, worth, trial_information,
+        )
+        state[SPREAD] *= 2.0
+        return level
+
+    def most_of(levels: Floats) -> float:
+        """Return the sum of squares from which a coarse fit is hopeless."""
+        lowest = float(levels.min())
+        return lowest + search.hopeless * unit_of(coarse.marker, lowest, coarse_freedom)
+
+    levels = np.full(count, math.inf)
+    for k in range(count):
+        if is_before_camera(states[k], seen.marker):
+            levels[k] = coarse_fit(states[k], most_of(levels))
+    most = most_of(levels)
+    best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
+    lowest = next_lowest = math.inf
+    reached = False
+    likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
+    for k in range(2 * count + 1):
+        unit = unit_of(seen.marker, lowest, freedom)
+        worth = lowest + search.hopeless * unit
+        if k < count:
+            if is_settled(levels, most, states, k):
+                continue
+            state = states[k].copy()
+        elif k == count:
+            state = mirrored_state(best)
+            if not is_before_camera(state, seen.marker):
+                continue
+            # Not worth a fit if it was reached before, or if the coarse pixels rule it out.
+            away = turn_between(state, best)
+            if turn_between(state, other) < 0.5 * away:
+                continue
+            tried = state.copy()
+            if not coarse_fit(tried, most) < most:
+                continue
+            if turn_between(tried, best) > 0.5 * away:
+                state = tried
+        else:
+            # The coarse fits misled all starts, or the model is wrong.
+            if lowest <= likely * unit:
+                break
+            state, worth = starts[k - count - 1].copy(), math.inf
+        if not is_before_camera(state, seen.marker):
+            continue
+        state[GREY_LEVELS] = 0.0
+        level, converged = descend(
+            seen, state, work, freedom, FINE_STEPS, search.settled, worth,
+            trial_information,
+        )
+        same = turn_between(state, best) < SAME_TURN_RAD
+        if level < lowest:
+            if not same:
+                overwrite(other, best)
+                next_lowest = lowest
+            overwrite(best, state)
+            lowest, reached = level, converged
+            for m in range(free):
+                overwrite(information[m], trial_information[m])
+        elif not same and level < next_lowest:
+            overwrite(other, state)
+            next_lowest = level
+    return best, lowest, reached, other
+
+
+@compiled
+def locate_exactly(
+    image: Floats, starts: Floats, view: MarkerView, information: Floats
+) -> tuple[Floats, float, bool, Floats, int]:
+    """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
+    freedom = int((~np.isnan(image)).sum()) - len(information) - LEVELS
+    small = np.empty((image.shape[0] // 2, image.shape[1] // 2))
+    halve(image, 0.25, small)
+    found = locate(
+        Pixels(image, squares(image), view),
+        work_space(image.shape[0], image.shape[1]), freedom,
+        Pixels(small, squares(small), binned_view(view)),
+        work_space(small.shape[0], small.shape[1]), starts, EXACT, information,
+    )
+    return *found, freedom
+
+
+class InSight(NamedTuple):
+    """As :class:`sweep.measure.likelihood.Pixels`, of a target in several planes.
+
+    What sheets hide of others depends on the pose: ``seen_from`` determines it again at each state;
+    of ``marker`` only what does not depend on it is used.
+    """
+
+    levels: Floats
+    square_sum: float
+    marker: MarkerView
+    seen_from: Callable[[tuple[Floats, Floats]], MarkerView]
+
+
+def _squares_in_sight(
+    seen: InSight, state: Floats, work: Work, information: Floats, gradient: Floats
+) -> float:
+    """As :func:`sweep.measure.likelihood.squared_residuals`, with what is seen at the state."""
+    view = seen.seen_from((rotation_of(state), state[POSITION]))
+    pixels = Pixels(seen.levels, seen.square_sum, view)
+    return squared_residuals(pixels, state, work, information, gradient)
+
+
+MODELS[InSight] = _squares_in_sight
+
+_descend_in_sight = getattr(descend, "py_func", descend)
+"""The same steps without compilation: what is seen is determined in Python."""
+
+
+def locate_in_sight(
+    image: Floats, starts: Floats, view: MarkerView,
+    seen_from: Callable[[tuple[Floats, Floats]], MarkerView], information: Floats,
+) -> tuple[Floats, float, bool, Floats, int]:
+    """Return what :func:`locate_exactly` does of a target in several planes, from each start."""
+    free, square_sum, work = len(information), squares(image), work_space(*image.shape)
+    freedom = int((~np.isnan(image)).sum()) - free - LEVELS
+    missing, found = np.full(STATE_LENGTH, math.nan), np.empty((free, free))
+    fits = [(missing, math.inf, False), (missing, math.inf, False)]
+    for start in starts:
+        state, level, reached = start.copy(), math.inf, False
+        if is_before_camera(state, view):
+            level, reached = _descend_in_sight(
+                InSight(image, square_sum, view, seen_from), state, work, freedom, FINE_STEPS,
+                SETTLED, math.inf, found,
+            )
+        if level < fits[0][1]:
+            information[:] = found
+        if all(not turn_between(state, each[0]) < SAME_TURN_RAD for each in fits):
+            fits.append((state, level, reached))
+        fits = sorted(fits, key=lambda fit: fit[1])
+    (state, level, reached), (other, _, _), *_ = fits
+    return state, level, reached, other, freedom
+
+
+def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
+    """Return whether residuals of an expected chi-square ``freedom`` are those of the noise.
+
+    Within :data:`EXCESS` standard deviations, sqrt(2 · freedom). Without noise the residuals are
+    those of rounding, which are smaller if the levels are whole numbers: only an excess counts.
+    """
+    deviation = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
+    return abs(deviation) <= EXCESS if noise_grey >= MIN_NOISE else deviation <= EXCESS
 
 
 # --------------------------------------------------------------------------------------------------
@@ -733,7 +895,7 @@ def bound_of_scene(
 
     ``image`` (height, width) is overwritten, but for its pixels that are NaN: they are left out.
 
-    One function, since each that calls :func:`sweep.measure.likelihood.descend` takes a second to
+    One function, since each that calls :func:`descend` takes a second to
     compile.
 
     Returns

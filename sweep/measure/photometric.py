@@ -3,59 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from sweep.compilation import compiled
-from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.estimation import (
+    Detections,
+    Estimates,
+    covariance_elsewhere,
+    pose_covariance,
+)
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
     BLACK,
     DEPTH,
-    GREY_LEVELS,
-    MIN_NOISE,
-    MODELS,
-    NEARLY_SETTLED,
     POSITION,
-    SETTLED,
-    SPREAD,
-    STATE_LENGTH,
     WHITE,
     MarkerView,
-    Pixels,
-    binned_view,
-    covariance_elsewhere,
-    descend,
-    halve,
-    is_before_camera,
+    explains,
+    locate_exactly,
+    locate_in_sight,
     marker_view,
     middle_m,
-    mirrored_state,
     noise_variance,
-    overwrite,
-    pose_covariance,
     rotation_of,
-    squared_residuals,
-    squares,
     state_of,
-    turn_between,
-    unit_of,
 )
-from sweep.measure.photograph import (
-    MOVED,
-    SIZE,
-    PhotographView,
-    binned_photograph,
-    judge,
-    photograph_view,
-    pixel_count,
-    system,
-)
+from sweep.measure.photograph import SIZE, locate_photograph, photograph_view, pixel_count
 from sweep.measure.solver import (
     MIN_POINTS,
     GuardedPoints,
@@ -65,269 +42,10 @@ from sweep.measure.solver import (
     reprojection_px,
 )
 from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
-from sweep.model.coverage import LEVELS, POSE, Work, work_space
+from sweep.model.coverage import LEVELS, POSE
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
 from sweep.typing import Floats, Grey
-
-# --------------------------------------------------------------------------------------------------
-# The best minimum and the next one, from several starts.
-#
-# The sum of squares of a small image has several minima: the two planar solutions, and poses with
-# edges on wrong pixels. So there are several starts. Each is first fitted to the means of 2 x 2
-# pixels, for which the model holds as well and whose minima are wider. Starts that end far above
-# the best are dropped, the others are fitted to the pixels; the best is compared with the minimum
-# that is reached from its mirror. If none explains the pixels, the starts are fitted to them
-# directly.
-
-COARSE_STEPS, FINE_STEPS = 15, 30
-
-SAME_TURN_RAD = 1e-3
-"""Fits whose rotations differ by less than this are the same."""
-
-EXCESS = 5.0
-"""Deviation of the residuals' variance, in its standard deviations, above which the model does not
-explain the pixels."""
-
-
-class Search(NamedTuple):
-    """How far fits go.
-
-    Attributes
-    ----------
-    coarsely_settled, settled
-        Squared standard deviations of the last undamped step, of means of 2 x 2 pixels and of
-        pixels.
-    hopeless
-        Excess of chi-square over the best coarse fit's above which a start is abandoned.
-    """
-
-    coarsely_settled: float
-    settled: float
-    hopeless: float
-
-
-EXACT = Search(NEARLY_SETTLED, SETTLED, 100.0)
-
-REAL = Search(4.0, 16.0, 50.0)
-"""Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
-Fits of all pixels chose the mirror at an excess of at most 44."""
-
-
-@compiled
-def is_settled(levels: Floats, most: float, states: Floats, k: int) -> bool:
-    """Return whether the k-th coarse fit is hopeless, or the same as an earlier one."""
-    if not levels[k] < most:
-        return True
-    for m in range(k):
-        if turn_between(states[k], states[m]) < SAME_TURN_RAD and levels[m] < most:
-            return True
-    return False
-
-
-@compiled
-def locate(
-    seen: Any, work: Any, freedom: int, coarse: Any, coarse_work: Any, starts: Floats,
-    search: Search, information: Floats,
-) -> tuple[Floats, float, bool, Floats]:
-    """Return the best minimum of the sum of squared residuals, and the next one.
-
-    Parameters
-    ----------
-    seen, work, freedom
-        As :func:`sweep.measure.likelihood.descend` takes them.
-    coarse, coarse_work
-        What is seen in the means of 2 x 2 pixels.
-    starts
-        (K, 18) states; those behind the camera are skipped.
-    search
-        How far fits go.
-    information
-        Overwritten, as by :func:`sweep.measure.likelihood.descend`.
-
-    Returns
-    -------
-    tuple
-        The state (18,), its sum of squares, infinite without a pose, whether the minimum was
-        reached, and the state of the next best minimum; NaN if there is none.
-    """
-    count, free = len(starts), len(information)
-    coarse_freedom = max(freedom // 4, 1)
-    states = starts.copy()
-    trial_information = np.empty((free, free))
-
-    def coarse_fit(state: Floats, worth: float) -> float:
-        """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
-        state[SPREAD] *= 0.5
-        state[GREY_LEVELS] = 0.0
-        level, _ = descend(
-            coarse, state, coarse_work, coarse_freedom, COARSE_STEPS,
-            search.coarsely_settled, worth, trial_information,
-        )
-        state[SPREAD] *= 2.0
-        return level
-
-    def most_of(levels: Floats) -> float:
-        """Return the sum of squares from which a coarse fit is hopeless."""
-        lowest = float(levels.min())
-        return lowest + search.hopeless * unit_of(coarse.marker, lowest, coarse_freedom)
-
-    levels = np.full(count, math.inf)
-    for k in range(count):
-        if is_before_camera(states[k], seen.marker):
-            levels[k] = coarse_fit(states[k], most_of(levels))
-    most = most_of(levels)
-    best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
-    lowest = next_lowest = math.inf
-    reached = False
-    likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
-    for k in range(2 * count + 1):
-        unit = unit_of(seen.marker, lowest, freedom)
-        worth = lowest + search.hopeless * unit
-        if k < count:
-            if is_settled(levels, most, states, k):
-                continue
-            state = states[k].copy()
-        elif k == count:
-            state = mirrored_state(best)
-            if not is_before_camera(state, seen.marker):
-                continue
-            # Not worth a fit if it was reached before, or if the coarse pixels rule it out.
-            away = turn_between(state, best)
-            if turn_between(state, other) < 0.5 * away:
-                continue
-            tried = state.copy()
-            if not coarse_fit(tried, most) < most:
-                continue
-            if turn_between(tried, best) > 0.5 * away:
-                state = tried
-        else:
-            # The coarse fits misled all starts, or the model is wrong.
-            if lowest <= likely * unit:
-                break
-            state, worth = starts[k - count - 1].copy(), math.inf
-        if not is_before_camera(state, seen.marker):
-            continue
-        state[GREY_LEVELS] = 0.0
-        level, converged = descend(
-            seen, state, work, freedom, FINE_STEPS, search.settled, worth,
-            trial_information,
-        )
-        same = turn_between(state, best) < SAME_TURN_RAD
-        if level < lowest:
-            if not same:
-                overwrite(other, best)
-                next_lowest = lowest
-            overwrite(best, state)
-            lowest, reached = level, converged
-            for m in range(free):
-                overwrite(information[m], trial_information[m])
-        elif not same and level < next_lowest:
-            overwrite(other, state)
-            next_lowest = level
-    return best, lowest, reached, other
-
-
-@compiled
-def locate_exactly(
-    image: Floats, starts: Floats, view: MarkerView, information: Floats
-) -> tuple[Floats, float, bool, Floats, int]:
-    """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
-    freedom = int((~np.isnan(image)).sum()) - len(information) - LEVELS
-    small = np.empty((image.shape[0] // 2, image.shape[1] // 2))
-    halve(image, 0.25, small)
-    found = locate(
-        Pixels(image, squares(image), view),
-        work_space(image.shape[0], image.shape[1]), freedom,
-        Pixels(small, squares(small), binned_view(view)),
-        work_space(small.shape[0], small.shape[1]), starts, EXACT, information,
-    )
-    return *found, freedom
-
-
-class InSight(NamedTuple):
-    """As :class:`sweep.measure.likelihood.Pixels`, of a target in several planes.
-
-    What sheets hide of others depends on the pose: ``seen_from`` determines it again at each state;
-    of ``marker`` only what does not depend on it is used.
-    """
-
-    levels: Floats
-    square_sum: float
-    marker: MarkerView
-    seen_from: Callable[[Pose], MarkerView]
-
-
-def _squares_in_sight(
-    seen: InSight, state: Floats, work: Work, information: Floats, gradient: Floats
-) -> float:
-    """As :func:`sweep.measure.likelihood.squared_residuals`, with what is seen at the state."""
-    view = seen.seen_from((rotation_of(state), state[POSITION]))
-    pixels = Pixels(seen.levels, seen.square_sum, view)
-    return squared_residuals(pixels, state, work, information, gradient)
-
-
-MODELS[InSight] = _squares_in_sight
-
-_descend_in_sight = getattr(descend, "py_func", descend)
-"""The same steps without compilation: what is seen is determined in Python."""
-
-
-def locate_in_sight(
-    image: Floats, starts: Floats, view: MarkerView, seen_from: Callable[[Pose], MarkerView],
-    information: Floats,
-) -> tuple[Floats, float, bool, Floats, int]:
-    """Return what :func:`locate_exactly` does of a target in several planes, from each start."""
-    free, square_sum, work = len(information), squares(image), work_space(*image.shape)
-    freedom = int((~np.isnan(image)).sum()) - free - LEVELS
-    missing, found = np.full(STATE_LENGTH, math.nan), np.empty((free, free))
-    fits = [(missing, math.inf, False), (missing, math.inf, False)]
-    for start in starts:
-        state, level, reached = start.copy(), math.inf, False
-        if is_before_camera(state, view):
-            level, reached = _descend_in_sight(
-                InSight(image, square_sum, view, seen_from), state, work, freedom, FINE_STEPS,
-                SETTLED, math.inf, found,
-            )
-        if level < fits[0][1]:
-            information[:] = found
-        if all(not turn_between(state, each[0]) < SAME_TURN_RAD for each in fits):
-            fits.append((state, level, reached))
-        fits = sorted(fits, key=lambda fit: fit[1])
-    (state, level, reached), (other, _, _), *_ = fits
-    return state, level, reached, other, freedom
-
-
-@compiled
-def locate_photograph(
-    view: PhotographView, starts: Floats, covariance: Floats
-) -> tuple[Floats, float, bool, Floats, int, float]:
-    """Return what :func:`locate` does on a photograph, the freedom, and the misfit.
-
-    ``covariance`` (6, 6) gets that of the pose in radians and metres; the misfit is NaN if there is
-    none.
-    """
-    freedom = pixel_count(view) - SIZE
-    coarse = binned_photograph(view)
-    work = system(view.levels.shape[0], view.levels.shape[1])
-    state, level, reached, other = locate(
-        view, work, freedom, coarse,
-        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL,
-        np.empty((MOVED, MOVED)),
-    )
-    misfit = judge(view, state, work, covariance) if reached else math.nan
-    return state, level, reached, other, freedom, misfit
-
-
-def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
-    """Return whether residuals of an expected chi-square ``freedom`` are those of the noise.
-
-    Within :data:`EXCESS` standard deviations, sqrt(2 · freedom). Without noise the residuals are
-    those of rounding, which are smaller if the levels are whole numbers: only an excess counts.
-    """
-    deviation = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
-    return abs(deviation) <= EXCESS if noise_grey >= MIN_NOISE else deviation <= EXCESS
-
 
 # --------------------------------------------------------------------------------------------------
 # First poses of one target, marker or board, and the part of the image that is fitted.

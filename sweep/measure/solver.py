@@ -494,6 +494,41 @@ class _Solution(NamedTuple):
 _NONE = _Solution(np.full((3, 3), np.nan), np.full(3, np.nan), math.nan, np.zeros((0, 3)))
 
 
+class _Points(NamedTuple):
+    """Points (k, 3) of a target in metres, their pixels (k, 2), and the camera, the first."""
+
+    objects: Floats
+    pixels: Floats
+    cameras: Cameras
+
+    def solutions(
+        self, poses: Sequence[Pose], used: Iterable[Floats] | None = None
+    ) -> list[_Solution]:
+        """Return the finite poses, the best first; ``used`` gave each, by default all points."""
+        objects, pixels, cameras = self
+        given = itertools.repeat(objects, len(poses)) if used is None else used
+        found = [
+            _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras), points)
+            for pose, points in zip(poses, given, strict=True)
+        ]
+        return sorted((each for each in found if math.isfinite(each.error_px)),
+                      key=lambda each: each.error_px)
+
+    def refined(self, start: _Solution, refine: str) -> _Solution:
+        """Return a pose after OpenCV's refinement, lm or vvs; the start if it fails."""
+        call: Any = cv2.solvePnPRefineLM if refine == "lm" else cv2.solvePnPRefineVVS
+        vector = vector_of_rotation(start.rotation[None])[0][:, None]
+        try:
+            r, t = call(
+                self.objects, self.pixels, self.cameras.matrix(0), lens_of(self.cameras), vector,
+                start.translation[:, None].copy(),
+            )
+        except cv2.error:
+            return start
+        pose = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
+        return next(iter(self.solutions([pose])), start)
+
+
 @dataclass(frozen=True, slots=True)
 class PointSolver:
     """An OpenCV solver as an estimator of poses from corners alone.
@@ -534,18 +569,18 @@ class PointSolver:
 
     def _estimate(self, one: Detections, i: int, out: Estimates) -> None:
         """Write the estimate of a single board as number ``i``."""
-        objects, pixels = self._points(one)
-        if len(pixels) < MIN_POINTS:
+        points = self._points(one)
+        if len(points.pixels) < MIN_POINTS:
             out.status[i] = EstimateStatus.too_few_points
             return
         side = float(one.side_px()[0])
-        solutions = self._solutions(one, objects, pixels, side)
+        solutions = self._solutions(points, side)
         limit = self.reprojection_limit * side
         if not solutions or not solutions[0].error_px <= limit:
             return
         best = solutions[0]
         other = next((each for each in solutions[1:] if each.error_px <= limit), _NONE)
-        out.status[i], out.point_count[i] = EstimateStatus.solved, len(pixels)
+        out.status[i], out.point_count[i] = EstimateStatus.solved, len(points.pixels)
         out.rotation[i], out.translation[i], out.reprojection_px[i], used = best
         out.alternative_rotation[i], _, out.alternative_reprojection_px[i], _ = other
         if self.corner_noise_px is not None:
@@ -554,78 +589,51 @@ class PointSolver:
                 np.zeros(1, dtype=np.int64), one.cameras, self.corner_noise_px,
             )[0]
 
-    def _points(self, one: Detections) -> tuple[Floats, Floats]:
-        """Return the points (k, 3) in the board's frame and their pixels (k, 2)."""
+    def _points(self, one: Detections) -> _Points:
+        """Return the points in the board's frame."""
         if self.points == "chessboard":
             found = np.isfinite(one.chessboard_px[0, :, 0])
-            board = one.targets[0]
-            return board.chessboard_m[found] * one.scale[0], one.chessboard_px[0, found]
+            objects = one.targets[0].chessboard_m[found] * one.scale[0]
+            return _Points(objects, one.chessboard_px[0, found], one.cameras)
         objects, corners = one.objects_m, one.corners
         if self.points == "largest_marker" and len(corners):
             largest = np.argmax(np.abs(signed_areas(corners)))
             objects, corners = objects[[largest]], corners[[largest]]
-        return objects.reshape(-1, 3), corners.reshape(-1, 2)
+        return _Points(objects.reshape(-1, 3), corners.reshape(-1, 2), one.cameras)
 
-    def _solutions(
-        self, one: Detections, objects: Floats, pixels: Floats, side_px: float
-    ) -> list[_Solution]:
-        """Return the poses by their reprojection error, the best first.
+    def _solutions(self, points: _Points, side_px: float) -> list[_Solution]:
+        """Return the two poses of least reprojection error, the best first.
 
         ``side_px`` is the mean side of the detected markers.
         """
-        cameras, used, guard = one.cameras, None, None
-        method = OPENCV_SOLVERS[self.solver].method
+        objects, pixels, cameras = points
+        method, guard, used = OPENCV_SOLVERS[self.solver].method, None, None
         if self.points == "largest_marker":
-            poses = self._of_marker(objects, pixels, cameras)
+            size, to_board = marker_frame(objects)
+            (rotations,), (positions,) = square_poses(
+                pixels[None], cameras, np.array([size]), self.solver, self.guarded
+            )
+            poses = [of_board(*pose, to_board) for pose in zip(rotations, positions, strict=True)]
         elif self.points == "each_marker":
-            poses = poses_of_each_marker(objects, pixels, cameras)
+            poses = poses_of_each_marker(*points)
             used = np.repeat(objects.reshape(-1, 4, 3), 2, axis=0)
         elif self.guarded:
-            guard = GuardedPoints.of(objects, pixels, cameras)
+            guard = GuardedPoints.of(*points)
             poses = guard.poses(method)
         else:
             poses = _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
-        ordered = _by_error(poses, objects, pixels, cameras, used)
+        ordered = points.solutions(poses, used)
         if guard is not None and self.solver == "iterative":
-            ordered = _least_of(ordered, guard, objects, pixels, cameras, side_px)
+            ordered = _least_of(ordered, guard, points, side_px)
         if guard is not None and self.solver != "epnp":
-            ordered = _or_others(
-                ordered, guard, objects, pixels, cameras, CREDIBLE_SHARE * side_px)
+            ordered = _or_others(ordered, guard, points, CREDIBLE_SHARE * side_px)
         if self.refine != "none" and ordered:
-            ordered[0] = _refined(ordered[0], self.refine, objects, pixels, cameras)
+            ordered[0] = points.refined(ordered[0], self.refine)
         return ordered[:2]
-
-    def _of_marker(self, objects: Floats, pixels: Floats, cameras: Cameras) -> list[Pose]:
-        """Return the board's poses from the corners (4, 3) and (4, 2) of a single marker."""
-        size, to_board = marker_frame(objects)
-        (rotations,), (positions,) = square_poses(
-            pixels[None], cameras, np.array([size]), self.solver, self.guarded
-        )
-        return [of_board(*pose, to_board) for pose in zip(rotations, positions, strict=True)]
-
-
-def _refined(
-    start: _Solution, refine: str, objects: Floats, pixels: Floats, cameras: Cameras
-) -> _Solution:
-    """Return a pose after OpenCV's refinement, lm or vvs, on all points; the start if it fails."""
-    call: Any = cv2.solvePnPRefineLM if refine == "lm" else cv2.solvePnPRefineVVS
-    vector = vector_of_rotation(start.rotation[None])[0][:, None]
-    try:
-        r, t = call(
-            objects, pixels, cameras.matrix(0), lens_of(cameras), vector,
-            start.translation[:, None].copy(),
-        )
-    except cv2.error:
-        return start
-    rotation, translation = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
-    error = reprojection_px(rotation, translation, objects, pixels, cameras)
-    found = _Solution(rotation, translation, error, objects)
-    return found if math.isfinite(error) else start
 
 
 def _least_of(
-    ordered: list[_Solution], guard: GuardedPoints, objects: Floats, pixels: Floats,
-    cameras: Cameras, side_px: float,
+    ordered: list[_Solution], guard: GuardedPoints, points: _Points, side_px: float
 ) -> list[_Solution]:
     """Return ITERATIVE's solutions, or other solvers' refined where it missed the least error.
 
@@ -633,36 +641,20 @@ def _least_of(
     """
     if ordered and ordered[0].error_px <= ASTRAY_SHARE * side_px:
         return ordered
-    starts = _by_error(
-        [*guard.poses(cv2.SOLVEPNP_IPPE), *guard.poses(cv2.SOLVEPNP_SQPNP)],
-        objects, pixels, cameras,
+    starts = points.solutions(
+        [*guard.poses(cv2.SOLVEPNP_IPPE), *guard.poses(cv2.SOLVEPNP_SQPNP)]
     )
     if not starts:
         return ordered
     least = starts[0].error_px
     if ordered and ordered[0].error_px <= ASTRAY_RATIO[cv2.SOLVEPNP_ITERATIVE] * least:
         return ordered
-    refined = [_refined(each, "lm", objects, pixels, cameras) for each in starts]
+    refined = [points.refined(each, "lm") for each in starts]
     return [min([*refined, *starts], key=lambda each: each.error_px)]
 
 
-def _by_error(
-    poses: Sequence[Pose], objects: Floats, pixels: Floats, cameras: Cameras,
-    used: Iterable[Floats] | None = None,
-) -> list[_Solution]:
-    """Return the finite poses, the best first; ``used`` gave each, by default all points."""
-    given = itertools.repeat(objects, len(poses)) if used is None else used
-    found = [
-        _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras), points)
-        for pose, points in zip(poses, given, strict=True)
-    ]
-    return sorted((each for each in found if math.isfinite(each.error_px)),
-                  key=lambda each: each.error_px)
-
-
 def _or_others(
-    ordered: list[_Solution], guard: GuardedPoints, objects: Floats, pixels: Floats,
-    cameras: Cameras, credible_px: float,
+    ordered: list[_Solution], guard: GuardedPoints, points: _Points, credible_px: float
 ) -> list[_Solution]:
     """Return solutions, or those of ITERATIVE or IPPE where the best is not credible.
 
@@ -672,7 +664,7 @@ def _or_others(
     if ordered and ordered[0].error_px <= credible_px:
         return ordered
     for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE):
-        others = _by_error(guard.poses(method), objects, pixels, cameras)
+        others = points.solutions(guard.poses(method))
         if others and not (
             ordered and ordered[0].error_px <= CREDIBLE_RATIO * others[0].error_px
         ):

@@ -322,29 +322,16 @@ def _accumulate_curved(
         if jump == 0.0:
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
-        columns, rows = edge.to_column - edge.column, edge.to_row - edge.row
         pieces = polygon.piece_count(edge, projection, sheet)
         x, y = polygon.sheet_pixel(edge.column, edge.row, projection, sheet)
         for piece in range(pieces):
-            distance = 0.0
-            t = (piece + 1.0) / pieces
-            u1, v1 = polygon.sheet_pixel(
-                edge.column + t * columns, edge.row + t * rows, projection, sheet
-            )
-            for quarter in range(1, 4):
-                t = (piece + 0.25 * quarter) / pieces
-                u, v = polygon.sheet_pixel(
-                    edge.column + t * columns, edge.row + t * rows, projection, sheet
-                )
-                distance = max(distance, polygon.distance_from_chord(u, v, x, y, u1, v1))
-            chords = polygon.chords_within_tolerance(distance)
+            u1, v1 = polygon.edge_pixel((piece + 1.0) / pieces, edge, projection, sheet)
+            chords = polygon.chord_count(edge, piece, pieces, (x, y, u1, v1), projection, sheet)
             for chord in range(1, chords + 1):
                 u, v = u1, v1
                 if chord < chords:
                     t = (piece + chord / chords) / pieces
-                    u, v = polygon.sheet_pixel(
-                        edge.column + t * columns, edge.row + t * rows, projection, sheet
-                    )
+                    u, v = polygon.edge_pixel(t, edge, projection, sheet)
                 segment = Segment(
                     x + (0.5 - left), y + (0.5 - top), 1.0, u + (0.5 - left), v + (0.5 - top), 1.0
                 )
@@ -625,13 +612,12 @@ def differentiate(
     count
         Pixels that have slopes already, of sheets in other planes.
     """
+    flat = polygon.flat_sheet()
     for area in range(2):
         # Black is 1 and all else 0, then white.
         area_levels = np.zeros(LEVELS)
         area_levels[1 + area] = 1.0
-        accumulate(
-            work.shares[area], edges, area_levels, projection, 0, 0, sigma, polygon.flat_sheet()
-        )
+        accumulate(work.shares[area], edges, area_levels, projection, 0, 0, sigma, flat)
     plane, optics = projection.plane, projection.optics
     ends, sides = edges.ends, edges.sides
     height, width = work.slot.shape
@@ -645,8 +631,11 @@ def differentiate(
         if jump == 0.0:
             continue
         a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
-        edge = ModuleEdge(a, b, c, d)
-        chords = polygon.chord_count(projection, edge) if optics.distorted else 1
+        edge, chords = ModuleEdge(a, b, c, d), 1
+        if optics.distorted:
+            u0, v0 = polygon.edge_pixel(0.0, edge, projection, flat)
+            u1, v1 = polygon.edge_pixel(1.0, edge, projection, flat)
+            chords = polygon.chord_count(edge, 0, 1, (u0, v0, u1, v1), projection, flat)
         for chord in range(chords):
             t0, t1 = chord / chords, (chord + 1.0) / chords
             if not optics.distorted:
@@ -658,8 +647,8 @@ def differentiate(
                 t0, t1 = clip(far_x * z0 - x0, far_x * z1 - x1, t0, t1)
                 t0, t1 = clip(far_y * z0 - y0, far_y * z1 - y1, t0, t1)
             else:
-                u0, v0 = polygon.distorted_point(t0, projection, edge)
-                u1, v1 = polygon.distorted_point(t1, projection, edge)
+                u0, v0 = polygon.edge_pixel(t0, edge, projection, flat)
+                u1, v1 = polygon.edge_pixel(t1, edge, projection, flat)
                 if (
                     max(u0, u1) + 0.5 < -margin or min(u0, u1) + 0.5 > width + margin
                     or max(v0, v1) + 0.5 < -margin or min(v0, v1) + 0.5 > height + margin

@@ -125,17 +125,6 @@ def homogeneous_pixel(
     return intrinsics[0] * x + shift_x * z, intrinsics[1] * y + shift_y * z, z
 
 
-@compiled_inline
-def distorted_point(t: float, projection: Projection, edge: ModuleEdge) -> tuple[float, float]:
-    """Return the pixel of the point at parameter t of an edge, seen through the lens."""
-    column = edge.column + t * (edge.to_column - edge.column)
-    row = edge.row + t * (edge.to_row - edge.row)
-    x, y, z = plane_point(projection.plane, column, row)
-    x, y = distort(x / z, y / z, projection.optics.lens)
-    intrinsics = projection.optics.intrinsics
-    return intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
-
-
 @compiled
 def distance_from_chord(px: float, py: float, x0: float, y0: float, x1: float, y1: float) -> float:
     """Return the distance of a point from the straight line through two others."""
@@ -143,27 +132,6 @@ def distance_from_chord(px: float, py: float, x0: float, y0: float, x1: float, y
     if length == 0.0:
         return math.hypot(px - x0, py - y0)
     return abs((px - x0) * (y1 - y0) - (py - y0) * (x1 - x0)) / length
-
-
-@compiled_inline
-def chords_within_tolerance(distance: float) -> int:
-    """Return the chords that replace a curve whose single chord is ``distance`` px from it."""
-    return min(max(math.ceil(math.sqrt(distance / CHORD_TOLERANCE_PX)), 1), 4096)
-
-
-@compiled
-def chord_count(projection: Projection, edge: ModuleEdge) -> int:
-    """Return the number of equal chords that replace an edge's curved image.
-
-    A chord's distance from a smooth curve falls with the square of their number.
-    """
-    u0, v0 = distorted_point(0.0, projection, edge)
-    u1, v1 = distorted_point(1.0, projection, edge)
-    distance = 0.0
-    for quarter in range(1, 4):
-        u, v = distorted_point(0.25 * quarter, projection, edge)
-        distance = max(distance, distance_from_chord(u, v, u0, v0, u1, v1))
-    return chords_within_tolerance(distance)
 
 
 @compiled
@@ -306,6 +274,35 @@ def sheet_pixel(
         phase = waves[1, wave, 0] * u + waves[1, wave, 1] * v
         down += waves[1, wave, 2] * math.cos(phase) + waves[1, wave, 3] * math.sin(phase)
     return u + right, v + down
+
+
+@compiled_inline
+def edge_pixel(
+    t: float, edge: ModuleEdge, projection: Projection, sheet: Sheet
+) -> tuple[float, float]:
+    """Return the pixel of the point at parameter t of an edge, as :func:`sheet_pixel`."""
+    return sheet_pixel(
+        edge.column + t * (edge.to_column - edge.column), edge.row + t * (edge.to_row - edge.row),
+        projection, sheet,
+    )
+
+
+@compiled
+def chord_count(
+    edge: ModuleEdge, piece: int, pieces: int, ends: tuple[float, float, float, float],
+    projection: Projection, sheet: Sheet,
+) -> int:
+    """Return the number of equal chords that replace the curved image of one of an edge's pieces.
+
+    ``ends`` are the pixels of the piece's ends. A chord's distance from a smooth curve falls with
+    the square of their number.
+    """
+    x0, y0, x1, y1 = ends
+    distance = 0.0
+    for quarter in range(1, 4):
+        x, y = edge_pixel((piece + 0.25 * quarter) / pieces, edge, projection, sheet)
+        distance = max(distance, distance_from_chord(x, y, x0, y0, x1, y1))
+    return min(max(math.ceil(math.sqrt(distance / CHORD_TOLERANCE_PX)), 1), 4096)
 
 
 @compiled

@@ -8,8 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.exact_image import LENSES
-from sweep.measure.estimation import point_covariance, squared_deviations
-from sweep.measure.likelihood import solve_positive
+from sweep.measure.estimation import point_covariance, solve_positive, squared_deviations
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import marker_corners

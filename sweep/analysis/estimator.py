@@ -204,8 +204,8 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
 # too: it then covers less than its level. So all intervals of a store whose sampling was stopped
 # have smaller tails, by `TAIL_SHARE` (but those of mean squares, whose upper ends hold what was not
 # seen: `with_unseen_tail`), and those of rates are Clopper and Pearson's. By exact
-# enumeration (`tests/support/stopped_rate.py`) those of rates then cover 95 % at least, whatever
-# the rate; the others by simulation (`tests/sampling/test_stopped_coverage.py`).
+# enumeration (`tests/sampling/test_stopped_rate.py`) those of rates then cover 95 % at least at any
+# rate; the others by simulation (`tests/sampling/test_stopped_coverage.py`).
 
 TAIL_SHARE = 0.6
 """Tails of intervals of stores whose sampling was stopped, of those that they would have.

@@ -93,9 +93,7 @@ def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
 @METHODS
 @pytest.mark.parametrize(("successes", "n", "said"), [
     (-1, 5, "successes = -1, n = 5"), ([1, 6], 5, "successes = 6, n = 5"),
-    (1.5, 5, "successes = 1.5, n = 5"), (1, 5.5, "successes = 1, n = 5.5"),
-    (np.nan, 5, "successes = nan, n = 5"), (1, np.inf, "successes = 1, n = inf"),
-    (1, 10**15 + 1, "successes = 1, n = 1000000000000001"),
+    (1.5, 5, "successes = 1.5, n = 5"), (1, 10**15 + 1, "successes = 1, n = 1000000000000001"),
 ])
 def test_impossible_counts_are_refused_in_one_line(interval, successes, n, said):
     with pytest.raises(ValueError, match=f"^{re.escape(said)}: expected whole .*$"):

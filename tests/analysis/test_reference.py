@@ -1,7 +1,7 @@
 """The analysis functions against plain loops over every pose of small datasets.
 
-The loops follow the definitions of the functions' descriptions, and SciPy's distributions; nothing
-of `sweep.analysis` is used in them.
+The loops follow the definitions of the functions' descriptions, and SciPy's distributions. Of
+`sweep.analysis` they use the intervals of a proportion, which have tests of their own.
 """
 
 import functools
@@ -38,7 +38,6 @@ from support.small_datasets import (
     student,
 )
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
-from sweep.analysis.estimator import MeanEstimate, length_interval
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -211,27 +210,15 @@ def poses_of(grid, of, per):
     ("all", ()), ("all", ("noise_grey", "cornerRefinementMethod")), ("all", ("trial", "marker_id")),
     ("small", tuple(n for n in ALL if n != "solver")), ("plain", ("marker_id", "distance_m")),
     ("plain", ("trial",)), ("draws", ("marker_id",)), ("no trial", ("cornerRefinementMethod",)),
-    ("one trial", ("tilt_deg",)), ("only trial", ()), ("settings first", ("distance_m",)),
-    ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
+    ("one trial", ("tilt_deg",)), ("only trial", ()), ("small", tuple(ALL)),
     ("settings first", ("cornerRefinementMethod", "solver")),
 ])
 def test_values_and_intervals_are_those_of_plain_loops(function, of, expected, grid, per):
-    per = tuple(name for name in per if name in GRIDS[grid][of].dims)
-    assert_all_agree(function(GRIDS[grid], per), poses_of(grid, of, per), per, expected)
-
-
-@FUNCTIONS
-@pytest.mark.parametrize("grid", ["all", "settings first"])
-def test_the_order_of_dimensions_does_not_matter(function, of, expected, grid):
     results = GRIDS[grid]
-    names = [name for name in results.dims if name not in INNER]
-    per = (names[-1],) if names[-1] in results[of].dims else ()
-    groups = poses_of(grid, of, per)
-    for order in (names[::-1], names[2:] + names[:2]):
-        turned = results.transpose(*order, ...)
-        assert_all_agree(function(turned, per), groups, per, expected)
-    inner_first = results.transpose("xyz", ..., missing_dims="ignore")
-    assert_all_agree(function(inner_first, per), groups, per, expected)
+    per = tuple(name for name in per if name in results[of].dims)
+    assert_all_agree(function(results, per), poses_of(grid, of, per), per, expected)
+    turned = results.transpose("xyz", *[n for n in results.dims if n not in INNER][::-1], ...)
+    assert_all_agree(function(turned, per), poses_of(grid, of, per), per, expected)
 
 
 EDGES = [100.0, 200.0, 450.0, 451.0, 2000.0]
@@ -277,26 +264,6 @@ def test_what_was_cut_away_was_not_run():
         assert detection_rate(cut)[name] == expected[name], name
 
 
-def test_a_draw_with_more_solved_settings_counts_more():
-    # Kish 1965: 10 draws with 30 settings each and 90 with one are worth 19 draws, not 100.
-    results = perfect(np.random.default_rng(1), {"trial": 100, "solver": 30})
-    results["estimate"].values[10:, 1:] = EstimateStatus.solver_failed
-    answer = flip_rate(results)
-    assert answer["solved"] == 10 * 30 + 90
-    assert answer["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16
-
-
-@pytest.mark.parametrize(("components", "freedom"), [(2, 1.0), (3, 2.0), (3, 2.5), (3, 30.0)])
-def test_the_interval_of_a_length_is_scheffes_and_students(components, freedom):
-    one = MeanEstimate(*map(np.atleast_1d, (10.0, 0.5, freedom)))
-    value, low, high = (each.item() for each in length_interval(one, components))
-    rest = freedom - components + 1
-    reach = math.sqrt(components * freedom / rest * stats.f.ppf(0.95, components, rest)
-                      ) if rest > 0 else math.inf
-    assert (value, low) == (10.0, pytest.approx(max(0.0, 10.0 - 0.5 * reach), rel=1e-9))
-    assert high == pytest.approx(10.0 + 0.5 * stats.t.ppf(0.975, freedom), rel=1e-9)
-
-
 def test_a_solved_pose_without_a_number_counts_in_no_mean():
     results = perfect(np.random.default_rng(2), {"trial": 60})
     results["rotation_error_rad"].values[:3] = np.nan
@@ -311,11 +278,9 @@ def test_a_solved_pose_without_a_number_counts_in_no_mean():
     (None, {"per": ("speed",)}, ArgumentError, r"^per = speed: no .*; there.*tilt_deg.*trial"),
     (lambda r: r.assign_coords(size_m=("tilt_deg", [0.1, 0.2])), {"per": ["size_m"]}, ArgumentError,
      "size_m: goes with the axis tilt_deg: name that"),
-    (None, {"per": [3]}, ArgumentError, "names of dimensions"),
     (None, {"per": None}, ArgumentError, "names of dimensions"),
     (None, {"bins": {"speed": [0.0, 1.0]}}, ArgumentError, "bins = speed: no such variable"),
     (None, {"bins": ["marker_area_px"]}, ArgumentError, "names with edges"),
-    (None, {"bins": {"marker_area_px": "abc"}}, ArgumentError, "increasing edges"),
     (None, {"bins": {"marker_area_px": [1, np.nan]}}, ArgumentError, "increasing edges"),
     (lambda r: r.drop_vars("estimate"), {}, DatasetError, "no variable estimate; there are"),
     (lambda _: xr.Dataset(), {}, DatasetError, "no variable detection, estimate"),

@@ -109,14 +109,6 @@ def test_rare_failures_get_no_more_than_independent_draws():
     assert one.detection_rate_low.item() < 0.99
 
 
-def test_flips_are_counted_in_draws_and_not_in_replicates():
-    truth = true_values()["rotation_rmse_unflipped_deg"]
-    even, independent = (
-        covered(dataset(50, sobol=sobol), "rotation_rmse_deg", truth) for sobol in (True, False))
-    assert min(even[0], independent[0]) > 0.8
-    assert even[1] == pytest.approx(independent[1], rel=0.1)
-
-
 def test_settings_of_a_trial_count_as_one_draw():
     results = dataset(2, 64)
     twice = xr.concat([results, results], dim="blur_px").assign_coords(blur_px=[0.0, 1.0])
@@ -146,4 +138,3 @@ def test_what_needs_independent_draws_says_so():
     other = dataset(1, 64, dims=("marker_id", "trial"), sobol=False)
     with pytest.raises(DatasetError, match="sampling sobol and independent"):
         compare(results.isel(marker_id=[0]), other)
-

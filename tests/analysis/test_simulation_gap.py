@@ -142,7 +142,6 @@ FIRST, TWINS, SIMULATION = results_of(RNG), twins(RNG), results_of(RNG, files=Fa
 
 @pytest.mark.parametrize(("first", "second", "bins", "error", "words"), [
     (SIMULATION, FIRST, {}, DatasetError, "expected photographs"),
-    (TWINS, FIRST, {}, DatasetError, "expected photographs"),
     (FIRST, TWINS.assign_coords(sha256=("trial", ["another"] * PHOTOGRAPHS)), {}, DatasetError,
      "twin of other photographs"),
     (FIRST, TWINS.assign_coords(cornerRefinementMethod=["contour", "apriltag"]), {}, DatasetError,
@@ -154,12 +153,6 @@ FIRST, TWINS, SIMULATION = results_of(RNG), twins(RNG), results_of(RNG, files=Fa
 def test_what_cannot_be_compared_is_told_in_a_line(first, second, bins, error, words):
     with pytest.raises(error, match=words):
         simulation_gap(first, second, bins=bins)
-
-
-def test_few_photographs_have_values_without_intervals():
-    gap = simulation_gap(results_of(np.random.default_rng(7), 3), TWINS)
-    assert np.isfinite(gap.rotation_median_deg).all()
-    assert np.isnan(gap.rotation_median_deg_gap_low).all()
 
 
 def test_resampled_quantiles_are_scipys():

@@ -1,14 +1,14 @@
 """Small datasets of poses and the analysis of them by plain loops and SciPy's distributions."""
 
-import functools
 import itertools
 import math
 from collections import Counter
 
 import numpy as np
 import xarray as xr
-from scipy import special, stats
+from scipy import special
 
+from sweep.analysis.intervals import jeffreys, wilson
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 VALUES = {
@@ -270,23 +270,6 @@ def rate(name, of, hits, method="wilson"):
     ends = wilson if method == "wilson" else jeffreys
     return out | {f"{stem}_low": ends(hits * draws // n, draws)[0],
                   f"{stem}_high": ends(math.ceil(hits * draws / n), draws)[1]}
-
-
-@functools.cache
-def wilson(successes, n):
-    """Brown, Cai and DasGupta 2001, eq. 4."""
-    z = stats.norm.ppf(0.975)
-    p = successes / n
-    centre = (successes + z**2 / 2) / (n + z**2)
-    half = z * math.sqrt(n) / (n + z**2) * math.sqrt(p * (1 - p) + z**2 / (4 * n))
-    return (0.0 if successes == 0 else centre - half), (1.0 if successes == n else centre + half)
-
-
-@functools.cache
-def jeffreys(successes, n):
-    """Brown, Cai and DasGupta 2001, section 3.1.3."""
-    low, high = stats.beta.ppf([0.025, 0.975], successes + 0.5, n - successes + 0.5)
-    return (0.0 if successes == 0 else low), (1.0 if successes == n else high)
 
 
 def mean_of(pairs, run):

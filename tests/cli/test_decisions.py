@@ -64,8 +64,7 @@ def test_what_the_pipeline_requires_is_decided(require):
 
 
 @pytest.mark.parametrize(("arguments", "status"), [
-    (["detection >= 0.55"], 3), (["detection >= 0.3"], 0), (["detection >= 0.8"], 1),
-    (["detection >= 0.8", "--at", "side_px=40"], 0),
+    (["detection >= 0.3"], 0), (["detection >= 0.8"], 1),
     (["detection >= 0.995", "--at", "side_px=40"], 3),
     (["detection >= 0.3", "rotation_p95_deg <= 0.0001", "--per", "side_px"], 1),
     (["--pipeline", "other.toml", "--at", "side_px=40"], 0),
@@ -109,15 +108,11 @@ def test_a_store_is_worse_than_another_and_not_than_itself(folder, require):
 
 @pytest.mark.parametrize(("arguments", "line"), [
     (["begun.zarr"], "begun.zarr: unfinished: 0 of "),
-    (["none.zarr"], "none.zarr: "),
     (["two.zarr", "detection"], "REQUIREMENT detection: expected NAME >= NUMBER"),
-    (["two.zarr", "detection >= 99 %"], "write 0.99"),
     (["two.zarr", "nees <= 7"], "nees_mean: no pose of this store has such a number"),
     (["drawn.zarr", "detection >= 0.5", "--per", "distance_m"], "is drawn in this store"),
     (["two.zarr", "--per", "trial"], "intervals are over the draws"),
     (["two.zarr", "--at", "side=40"], "--at side=40: unknown parameter; did you mean side_px?"),
-    (["two.zarr", "--at", "side_px=41"], "no such value; there are 11.0, 40.0"),
-    (["once.zarr", "detection >= 0.5"], "a single draw of each pose"),
     (["once.zarr"], "has no section [require]"),
     (["two.zarr", "--against", "once.zarr"], "not the same scenes"),
 ])
@@ -154,15 +149,12 @@ def written(tmp_path, choose='smallest = "side_px"', more="", trials=100):
     return path
 
 
-@pytest.fixture
-def found(tmp_path, monkeypatch, capsys):
+def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     written(tmp_path)
-    return size(["marker.toml", "--seconds", "0.2", "--json"], capsys)
-
-
-def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(found, capsys):
-    status, out, _ = found
+    status, out, _ = size(["marker.toml", "--seconds", "0.2", "--json"], capsys)
     answer = json.loads(out)
     assert (status, answer["decision"], answer["answer"]["side_px"]) == (0, "met", 30.0)
     assert answer["alternatives"][0]["next"] == 4.0
@@ -186,17 +178,8 @@ def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
     assert "rotation_p95_deg <= 1e-06 is not met" in out
 
 
-def test_a_pipeline_without_a_choice_is_told_what_to_write(tmp_path, capsys):
-    path = tmp_path / "plain.toml"
-    path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = 5\n")
-    status, _, err = size([path], capsys)
-    assert (status, err.count("\n")) == (2, 1)
-    assert 'expected what is chosen: [search] smallest = "size_m", max_trials = 5000' in err
-
-
 @pytest.mark.parametrize(("choose", "more", "line"), [
     ('smallest = "solver"', "", "search.smallest"),
-    ('smallest = "side_px"', ', "budget_ms >= 2"', "expected milliseconds of a frame"),
     ('smallest = "side_px"', ', "detection <= 0.2"', "no result can be both"),
     ('smallest = "side_px"', ', "solved >= 0.999"', "search.max_trials = 100: expected at least"),
     ("", "", "expected one of along, smallest"),
@@ -212,14 +195,19 @@ def test_what_cannot_be_searched_is_a_line_before_anything_runs(
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("command", ["size", "limit"])
-def test_a_file_that_cannot_be_read_is_told_before_more_is_asked_for(
-    command, tmp_path, monkeypatch, capsys
+@pytest.mark.parametrize(("command", "line"), [
+    ("size plain.toml", 'expected what is chosen: [search] smallest = "size_m", max_trials = 5000'),
+    ("size missing.toml", "missing.toml: cannot be read: No such file"),
+    ("limit missing.toml", "missing.toml: cannot be read: No such file"),
+])
+def test_a_pipeline_that_chooses_nothing_is_told_what_to_write(
+    command, line, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    assert main([command, "missing.toml"]) == 2
-    line, = capsys.readouterr().err.splitlines()
-    assert line.startswith("missing.toml: cannot be read: No such file")
+    (tmp_path / "plain.toml").write_text("[pose]\nside_px = 20\n[axes]\ntrial = 5\n")
+    assert main(command.split()) == 2
+    told, = capsys.readouterr().err.splitlines()
+    assert line in told
 
 
 BOUND = """
@@ -256,8 +244,7 @@ def test_a_bound_that_no_pose_has_is_a_line_of_every_command_and_of_the_report(b
     (["black=[0, 30]", "white=220", "background=200"], []), (["bound=none"], []),
     (["black=30", "white={ uniform = [254, 255] }"], ["clipped"]),
     (["noise_grey=[0.1, 4]"], ["no_noise", "clipped"]),
-    (["gain=2", "black=30", "white=220"], ["clipped"]), (["vignetting=0.3"], ["not_in_model"]),
-    (["bound=['none', 'known_blur']"], ["clipped"]),
+    (["vignetting=0.3"], ["not_in_model"]), (["bound=['none', 'known_blur']"], ["clipped"]),
 ])
 def test_why_no_pose_has_a_bound_is_told(settings, reasons):
     line = "".join(bound_notes(Pipeline.from_text(BOUND, settings)))

@@ -51,39 +51,30 @@ def told(capsys, line):
     [
         ("runn small.toml", "did you mean run?"),
         ("help", "`sweep COMMAND --help` print the help"),
-        ("run", "--example smoke"),
         ("run small.toml --example smoke", "--example smoke"),
         ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
         ("run small.toml --set tilt_deg 3", "values are set by --set KEY=VALUE"),
-        ("run small.toml --dry-run", "`sweep plan PIPELINE` shows what would run"),
         ("plan small.toml --worker-count 2", "did you mean --workers?"),
         ("run small", "did you mean small.toml?"),
         ("run runs", "runs: a folder that is no store; expected a TOML file or a store"),
         ("run small.toml --set Tilt_Deg=3", "did you mean tilt_deg?"),
-        ("run small.toml --set tilt_deg=0,45", "such as [0, 45]"),
         ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),
         ("show small.toml --at side_px:30", "expected name=value"),
-        ("show small.toml --at side_px=30 --at side_px=60", "side_px is given twice"),
         ("show small.toml -o cell.jpg", "expected a file that ends in .png"),
-        ("repro runs/small.zarr --at Side_px=30", "did you mean side_px?"),
         ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
         ("repro runs/small.zarr --plain", "--plain and --full are for the file of -o"),
-        ("repro runs/small.zarr -o a.png --at trial=0 --at trial=1", "expected one --at beside it"),
         ("repro small.toml", "`sweep run small.toml` makes its store"),
         ("status small", "did you mean runs/small.zarr?"),
         ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
         ("report runs/unfinished.zarr", "unfinished: 1 of 1 blocks; `sweep run` continues it"),
-        ("verify small.toml", "not a sweep store, but a pipeline file"),
         ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
         ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
         ("run small.toml --set trial=5",
          "sweep run small.toml --set trial=5 --store runs/small-2.zarr --reuse runs/small.zarr"),
-        ("repro runs/small.zarr --time-limit inf", "--time-limit inf: expected seconds above 0"),
         ("tradeoff runs/small.zarr --seconds nan",
          "--seconds nan: expected a finite number above 0"),
         ("run few.toml --precision 'detection_rate = 0.1'",
          "--max-trials: expected max_trials, too: the most trials of a condition, such as 2400"),
-        ("limit small.toml --require 'detektion >= 0.1' --along side_px", "require.all"),
         ("run small.toml --set seed=5", "holds another experiment; choose another store"),
     ],
 )
@@ -100,13 +91,10 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
     [
         ("run small.toml", "sweep report runs/small.zarr"),
         ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
-        ("show runs/small.zarr", "sweep plan runs/small.zarr"),
         ("repro runs/small.zarr --at trial=1",
          "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
-        ("status runs/small.zarr", "sweep report runs/small.zarr"),
         ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
         ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
-        ("verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr"),
         ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
         ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
     ],
@@ -139,8 +127,6 @@ def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
         sweep.run("runs")
     with pytest.raises(SweepError, match=r"but a pipeline file; `sweep run small.toml` makes"):
         sweep.open("small.toml")
-    with pytest.raises(SweepError, match=r"did you mean runs/small.zarr\?"):
-        sweep.open("small")
 
 
 def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
@@ -163,7 +149,6 @@ def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
          ["writes 20 GB before compression, and 10 GB are free"]),
         (Demand(5.0, 1, 1, 1000), FreeDisk(10**10, 100),
          ["makes 1,000 files, and the disk has room for 100"]),
-        (Demand(5.0, 1, 1, 1000), FreeDisk(10**10, None), []),
         (Demand(5.0, 1, 10**15, 1000), None, []),
     ],
 )

@@ -56,11 +56,10 @@ PLACES = {
     "~/x.zarr": "~ is not expanded here; expected /home/someone/x.zarr, or ./~/x.zarr for a "
                 "folder of that name",
     "nonsense://x": "cannot be reached: Protocol not known: nonsense",
-    "a\0b": "a path cannot hold a null character; choose another one",
 }
 
 
-@pytest.mark.parametrize("place", PLACES, ids=lambda place: place[:20].replace("\0", "NUL"))
+@pytest.mark.parametrize("place", PLACES, ids=lambda place: place[:20])
 def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, folder):  # noqa: ARG001
     for reader in READERS:
         if not (reader[0] == "tradeoff" and place.endswith(".toml")):
@@ -74,14 +73,12 @@ def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, f
     [
         ("small.toml/s.zarr", "cannot be written: Not a directory"),
         *((place, PLACES[place]) for place in (
-            "loop.zarr", "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr", "a\0b")),
-        ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
-        *((f"{protocol}://a/x.zarr", f"{protocol}://a/x.zarr: ") for protocol in (
-            "github", "zip", "simplecache", "foo", "S3")),
+            "loop.zarr", "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr")),
+        ("http://127.0.0.1:9/x.zarr", "cannot be reached"), ("zip://a/x.zarr", "zip://a/x.zarr: "),
         ("small.toml", "not a sweep store, but a pipeline file"),
         ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
     ],
-    ids=lambda text: text[:20].replace("\0", "NUL"),
+    ids=lambda text: text[:20],
 )
 def test_a_place_that_cannot_be_written_is_refused_before_anything_starts(
     place, problem, folder
@@ -120,11 +117,8 @@ ERRORS = {
 def test_what_the_system_refuses_is_told_in_one_line(error, monkeypatch):
     monkeypatch.setattr("sweep.cli.check_installation", mock.Mock(side_effect=error))
     assert command("status", "x") == (1, "", ERRORS[error] + "\n")
-
-
-def test_a_defect_is_not_taken_for_the_system(monkeypatch):
-    monkeypatch.setattr(
-        "sweep.cli.check_installation", mock.Mock(side_effect=RuntimeError("some defect")))
+    defect = mock.Mock(side_effect=RuntimeError("some defect"))
+    monkeypatch.setattr("sweep.cli.check_installation", defect)
     with pytest.raises(RuntimeError, match="some defect"):
         cli.main(["status", "x"])
 

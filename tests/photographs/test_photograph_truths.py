@@ -217,7 +217,8 @@ def test_what_is_left_out_and_converted_is_said(faulty, tmp_path):
     cv2.imwrite(str(shots / "deep.png"), grey.astype(np.uint16) * 257)
     cv2.imwrite(str(shots / "colour.png"), cv2.merge([grey, grey // 2, grey]))
     (shots / "cut.jpg").write_bytes(b"\xff\xd8\xff")
-    (shots / os.fsdecode(b"\xff.png")).write_bytes((shots / "deep.png").read_bytes())
+    for name in (os.fsdecode(b"\xff.png"), "again.png"):
+        shutil.copy(shots / "deep.png", shots / name)
     (shots / "notes.txt").write_text("no photograph")
     made = prepare([shots], faulty / "camera.json", board=faulty / "board.toml", home=tmp_path)
     said = "\n".join(made.lines)

@@ -30,7 +30,7 @@ from sweep.photographs.folder import FoundCorners
 from sweep.photographs.pose_fit import Lens, fit_pose
 from sweep.photographs.prepare import prepare
 from sweep.photographs.truth import camera_of_file, known_camera, unshared_variance
-from sweep.photographs.twins import read_scene, twin_pipeline
+from sweep.photographs.twins import twin_pipeline
 
 
 @pytest.fixture(scope="module")
@@ -235,20 +235,14 @@ def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_i
     assert difference.max() < 1.0  # rounding
 
 
-def test_only_photographs_have_twins(prepared, tmp_path):
+def test_only_photographs_have_twins(prepared):
     twins = twin_pipeline(prepared, {})
     for other in (Pipeline.from_dict({"pose": {"distance_m": 1}}), twins):
         with pytest.raises(SweepError, match="expected a store of photographs"):
             twin_pipeline(other, {})
-    with pytest.raises(SweepError, match="simulated = true: expected photographs beside it"):
-        Pipeline.from_dict({"pose": {"distance_m": 1}, "scene": {"simulated": True}})
     with pytest.raises(SweepError, match="nothing beside photographs, which have their own poses"):
         Pipeline.from_text(
             twins.to_toml() + "\n[pose]\ndistance_m = 1\n", folder=prepared.folder)
-    (tmp_path / "none.toml").write_text("seed = 1\n")
-    for name, line in (("none", r"expected a section \[scene\]"), ("missing", "cannot be read")):
-        with pytest.raises(SweepError, match=line):
-            read_scene(tmp_path / f"{name}.toml")
 
 
 LENS = Lens.of(*VIEW, (0.1, -0.2, 0.001, -0.001, 0.05))

@@ -46,19 +46,6 @@ def test_a_link_stays_and_its_file_is_written(tmp_path):
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_device_is_written_into_and_stays(tmp_path):
-    write_output_file(Path("/dev/null"), b"text")
-    assert Path("/dev/null").is_char_device()
-    full = tmp_path / "full.svg"
-    full.symlink_to("/dev/full")
-    for path in (full, Path("/dev/full")):
-        check_output_file(path)
-        with pytest.raises(StoreError, match="cannot be written: No space left on device"):
-            write_output_file(path, b"text")
-        assert path.is_char_device()
-    assert full.is_symlink()
-
-
 def test_what_cannot_be_written_is_told_in_a_line(tmp_path):
     file, loop = tmp_path / "file", tmp_path / "loop"
     file.write_text("mine")

@@ -5,22 +5,18 @@ import json
 import math
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
-from hypothesis import given
-from hypothesis import strategies as st
 
 from support.reports import CAMERA, command, made
 from support.small_datasets import perfect
+from sweep.analysis import compare, error_statistics
 from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
-from sweep.report.report_data import Configurations, ReportData
+from sweep.report.report_data import ReportData
 from sweep.report.table import number
 from sweep.store.lifecycle import open_dataset
 
@@ -63,74 +59,41 @@ def told(url, *arguments):
     return json.loads(out), page.read_text(encoding="utf-8")
 
 
-def numbers_of(results):
-    """Return n, rates and RMSE of one configuration, and its squared errors, by plain NumPy."""
-    solved = (results["estimate"] == EstimateStatus.solved).values
-    rotation = results["rotation_error_deg"].values.astype(float)
-    errors, truth = xr.broadcast(results["translation_error_m"], results["true_tvec_m"])
-    order = (*results["estimate"].dims, ...)
-    depth = (errors.astype(float) / truth).transpose(*order).values[..., 2]
-    detected = (results["detection"] == DetectionStatus.detected).values
-    return SimpleNamespace(
-        count=detected.size, detected=100 * detected.mean(), solved=solved,
-        rotation=np.where(solved, rotation, np.nan) ** 2,
-        depth=np.where(solved, depth, np.nan) ** 2,
-        median=np.sort(np.where(solved, rotation, np.inf).ravel())[math.ceil(solved.size / 2) - 1],
-        flipped=(results["flipped"] == Flipped.flipped).values)
-
-
 def value_of(cell):
     """Return the number of a cell of a table's JSON, infinite where it is flagged."""
     return math.inf if cell.get("value_flag") == "infinite" else cell["value"]
 
 
-def test_line_table_and_json_are_what_plain_numpy_finds(tmp_path):
+def test_line_table_json_and_page_have_the_numbers_of_the_analysis(tmp_path):
     url = made(tmp_path, TUTORIAL, "tutorial",
                settings=["distance_m=[1, 3, 5]", "tilt_deg=[30, 60]", "trial=12"])
     shown, page = told(url)
-    results = open_dataset(url).load()
-    parts = {label: numbers_of(results.sel(cornerRefinementMethod=label))
-             for label in ("none", "subpix")}
+    results = open_dataset(url)
     assert shown["answer"].startswith("subpix against none: ")
-    assert "range RMSE ratio 0." in shown["answer"]
+    assert f'<p class="verdict">{shown["answer"]}</p>' in page
     table = next(each for each in shown["tables"]
                  if each["caption"].startswith("Configurations, with"))
     rows = {row["configuration"]: row for row in table["rows"]}
-    assert set(rows) == set(parts)
-    for label, one in parts.items():
-        row = rows[label]
-        assert row["n"] == one.count
-        for heading, value in (
-            ("detected, %", one.detected), ("solved, %", 100 * one.solved.mean()),
-            ("rotation median, deg", one.median),
-            ("rotation RMSE, deg", math.sqrt(np.nanmean(one.rotation))),
-            ("range RMSE, %", 100 * math.sqrt(np.nanmean(one.depth))),
-            ("flips, %", 100 * one.flipped.sum() / one.solved.sum())):
-            assert value_of(row[heading]) == pytest.approx(value, rel=1e-6)
-    assert f'<p class="verdict">{shown["answer"]}</p>' in page
-    named, other = "subpix", "none"
+    found = error_statistics(results, ["cornerRefinementMethod"])
+    for label, row in rows.items():
+        one = found.sel(cornerRefinementMethod=label)
+        assert row["n"] == one["looked_for"]
+        for heading, name, scale in (
+            ("solved, %", "solved_rate", 100), ("rotation RMSE, deg", "rotation_rmse_deg", 1),
+            ("rotation median, deg", "rotation_median_deg", 1),
+            ("range RMSE, %", "range_rmse_percent", 1)):
+            assert value_of(row[heading]) == pytest.approx(scale * one[name].item(), rel=1e-9)
     tiles = {each["name"]: each for each in shown["numbers"]}
-    assert tiles["detected"]["text"] == f"{number(parts[named].detected)} %"
-    for heading, unit in (("rotation RMSE", "deg"), ("range RMSE", "%")):
-        assert tiles[heading]["value"] == rows[named][f"{heading}, {unit}"]["value"]
-    (found,) = shown["comparison"]
-    assert (found["configuration"], found["against"]) == (named, other)
-    assert rows[named]["verdict"] == ("best" if found["verdict"] == "better" else "named")
-    assert rows[other]["verdict"].split(":")[0] == found["verdict"] != "worse"
-    best, beaten = parts[named], parts[other]
-    both = best.solved & beaten.solved
-    differ = (best.flipped != beaten.flipped) & both
-    few = 0 < differ.sum() < 10
-    unflipped = both & ~best.flipped & ~beaten.flipped if few else both
-    expected = {
-        "detection": best.detected - beaten.detected,
-        "solved": 100 * (best.solved.mean() - beaten.solved.mean()),
-        "rotation": math.sqrt(best.rotation[unflipped].mean() / beaten.rotation[unflipped].mean()),
-        "range": math.sqrt(best.depth[both].mean() / beaten.depth[both].mean())}
-    for each in found["differences"]:
+    assert tiles["detected"]["text"] == f"{number(rows['subpix']['detected, %']['value'])} %"
+    assert tiles["range RMSE"]["value"] == rows["subpix"]["range RMSE, %"]["value"]
+    (pair,) = shown["comparison"]
+    assert (pair["configuration"], pair["against"]) == ("subpix", "none")
+    sides = (results.sel(cornerRefinementMethod=label) for label in ("none", "subpix"))
+    difference = compare(*sides)["detection_difference"].item()
+    assert pair["differences"][0]["value"] == pytest.approx(100 * difference)
+    for each in pair["differences"]:
         kind = each["quantity"].split()[0]
-        assert each["value"] == pytest.approx(expected[kind], rel=1e-6, abs=1e-12)
-        cell = next(cell for heading, cell in rows[other].items()
+        cell = next(cell for heading, cell in rows["none"].items()
                     if heading.startswith(kind) and ("difference" in heading or "ratio" in heading))
         assert cell["value"] == each["value"]
         equal = 0 if "difference" in each["quantity"] else 1
@@ -139,33 +102,6 @@ def test_line_table_and_json_are_what_plain_numpy_finds(tmp_path):
             assert (f"{each['quantity']} {number(each['value'])} ({number(each['low'])} to "
                     f"{number(each['high'])})") in shown["answer"]
             assert (each["value"] > equal) == ((each["verdict"] == "better") == (equal == 0))
-
-
-VERDICTS = st.integers(2, 6).flatmap(lambda n: st.lists(
-    st.sampled_from([-1, 0, 1]), min_size=n * (n - 1) // 2, max_size=n * (n - 1) // 2).map(
-        lambda flat: (n, flat)))
-
-
-@given(VERDICTS)
-def test_no_configuration_is_named_that_another_one_is_better_than_if_there_is_one(drawn):
-    count, flat = drawn
-    matrix = np.zeros((count, count), int)
-    matrix[np.triu_indices(count, 1)] = flat
-    matrix -= matrix.T
-
-    def against(_, __, best):
-        return [() if k == best else (comparisons.Difference("d", 0, 0, 0, "", verdict),)
-                for k, verdict in enumerate(matrix[best].tolist())]
-
-    names = [f"c{k}" for k in range(count)]
-    known = Configurations({}, [{}] * count, names, np.zeros(count, bool), None)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparisons, "_against_each", against)
-        patch.setattr(comparisons, "configurations", lambda *_, **__: known)
-        found = comparisons._comparison(None, None)
-    worse = (matrix < 0).sum(axis=1)
-    assert worse[found.best] == worse.min()
-    assert ("worse" in found.line) == bool(worse.min())
 
 
 # What is required.

@@ -3,6 +3,8 @@
 import numpy as np
 import xarray as xr
 
+from support.comparisons import with_detected
+from support.small_datasets import perfect
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 PHOTOGRAPHS, MARKERS = 12, 9
@@ -11,41 +13,27 @@ REFINEMENTS = ["none", "subpix"]
 
 def results_of(rng, trials=PHOTOGRAPHS, *, simulated=None, files=None, scale=1.0, spread=0.5):
     """Return results of photographs, of their twins, or of a simulation (``files`` is False)."""
-    shape = (trials, MARKERS, len(REFINEMENTS))
-    dims = ("trial", "marker_id", "cornerRefinementMethod")
+    sizes = {"trial": trials, "marker_id": MARKERS, "cornerRefinementMethod": len(REFINEMENTS)}
+    shape = tuple(sizes.values())
     own = np.exp(rng.normal(0.0, spread, (trials, 1, 1)))
-    angle = scale * own * rng.chisquare(3, shape) / 100
-    depth = scale * (own - 0.5 + rng.normal(0.0, 1.0, shape)) / 100
-    flags = np.where(rng.random(shape) < 0.15, DetectionStatus.no_candidate,
-                     DetectionStatus.detected)
-    flags[:, 0] = DetectionStatus.not_in_photograph
-    detected = flags == DetectionStatus.detected
-    solved = np.where(detected, EstimateStatus.solved, EstimateStatus.no_detection)
-    flipped = np.where(rng.random(shape) < 0.2, Flipped.flipped, Flipped.not_flipped)
-    zero = np.zeros(shape)
-    position = np.zeros((trials, MARKERS, 3))
-    position[..., 2] = 2.0
-    sides = np.broadcast_to(20.0 + 5 * np.arange(MARKERS), shape[:2])
-    found = xr.Dataset(
-        {
-            "detection": (dims, flags.astype(np.uint8)),
-            "estimate": (dims, solved.astype(np.uint8)),
-            "flipped": (dims, np.where(detected, flipped, Flipped.no_estimate).astype(np.uint8)),
-            "rotation_error_rad": (
-                (*dims, "xyz"),
-                np.where(detected[..., None], np.stack([zero, angle, zero], axis=-1), np.nan),
-            ),
-            "translation_error_m": (
-                (*dims, "xyz"),
-                np.where(detected[..., None], np.stack([zero, zero, 2 * depth], axis=-1), np.nan),
-            ),
-            "true_tvec_m": (("trial", "marker_id", "xyz"), position),
-            "true_rvec": (("trial", "marker_id", "xyz"), position),
-            "side_px": (("trial", "marker_id"), sides),
-        },
-        {"trial": range(trials), "marker_id": range(MARKERS),
-         "cornerRefinementMethod": REFINEMENTS},
-    )
+    rotation, position = np.zeros((2, *shape, 3))
+    rotation[..., 1] = scale * own * rng.chisquare(3, shape) / 100
+    position[..., 2] = 2 * scale * (own - 0.5 + rng.normal(0.0, 1.0, shape)) / 100
+    found = with_detected(
+        perfect(rng, sizes, rotation=rotation, position=position), rng.random(shape) >= 0.15)
+    found["detection"][:, 0] = DetectionStatus.not_in_photograph
+    hidden = found["detection"] != DetectionStatus.detected
+    turned = xr.DataArray(rng.random(shape) < 0.2, dims=found["flipped"].dims)
+    found = found.assign(
+        estimate=found["estimate"].where(~hidden, np.uint8(EstimateStatus.no_detection)),
+        flipped=xr.where(hidden, Flipped.no_estimate, xr.where(
+            turned, Flipped.flipped, Flipped.not_flipped)).astype(np.uint8),
+        rotation_error_rad=found["rotation_error_rad"].where(~hidden),
+        translation_error_m=found["translation_error_m"].where(~hidden),
+        true_tvec_m=found["true_tvec_m"].copy(data=np.broadcast_to(
+            [0.0, 0.0, 2.0], (*shape[:2], 3))),
+        side_px=20.0 + 5 * xr.DataArray(np.indices(shape[:2])[1], dims=("trial", "marker_id")),
+    ).assign_coords(marker_id=range(MARKERS), cornerRefinementMethod=REFINEMENTS).drop_attrs()
     if files is False:
         return found
     names = files or [f"{k}.png" for k in range(trials)]

@@ -7,10 +7,8 @@ import os
 from pathlib import Path
 from unittest import mock
 
-from support.poisoned.sitecustomize import _Poison
+from support.poisoned.sitecustomize import poison
 from sweep.evaluation import block, search
-from sweep.experiment.experiment import Experiment
-from sweep.measure import detectors
 
 POISONED = Path(__file__).parent / "poisoned"
 
@@ -38,21 +36,21 @@ class Poison:
 
 def poisoned(poisons, log):
     """Return the environment in which the commands are poisoned."""
-    given = {"log": str(log), "poisons": [poison.written() for poison in poisons]}
+    given = {"log": str(log), "poisons": [each.written() for each in poisons]}
     path = os.pathsep.join(filter(None, [str(POISONED), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path, "SWEEP_POISON": json.dumps(given)}
 
 
-WRAPPED = [(search, "build_scenes"), (search, "render_all"), (block, "detections_for"),
-           (block, "build"), (Experiment, "scene_values"), (detectors, "Detector")]
+POISONED_FUNCTIONS = [(search, "images_of"), (search, "detection_sources"),
+                      (block, "detections_for"), (block, "all_or_each")]
 
 
 @contextlib.contextmanager
 def raising(poisons, log):
     """Have scenes raise in this process while this is entered."""
-    assert not any(poison.deadly for poison in poisons)
+    assert not any(each.deadly for each in poisons)
     with contextlib.ExitStack() as stack:
-        for owner, name in WRAPPED:
+        for owner, name in POISONED_FUNCTIONS:
             stack.enter_context(mock.patch.object(owner, name, getattr(owner, name)))
-        _Poison(block, search, [poison.written() for poison in poisons], str(log))
+        poison(block, search, [each.written() for each in poisons], str(log))
         yield

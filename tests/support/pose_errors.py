@@ -4,10 +4,9 @@ import runpy
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
+from support.small_datasets import perfect
 from sweep.analysis.poses import viewing_angle_of
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
 
 TEXT = """seed = 1
@@ -65,45 +64,25 @@ def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None, drawn=None)
     rvec = vector_of_rotation(rotation.reshape(-1, 3, 3)).reshape(*shape, 3)
     side = FX * grid.get("size_m", SIZE_M) / z
     bias, sigma = law(z, side, viewing_angle_of(rvec, position))
-    dims, count = tuple(scene), len(axes.get("solver", [0]))
     draw = normal or (lambda rng, size: rng.normal(size=size))
     unit = position / np.linalg.norm(position, axis=-1, keepdims=True)
     turn = minimal_turn(unit)
-    parts = []
-    for _ in range(count):
-        error = bias + sigma * draw(rng, sigma.shape)
-        parts.append(np.concatenate(
-            [np.einsum("...ij,...j->...i", turn, error[..., k : k + 3]) for k in (0, 3)], axis=-1))
-    errors = parts[0]
-    estimated = dims
-    if "solver" in axes:
-        errors, estimated = np.stack(parts, axis=-2), (*dims, "solver")
-    size = errors.shape[:-1]
-
-    def flags(names, value):
-        lengths = tuple(len(axes[name]) for name in names)
-        return names, np.full(lengths, value, dtype=np.uint8)
-
-    assert errors.shape[:-1] == size
+    sizes = {name: len(axes[name]) for name in (*scene, "solver") if name in axes}
+    drawn_errors = np.stack([draw(rng, (*shape, 6)) for _ in axes.get("solver", [0])], axis=-2)
+    errors = bias[..., None, :] + sigma[..., None, :] * drawn_errors
+    turned = [np.einsum("...ij,...kj->...ki", turn, errors[..., k : k + 3]).reshape(
+        *sizes.values(), 3) for k in (0, 3)]
+    results = perfect(rng, sizes, position=turned[0], rotation=turned[1]).assign(
+        true_rvec=((*scene, "xyz"), rvec), true_tvec_m=((*scene, "xyz"), position),
+        marker_area_px=(scene, side**2))
     listed = {name: list(map(float, axes[name])) for name in scene if name != "trial"}
-    text = TEXT.format(
+    return results.assign_coords(
+        {name: list(values) for name, values in axes.items()}
+        | {name: (scene, each) for name, each in values.items()}
+    ).assign_attrs(pipeline=TEXT.format(
         fx=FX, size="" if "size_m" in axes else f"size_m = {SIZE_M}",
         distance="" if "distance_m" in axes else "distance_m = 1", axes="\n".join(
-            f"{name} = {values}" for name, values in listed.items()) + "\ntrial = 9")
-    return xr.Dataset(
-        {
-            "true_rvec": ((*dims, "xyz"), rvec), "true_tvec_m": ((*dims, "xyz"), position),
-            "marker_area_px": (dims, side**2),
-            "detection": flags(dims, DetectionStatus.detected),
-            "estimate": flags(estimated, EstimateStatus.solved),
-            "flipped": flags(estimated, Flipped.not_flipped),
-            "translation_error_m": ((*estimated, "xyz"), errors[..., :3].astype(np.float32)),
-            "rotation_error_rad": ((*estimated, "xyz"), errors[..., 3:].astype(np.float32)),
-        },
-        {name: list(values) for name, values in axes.items()} | {"xyz": ["x", "y", "z"]}
-        | {name: (dims, each) for name, each in values.items()},
-        {"pipeline": text},
-    )
+            f"{name} = {values}" for name, values in listed.items()) + "\ntrial = 9"))
 
 
 def power_law(distance, side, angle):  # noqa: ARG001

@@ -17,9 +17,7 @@ solver
 Without that variable nothing is touched.
 """
 
-import collections
 import ctypes
-import dataclasses
 import importlib.abc
 import importlib.machinery
 import json
@@ -61,157 +59,96 @@ def _kind():
     return "other"
 
 
-class _Poison:
-    """Wraps the functions of the evaluation by which the scenes of a call are known."""
+class _Source:
+    """A source of detections that tells which row it is asked for, before it searches."""
 
-    def __init__(self, cells, search, poisons, log):
-        self._poisons = poisons
-        self._log = log
-        self._here = threading.local()
-        # Scenes made last with their numbers; rendered images by number.
-        self._made = collections.deque(maxlen=4)
-        self._images = {}
-        homes = {
-            "build_scenes": search, "detections_for": cells, "build": cells,
-            "render_all": search,
-        }
-        self._real = {name: getattr(home, name) for name, home in homes.items()}
-        for name, home in homes.items():
-            setattr(home, name, getattr(self, name))
-        from sweep.experiment.experiment import Experiment  # noqa: PLC0415
-
-        self._real["scene_values"] = Experiment.scene_values
-
-        def values(experiment, indices):
-            return self.scene_values(experiment, indices)
-
-        Experiment.scene_values = values
-        from sweep.measure import detectors  # noqa: PLC0415
-
-        detectors.Detector = self._detector(detectors.Detector)
-
-    def _act(self, stage, cells, **treatment):
-        """Do what the poisons say that ``cells`` hold for this stage and treatment."""
-        for poison in self._poisons:
-            hit = poison["stage"] == stage and poison["cell"] in cells and all(
-                getattr(treatment.get(kind), name) == value
-                for kind in ("setting", "solver")
-                for name, value in poison.get(kind, {}).items()
-            )
-            if hit:
-                with Path(self._log).open("a") as log:
-                    log.write(json.dumps({"kind": _kind(), **poison}) + "\n")
-                WAYS[poison["how"]]()
-
-    def _cells(self, scenes):
-        return next((cells for made, cells in self._made if made is scenes), None)
-
-    def scene_values(self, experiment, indices):
-        import numpy as np  # noqa: PLC0415  (this module is imported by every process)
-
-        lengths = [len(axis) for axis in experiment.scene_axes]
-        cells = np.ravel_multi_index(list(indices), lengths).tolist() if lengths else [0]
-        if experiment.grid.title == "A standard scene":  # computed before any block, not poisoned
-            cells = [-1] * len(cells)
-        self._here.cells = cells
-        return self._real["scene_values"](experiment, indices)
-
-    def build_scenes(self, *arguments):
-        scenes = self._real["build_scenes"](*arguments)
-        self._made.append((scenes, self._here.cells))
-        return scenes
-
-    def render_all(self, scenes, rows, boxes, windows):
-        known = self._cells(scenes)
-        cells = [known[row] for row in rows.tolist()] if known else []
-        self._act("scene", cells)
-        images = self._real["render_all"](scenes, rows, boxes, windows)
-        marked = {poison["cell"] for poison in self._poisons if poison["stage"] == "detection"}
-        self._images.update(
-            (cell, image) for cell, image in zip(cells, images, strict=False) if cell in marked
-        )
-        return images
-
-    def _detector(self, real):
-        poison = self
-
-        class Detector(real):
-            """A detector that knows the images of poisoned scenes, also when they are cropped."""
-
-            def __init__(self, setting):
-                super().__init__(setting)
-                self._chosen = setting
-
-            def find(self, image, dictionary, frame_side):
-                import numpy as np  # noqa: PLC0415
-
-                cells = [
-                    cell for cell, marked in poison._images.items()
-                    if np.shares_memory(marked, image)
-                ]
-                poison._act("detection", cells, setting=self._chosen)
-                return super().find(image, dictionary, frame_side)
-
-        return Detector
-
-    def detections_for(self, estimator, batch, result, rows):
-        seen = self._real["detections_for"](estimator, batch, result, rows)
-        known = self._cells(batch.scenes)
-        return _told(seen, [known[row] for row in rows.tolist()]) if known else seen
-
-    def build(self, setting):
-        return _Estimator(self, setting, self._real["build"](setting))
-
-
-def _told(seen, cells):
-    """Return detections that know which scenes they are of."""
-
-    class Told(type(seen)):
-        """As its base; found corners alone do not tell one scene from another."""
-
-        def take(self, rows):
-            return _told(super().take(rows), [cells[row] for row in rows])
-
-    told = Told(*(getattr(seen, field.name) for field in dataclasses.fields(seen)))
-    object.__setattr__(told, "cells", cells)
-    return told
-
-
-class _Estimator:
-    """An estimator that looks at which scenes it is given."""
-
-    def __init__(self, poison, setting, real):
-        self._poison, self._setting, self._real = poison, setting, real
+    def __init__(self, real, told):
+        self._real, self._told = real, told
 
     def __getattr__(self, name):
         return getattr(self._real, name)
 
-    def __call__(self, detections):
-        cells = getattr(detections, "cells", ())
-        self._poison._act("estimation", cells, solver=self._setting)
-        return self._real(detections)
+    def __call__(self, row, image):
+        self._told(row)
+        return self._real(row, image)
+
+
+def _cells(batch):
+    """Return the numbers (N,) of a batch's scenes; -1 of one that is computed before any block."""
+    import numpy as np  # noqa: PLC0415  (this module is imported by every process)
+
+    lengths = [len(axis) for axis in batch.experiment.scene_axes]
+    if batch.experiment.grid.title == "A standard scene":
+        return np.full(len(batch.scenes), -1)
+    return np.ravel_multi_index(list(batch.indices), lengths) if lengths else np.zeros(1, int)
+
+
+def poison(block, search, poisons, log):
+    """Put poison into the functions of the evaluation by which scenes of known number pass."""
+    images_of, detection_sources = search.images_of, search.detection_sources
+    detections_for, all_or_each = block.detections_for, block.all_or_each
+    here = threading.local()
+
+    def act(stage, cells, **treatment):
+        """Do what the poisons say that ``cells`` hold for this stage and treatment."""
+        for each in poisons:
+            hit = each["stage"] == stage and each["cell"] in cells and all(
+                getattr(treatment.get(kind), name) == value
+                for kind in ("setting", "solver")
+                for name, value in each.get(kind, {}).items()
+            )
+            if hit:
+                with Path(log).open("a") as notes:
+                    notes.write(json.dumps({"kind": _kind(), **each}) + "\n")
+                WAYS[each["how"]]()
+
+    def images(source, batch, *rest):
+        def drawn(scenes, rows, *windows):
+            act("scene", _cells(batch)[rows])
+            return source(scenes, rows, *windows)
+
+        return images_of(drawn, batch, *rest)
+
+    def sources(batch):
+        cells = _cells(batch)
+        return [
+            _Source(real, lambda row, chosen=chosen: act(
+                "detection", cells[[row]], setting=chosen))
+            for real, chosen in zip(
+                detection_sources(batch), batch.experiment.detectors, strict=True)
+        ]
+
+    def seen(estimator, batch, result, rows):
+        here.cells, here.solver = _cells(batch)[rows], estimator
+        return detections_for(estimator, batch, result, rows)
+
+    def estimated(work, numbers, note):
+        def worked(some):
+            act("estimation", here.cells[some], solver=here.solver)
+            return work(some)
+
+        return all_or_each(worked, numbers, note)
+
+    search.images_of, search.detection_sources = images, sources
+    block.detections_for, block.all_or_each = seen, estimated
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Has the evaluation wrapped as soon as it has been loaded."""
-
-    def __init__(self, poisons, log):
-        self._given = poisons, log
+    """Has the evaluation poisoned as soon as it has been loaded."""
 
     def find_spec(self, name, path=None, target=None):
         if name != "sweep.evaluation.block":
             return None
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
-        load = spec.loader.exec_module
+        load, given = spec.loader.exec_module, json.loads(os.environ["SWEEP_POISON"])
 
-        def load_and_wrap(module):
+        def load_and_poison(module):
             load(module)
-            _Poison(module, sys.modules["sweep.evaluation.search"], *self._given)
+            poison(module, sys.modules["sweep.evaluation.search"], given["poisons"], given["log"])
 
-        spec.loader.exec_module = load_and_wrap
+        spec.loader.exec_module = load_and_poison
         return spec
 
 
 if "SWEEP_POISON" in os.environ:
-    _given = json.loads(os.environ["SWEEP_POISON"])
-    sys.meta_path.insert(0, _Finder(_given["poisons"], str(Path(_given["log"]))))
+    sys.meta_path.insert(0, _Finder())

@@ -227,7 +227,7 @@ EDGES = [100.0, 200.0, 450.0, 451.0, 2000.0]
 @FUNCTIONS
 @pytest.mark.parametrize(("grid", "per", "bins"), [
     ("all", (), {"marker_area_px": EDGES}), ("all", ("tilt_deg",), {"marker_area_px": EDGES}),
-    ("draws", (), {"marker_area_px": EDGES}), ("only trial", ("trial",), {"marker_area_px": EDGES}),
+    ("only trial", ("trial",), {"marker_area_px": EDGES}),
     ("plain", ("marker_id",), {"distance_m": [0.3, 0.8, 1.0]}),
     ("all", (), {"side_px": [12.0, 20.0]}),
 ])

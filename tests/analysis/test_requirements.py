@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from support.small_datasets import (
-    coordinates_of,
-    perfect,
-)
+from support.comparisons import with_detected
+from support.small_datasets import perfect
 from sweep.analysis.decisions import Reach, farthest_met
 from sweep.analysis.requirements import (
     Decision,
@@ -18,7 +16,7 @@ from sweep.analysis.requirements import (
     verdicts,
 )
 from sweep.errors import ArgumentError, DatasetError
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 
 
 def ends_of(variable, results, level):
@@ -60,23 +58,16 @@ def test_decisions_change_at_the_ends_of_scipys_intervals(variable, level, side)
         assert table["decision"].values[0, side, 0] == decision, text
 
 
-def with_detected(share_by_distance, trials=100, tilts=None):
-    """Return a dataset of which that share of the draws is detected at each distance."""
-    sizes = {"distance_m": len(share_by_distance), **({"tilt_deg": len(tilts)} if tilts else {}),
+def detected_by_distance(shares, trials=100, tilts=None):
+    """Return a dataset of which such shares of the draws are detected, at 1, 2, ... m."""
+    sizes = {"distance_m": len(shares), **({"tilt_deg": len(tilts)} if tilts else {}),
              "trial": trials, "solver": 1}
     results = perfect(np.random.default_rng(4), sizes)
-    results = results.assign_coords(coordinates_of(sizes))
-    results["distance_m"] = np.arange(1.0, len(share_by_distance) + 1.0)
-    shares = np.array(share_by_distance, dtype=float)
+    results["distance_m"] = np.arange(1.0, len(shares) + 1.0)
+    shares = np.array(shares, dtype=float)
     if tilts:
         shares = np.minimum(shares[:, None], np.array(tilts)[None])
-    missed = np.arange(trials) >= np.rint(shares[..., None] * trials)
-    results["detection"].values[missed] = DetectionStatus.no_candidate
-    results["estimate"].values[missed] = EstimateStatus.no_detection
-    results["flipped"].values[missed] = Flipped.no_estimate
-    for name in ("rotation_error_rad", "translation_error_m"):
-        results[name].values[missed] = np.nan
-    return results
+    return with_detected(results, np.arange(trials) < np.rint(shares[..., None] * trials))
 
 
 @pytest.mark.parametrize(("rates", "reach", "ends", "fails", "beyond"), [
@@ -88,7 +79,7 @@ def with_detected(share_by_distance, trials=100, tilts=None):
 ])
 def test_the_limit_along_distance_has_an_interval_and_a_cause(rates, reach, ends, fails, beyond):
     required = ["detection >= 0.9", "rotation_median_deg <= 90"]
-    one = farthest_met(with_detected(rates), required, "distance_m").isel(solver=0)
+    one = farthest_met(detected_by_distance(rates), required, "distance_m").isel(solver=0)
     assert Reach(int(one["reach"])) is reach
     assert [float(one[name]) for name in ("start", "low", "value", "high")] == ends
     assert (float(one["fails_at"]), float(one["failing_value"])) == pytest.approx(fails)
@@ -99,7 +90,7 @@ def test_the_limit_along_distance_has_an_interval_and_a_cause(rates, reach, ends
 
 
 def test_requirements_hold_at_all_tilts_together():
-    results = with_detected([1.0, 1.0, 1.0], tilts=[1.0, 0.5])
+    results = detected_by_distance([1.0, 1.0, 1.0], tilts=[1.0, 0.5])
     apart = farthest_met(results, ["detection >= 0.9"], "distance_m", per=["tilt_deg"])
     assert [Reach(int(each)).name for each in apart["reach"].isel(solver=0)] == ["always", "never"]
     together = farthest_met(results, ["detection >= 0.9"], "distance_m", at_all=["tilt_deg"])
@@ -121,7 +112,7 @@ def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
 
 
 def test_verdicts_are_of_the_worst_condition():
-    table = check_requirements(with_detected([1.0, 0.97, 0.2]), ["detection >= 0.9"],
+    table = check_requirements(detected_by_distance([1.0, 0.97, 0.2]), ["detection >= 0.9"],
                                per=["distance_m"])
     (verdict,) = verdicts(table)
     assert verdict.decision is Decision.not_met is combined([verdict])
@@ -131,26 +122,16 @@ def test_verdicts_are_of_the_worst_condition():
 
 
 def test_about_as_many_draws_as_are_said_decide():
-    few = check_requirements(with_detected([0.97], trials=100), ["detection >= 0.95"])
+    few = check_requirements(detected_by_distance([0.97], trials=100), ["detection >= 0.95"])
     assert Decision(int(few["decision"].item())) is Decision.undecided
     needed = int(few["draws_needed"].item())
     assert needed > 100
-    many = check_requirements(with_detected([0.97], trials=needed), ["detection >= 0.95"])
+    many = check_requirements(detected_by_distance([0.97], trials=needed), ["detection >= 0.95"])
     assert Decision(int(many["decision"].item())) is Decision.met
 
 
-@pytest.mark.parametrize("trials", [2, 40])
-def test_few_draws_of_a_spread_far_below_its_limit_need_no_endless_number(trials):
-    results = with_detected([1.0], trials=trials)
-    results["translation_error_m"].values[..., 0] = np.random.default_rng(8).normal(
-        0.0, 1e-4, results["translation_error_m"].shape[:-1])
-    table = check_requirements(results, ["x_sd_m <= 0.01"])
-    assert Decision(int(table["decision"].item())) is Decision.undecided
-    assert table["draws_needed"].item() == 50
-
-
 def test_poses_that_cannot_be_seen_are_no_condition():
-    results = with_detected([1.0, 1.0])
+    results = detected_by_distance([1.0, 1.0])
     results["detection"].values[1] = DetectionStatus.not_visible
     results["estimate"].values[1] = EstimateStatus.no_detection
     table = check_requirements(results, ["detection >= 0.9"], per=["distance_m"])
@@ -197,5 +178,3 @@ def test_a_store_that_cannot_answer_says_so(change, text, problem):
     results = change(perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1}))
     with pytest.raises(DatasetError, match=problem):
         check_requirements(results, [text])
-
-

@@ -86,12 +86,10 @@ def with_pipeline(results, text):
 
 @pytest.mark.parametrize(("change", "named"), [
     (lambda each: each.assign_coords(side_px=[10.0, 20.0, 41.0]), "side_px"),
-    (lambda each: each.isel(trial=slice(4)), "trial"),
     (lambda each: each.isel(solver=0, drop=True), "solver"),
     (lambda each: each.assign(true_tvec_m=each["true_tvec_m"] + 0.01), "true_tvec_m"),
     (lambda each: each.drop_vars("estimate"), "estimate"),
     (lambda each: with_pipeline(each, TEXT + "[scene]\nnoise_grey = 2"), "noise_grey is 0"),
-    (lambda each: with_pipeline(each, TEXT.replace("30]", "40]")), "tilt_deg"),
     (lambda each: each.assign_attrs(sweep='{"fingerprint": {"seed": 2}}'), "seeds 1 and 2"),
 ])
 def test_stores_that_are_no_pair_are_refused_in_one_line(first, change, named):

@@ -4,9 +4,9 @@
 
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
-Efficiency is the workers' busy share between their first and their last block; start and end count
-in the other figure, so more with few ``--waves`` (blocks a worker). The second table is of stores
-of ``--stored`` committed blocks, of which only receipts are made: processor seconds.
+Efficiency is the workers' busy share; start and end count more with few ``--waves`` (blocks a
+worker). The second table is of stores of ``--stored`` committed blocks, of which only receipts are
+made: processor seconds.
 """
 
 import argparse
@@ -14,13 +14,11 @@ import asyncio
 import contextlib
 import functools
 import json
-import math
 import os
 import resource
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -68,14 +66,14 @@ MONITORS = {
 }
 
 
-def receipt_of(store, number, wall_s, idle_s=0.0):
+def receipt_of(store, number, wall_s):
     """Return the receipt of a block whose poses were all detected and solved."""
     scenes = len(store.blocks[number])
     return Receipt(
         run_id=store.run_id, processors=("simulated",), scenes=scenes,
         computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
         detection=[0, scenes], estimate=[0, scenes],
-        seconds={"scene": [idle_s], "detection": [0.0], "estimation": [0.0]}, failures=(),
+        seconds={"scene": [0.0], "detection": [0.0], "estimation": [0.0]}, failures=(),
         wall_s=wall_s, written=time.time(), block=number,
         checksums={variable.name: 123456789 for variable in store.variables},
     )
@@ -86,27 +84,17 @@ def opened(url, run_id):  # noqa: ARG001  (a store of its own for each run)
     return open_store(url, "r+")
 
 
-LAST = threading.local()
-"""When the worker of this thread was to end its last block."""
-
-
-def share_of(number):
-    """Return how long a block takes, 0.5 to 1.5: workers do not finish all at once."""
-    return 0.5 + number * 0.6180339887498949 % 1.0
-
-
 def simulated_blocks(url, run_id, blocks, _decision, _sources, time_limit_s, *_others):
-    """Wait a block's time, here passed as its time limit; write its receipt and return it."""
-    (block,) = blocks
-    begun = time.perf_counter()
-    idle_s = begun - getattr(LAST, "end", math.nan)
-    store = opened(url, run_id)
-    number = store.blocks.number(block)
-    wanted = time_limit_s * share_of(number)
-    receipt = receipt_of(store, number, wanted, 0.0 if math.isnan(idle_s) else idle_s)
+    """Wait a block's time, here passed as its time limit; write its receipt and return it.
+
+    It takes 0.5 to 1.5 of that: workers do not finish all at once.
+    """
+    begun, store = time.perf_counter(), opened(url, run_id)
+    number = store.blocks.number(blocks[0])
+    wanted = time_limit_s * (0.5 + number * 0.6180339887498949 % 1.0)
+    receipt = receipt_of(store, number, wanted)
     time.sleep(max(wanted - (time.perf_counter() - begun), 0.0))
     write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
-    LAST.end = begun + wanted
     return [receipt]
 
 
@@ -122,12 +110,6 @@ async def live(address, count):
             await asyncio.gather(*some)
             workers += some
         await asyncio.gather(*(worker.finished() for worker in workers))
-
-
-def many_files():
-    """Allow as many open files as the system does: a worker needs several."""
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def cpu_s(process):
@@ -156,35 +138,24 @@ def simulated(count, waves, folder):
                 ["-c", script], env=os.environ | environment, stderr=subprocess.DEVNULL))
         client = stack.enter_context(Client(cluster.address, set_as_default=False))
         interrupts = stack.enter_context(Interrupts())
-        client.wait_for_workers(count // PROCESSES * PROCESSES, timeout=300)
+        workers = count // PROCESSES * PROCESSES
+        client.wait_for_workers(workers, timeout=300)
+        processes = {"scheduler": psutil.Process(cluster.scheduler.pid), "client": psutil.Process()}
+        spent = {name: cpu_s(process) for name, process in processes.items()}
+        begun = time.perf_counter()
+        compute(store, AnyOrder(range(len(store.blocks))), on_cluster.OnCluster(client), (),
+                block_s, interrupts, lambda _: None)
+        wall = time.perf_counter() - begun
+        busy_s = sum(one.wall_s for _, one in receipts(store, range(len(store.blocks))))
         return {
             "workers": count, "blocks": len(store.blocks), "block_s": round(block_s, 2),
-            **measured(store, client, block_s, interrupts, psutil.Process(cluster.scheduler.pid)),
+            "blocks_a_s": round(len(store.blocks) / wall, 1),
+            "efficiency": round(busy_s / workers / wall, 3),
+            **{f"{name}_core": round((cpu_s(process) - spent[name]) / wall, 2)
+               for name, process in processes.items()},
+            **{f"{name}_mb": round(process.memory_info().rss / 1e6)
+               for name, process in processes.items()},
         }
-
-
-def measured(store, client, block_s, interrupts, scheduler):
-    """Return the figures of a run of all blocks of a store on a cluster that is there."""
-    processes = {"scheduler": scheduler, "client": psutil.Process()}
-    number, threads = len(store.blocks), sum(client.nthreads().values())
-    spent = {name: cpu_s(process) for name, process in processes.items()}
-    begun = time.perf_counter()
-    compute(store, AnyOrder(range(number)), on_cluster.OnCluster(client), (), block_s, interrupts,
-            lambda _: None)
-    wall = time.perf_counter() - begun
-    found = [receipt for _, receipt in receipts(store, range(number))]
-    busy_s = sum(receipt.wall_s for receipt in found)
-    # From the end of a worker's block to the start of its next one, with the writing of receipts.
-    idle_s = sum(receipt.seconds["scene"][0] for receipt in found)
-    figures = {
-        "blocks_a_s": round(number / wall, 1),
-        "efficiency": round(busy_s / (busy_s + idle_s), 3),
-        "with_start_and_end": round(busy_s / threads / wall, 3),
-    }
-    for name, process in processes.items():
-        figures[f"{name}_core"] = round((cpu_s(process) - spent[name]) / wall, 2)
-        figures[f"{name}_mb"] = round(process.memory_info().rss / 1e6)
-    return figures
 
 
 def stored(count, folder):
@@ -217,7 +188,8 @@ def main(*words):
     parser.add_argument("--stored", type=int, nargs="*", default=[])
     options = parser.parse_args(words)
     on_cluster.compute_blocks = simulated_blocks
-    many_files()
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a worker needs several
     with tempfile.TemporaryDirectory() as folder:
         for count in options.workers:
             print(json.dumps(simulated(count, options.waves, folder)), flush=True)

@@ -204,7 +204,8 @@ def test_a_pipeline_that_chooses_nothing_is_told_what_to_write(
     command, line, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "plain.toml").write_text("[pose]\nside_px = 20\n[axes]\ntrial = 5\n")
+    (tmp_path / "plain.toml").write_text(
+        "pose.jitter_px = 0.5\naxes = { side_px = [20, 40], trial = 5 }\n")
     assert main(command.split()) == 2
     told, = capsys.readouterr().err.splitlines()
     assert line in told

@@ -37,8 +37,11 @@ def along(result, variable, axis):
 
 @lengths(8, MAX_SCENES)
 @pytest.mark.parametrize("name", PATHS)
-def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_printed(name, count):
+def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_printed(
+    name, count, capfd
+):
     assert broken_promises(measured(Pipeline.from_toml(PATHS[name]), count)) == []
+    assert capfd.readouterr() == ("", "")
 
 
 def test_of_a_pair_on_the_planar_ambiguity_one_is_flipped_and_neither_is_anything_else():

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.comparisons import with_detected
 from support.reports import CAMERA, command, made
 from support.small_datasets import perfect
 from sweep.analysis import compare, error_statistics
 from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.report.answer import answer
 from sweep.report.report_data import ReportData
 from sweep.report.table import number
@@ -116,12 +116,7 @@ def synthetic(rates, require=("detection >= 0.9",), per=("distance_m", "tilt_deg
     results = perfect(rng, SIZES | {"solver": len(values)}).assign_coords(solver=values)
     results = results.rename({"solver": name}) if belief else results
     detected = np.arange(400)[None, None, :, None] < 400 * np.asarray(rates)[:, :, None]
-    results["detection"][:] = np.where(
-        detected, DetectionStatus.detected, DetectionStatus.no_candidate)
-    lost = ~results["detection"].isin([DetectionStatus.detected])
-    lost = lost.broadcast_like(results["estimate"]).transpose(*results["estimate"].dims)
-    results["estimate"] = results["estimate"].where(~lost, EstimateStatus.no_detection)
-    results["flipped"] = results["flipped"].where(~lost, Flipped.no_estimate)
+    results = with_detected(results, detected)
     axes = "\n".join(
         f"{name} = {results[name].values.tolist()!r}".replace("'", '"')
         for name in ("distance_m", "tilt_deg", "cornerRefinementMethod", *belief))

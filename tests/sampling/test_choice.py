@@ -27,25 +27,6 @@ def group(pipeline, rates, trials, generator):
     return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, flags | of_solvers)
 
 
-@pytest.mark.parametrize("section", [
-    {"require": {"all": ["detection >= 0.5"], "per": []},
-     "search": {"smallest": "size_m", "max_trials": 40}},
-    {"search": {"precision": {"detection_rate": 0.1}, "per": [], "max_trials": 40}},
-    {"require": {"all": ["detection >= 0.5"]},
-     "search": {"along": "size_m", "per": [], "max_trials": 40}},
-])
-def test_a_first_wave_of_many_pooled_cells_can_be_decided(section):
-    pipeline = Pipeline.from_dict({
-        "pose": {"distance_m": 1.0, "jitter_px": 0.5},
-        "axes": {"size_m": [0.02, 0.08], "marker_id": list(range(50))}, **section})
-    rule = make_rule(pipeline)
-    first = rule.ends[0]
-    assert first >= 2
-    flags = np.ones((2, 50, first), np.uint8)
-    values = {"detection": flags, "estimate": flags, "flipped": flags}
-    rule.needed(GroupResults(pipeline, (0, 0), (2, 50), 1, first, values))
-
-
 @pytest.fixture
 def chosen(monkeypatch):
     """Return what makes the choice of a search that found these rates (size, tilt)."""

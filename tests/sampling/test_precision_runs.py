@@ -155,21 +155,3 @@ def test_a_run_in_waves_is_refused_if_all_its_trials_would_take_too_long():
     with pytest.raises(StoreError, match="takes up to"):
         check_affordable("none.zarr", pipeline, 1.0, 1, 30_000, 30_000)
     check_affordable("none.zarr", pipeline, 0.02, 1, 30_000, 30_000)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("settings", "needed"), [
-    (["search.max_trials = 19"], 3 * 19),
-    (["search.per = []"], None),
-    (["side_px = 30", "bearing_x_deg = 80", "search.max_trials = 5000"], 50),
-    (["side_px = 30", "marker_id = {range = [0, 50]}", "search.per = ['side_px']"], None),
-])
-def test_extremes_end(settings, needed, tmp_path):
-    url = str(tmp_path / "extreme.zarr")
-    pipeline = precise("0.1", settings)
-    summary = execute(pipeline, url)
-    assert needed in {None, summary.needed}
-    assert verify(url, 3).damage == []
-    flags = open_dataset(url).detection.to_numpy()
-    assert (flags != DetectionStatus.not_needed).sum() == summary.needed
-    assert (flags != DetectionStatus.not_run).all()

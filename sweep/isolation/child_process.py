@@ -15,9 +15,10 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, wait
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Self, TypeVar, cast
+from typing import Any, Self, TypeVar
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
@@ -71,8 +72,8 @@ def explained(death: object) -> str:
 # --------------------------------------------------------------------------------------------------
 # Function calls in a child process, which may crash or never return.
 #
-# The child reads calls from its standard input and writes results to its standard output. Only
-# what these two processes of one program send each other is unpickled.
+# The two are connected by a pair of sockets. Only what these two processes of one program send each
+# other is unpickled.
 
 GRACE_S = 30.0
 """How long after its limit a child that did not end itself is killed."""
@@ -131,14 +132,16 @@ class Child:
         self._start()
 
     def _start(self) -> None:
-        self._process = subprocess.Popen(  # noqa: S603  (this program)
-            [sys.executable, "-P", "-c", _START, json.dumps(sys.path), self._module],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env={**os.environ, **SINGLE_THREADED},
-            start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
-        )
-        self._pipes = cast(
-            "tuple[IO[bytes], IO[bytes]]", (self._process.stdin, self._process.stdout))
+        self._connection, theirs = Pipe()
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603  (this program)
+                [sys.executable, "-P", "-c", _START, json.dumps(sys.path), self._module,
+                 str(theirs.fileno())],
+                # What libraries print is nobody's.
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()], env={**os.environ, **SINGLE_THREADED},
+                start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
+            )
 
     def restart(self) -> None:
         """Start another process in place of one that ended."""
@@ -174,25 +177,19 @@ class Child:
             If the call raised; a `SweepError` is raised as it is, and a fault of the machine as
             `MachineFaultError`.
         """
-        requests, answers = self._pipes
         started = time.monotonic()
-        killer = threading.Timer(limit_s + grace_s, self._process.kill)
-        killer.daemon = True
-        killer.start()
-        request = pickle.dumps((function, arguments, limit_s), pickle.HIGHEST_PROTOCOL)
         try:
-            requests.write(request)
-            requests.flush()
-            raised, result = pickle.load(answers)  # noqa: S301  (from this program's own child)
-        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+            self._connection.send((function, arguments, limit_s))
+            if not self._connection.poll(limit_s + grace_s):
+                self._process.kill()
+            raised, result = self._connection.recv()
+        except (EOFError, OSError, pickle.UnpicklingError):
             took_s, code = time.monotonic() - started, self._process.wait()
             self.close()
             # The child ends itself with status 1 (`watchdog.ending_after`).
             if took_s >= limit_s + (0.0 if code == 1 else grace_s):
                 raise ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True) from None
             raise ChildDiedError(ending(code)) from None
-        finally:
-            killer.cancel()
         if raised:
             raise result if isinstance(result, SweepError) else ChildRaisedError(result)
         return result
@@ -201,23 +198,20 @@ class Child:
         """End the child."""
         self._process.kill()
         self._process.wait()
-        for pipe in self._pipes:
-            with contextlib.suppress(BrokenPipeError):
-                pipe.close()
+        self._connection.close()
 
 
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from sweep.isolation.child_process import serve; serve(sys.argv[2])"
+    "from sweep.isolation.child_process import serve; serve(*sys.argv[2:])"
 )
 
 
-def serve(module: str) -> None:
-    """Import a module, then answer calls until the caller closes the pipe; what the child runs."""
+def serve(module: str, descriptor: str) -> None:
+    """Import a module, then answer calls until the caller has closed; what the child runs."""
     threading.Thread(target=_end_after, args=(os.getppid(),), daemon=True).start()
-    # What libraries print must not mix with the answers.
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    connection: Connection[Any, Any] = Connection(int(descriptor))
+    os.set_inheritable(connection.fileno(), False)
     with contextlib.suppress(OSError):  # it is killed before others if memory runs out
         Path("/proc/self/oom_score_adj").write_text("1000")
     # It has a session of its own: whoever interrupts, the caller ends it.
@@ -227,19 +221,18 @@ def serve(module: str) -> None:
     # Numba is slow to import, and the caller needs none of it.
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 
-    requests: Any = sys.stdin.buffer
-    while requests.peek(1):
-        answer: tuple[bool, Any]
-        try:
-            function, arguments, limit_s = pickle.load(requests)  # noqa: S301  (from the parent)
-            with ending_after(limit_s):
-                answer = (False, function(*arguments))
-        except SweepError as error:
-            answer = (True, error)
-        except Exception as error:
-            answer = (True, machine_fault(error) or traceback.format_exc())
-        answers.write(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
-        answers.flush()
+    with contextlib.suppress(EOFError):
+        while request := connection.recv_bytes():
+            answer: tuple[bool, Any]
+            try:
+                function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (the parent's)
+                with ending_after(limit_s):
+                    answer = (False, function(*arguments))
+            except SweepError as error:
+                answer = (True, error)
+            except Exception as error:
+                answer = (True, machine_fault(error) or traceback.format_exc())
+            connection.send(answer)
 
 
 def _end_after(parent: int) -> None:

@@ -122,25 +122,21 @@ class _IsolatedCells:
         rendering, each detector setting, each estimator. The results of those that work are
         joined, the others are flagged.
         """
-        estimators = need.shape[2]
-        result = self._part(Failure(0, "scene", ""), indices, need)
-        rendered = isinstance(result, CellsResult)
-        failures = [] if isinstance(result, CellsResult) else [result]
-        joined = result if isinstance(result, CellsResult) else CellsResult.not_run(
-            self._pipeline.experiment, 1)
+        joined = CellsResult.not_run(self._pipeline.experiment, 1)
+        flags = joined.columns
+        failures: list[Failure] = []
 
-        def works(stage: str, number: int, setting: int, estimator: int | None = None) -> bool:
+        def works(
+            stage: str, number: int = 0, setting: int | None = None, estimator: int | None = None
+        ) -> bool:
+            """Compute a part; take what it gives of its stage, or note why there is nothing."""
             part = self._part(Failure(0, stage, "", setting, estimator), indices, need)
             if isinstance(part, Failure):
                 failures.append(part)
-                flags = DetectionStatus if estimator is None else EstimateStatus
-                name = "detection" if estimator is None else "estimate"
-                joined.columns[name][number][:] = flags["crashed" if part.crashed else "failed"]
                 return False
             for variable in self._pipeline.experiment.variables:
                 if variable.stage.name == stage:
-                    column = part.columns[variable.name][number]
-                    joined.columns[variable.name][number] = column
+                    joined.columns[variable.name][number] = part.columns[variable.name][number]
             joined.seconds[stage][number] = part.seconds[stage][number]
             joined.row_seconds += part.row_seconds
             known = {(each.stage, each.setting, each.estimator) for each in failures}
@@ -148,19 +144,22 @@ class _IsolatedCells:
                             if (each.stage, each.setting, each.estimator) not in known)
             return True
 
-        failures += joined.failures
+        def lost() -> str:
+            return "crashed" if failures[-1].crashed else "failed"
+
+        rendered = works("scene")
         for k in np.flatnonzero(need[0].any(axis=1)).tolist():
             searched = rendered and works("detection", k, k)
-            if not rendered:
-                crashed = failures[0].crashed
-                joined.columns["detection"][k][:] = DetectionStatus[
-                    "crashed" if crashed else "failed"]
+            if not searched:
+                flags["detection"][k][:] = DetectionStatus[lost()]
             for j in np.flatnonzero(need[0, k]).tolist():
-                number = k * estimators + j
+                number = k * need.shape[2] + j
                 if not searched:
-                    joined.columns["estimate"][number][:] = EstimateStatus.no_detection
-                if not (searched and works("estimation", number, k, j)):
-                    joined.columns["flipped"][number][:] = Flipped.no_estimate
+                    flags["estimate"][number][:] = EstimateStatus.no_detection
+                    flags["flipped"][number][:] = Flipped.no_estimate
+                elif not works("estimation", number, k, j):
+                    flags["estimate"][number][:] = EstimateStatus[lost()]
+                    flags["flipped"][number][:] = Flipped.no_estimate
         joined.failures = failures
         return joined
 
@@ -277,9 +276,6 @@ def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 # --------------------------------------------------------------------------------------------------
 # Scenes that raised are repeated in a fresh process: what it does not raise again is no result.
 
-Part = tuple[int, str, int | None, int | None, bool]
-
-
 def check_repeatable(
     pipeline: Pipeline,
     indices: Sequence[NDArray[np.intp]],
@@ -313,17 +309,14 @@ def check_repeatable(
         return
     rows = np.array(scenes)
     again = run_cells_isolated(pipeline, [index[rows] for index in indices], need[rows], limit_s)
-    repeated = {_part(failure, scenes[failure.scene]) for failure in again.failures}
+    repeated = {dataclasses.replace(each, scene=scenes[each.scene], text="")
+                for each in again.failures}
     for failure in cells.failures:
-        if failure.scene in scenes and _part(failure, failure.scene) not in repeated:
+        if failure.scene in scenes and dataclasses.replace(failure, text="") not in repeated:
             raise local_fault(
                 "raised in a scene, but not when that was repeated in another process: "
                 + failure.text.strip().rpartition("\n")[2]
             )
-
-
-def _part(failure: Failure, scene: int) -> Part:
-    return scene, failure.stage, failure.setting, failure.estimator, failure.crashed
 
 
 # --------------------------------------------------------------------------------------------------

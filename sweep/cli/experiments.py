@@ -484,7 +484,7 @@ def verify(
     """
     if repair:
         SESSION.stopped = CONTINUES
-        report = library.repair.repair(store, sample, workers=workers)
+        report = library.verification.repair(store, sample, workers=workers)
     else:
         report = library.verification.verify(store, sample)
     unstable = [each for each in report.damage if each.where == report.unstable]

@@ -26,7 +26,7 @@ from sweep.messages import label, plain
 from sweep.model.polygon import signed_areas
 from sweep.model.scene import Scenes
 from sweep.store.files import write_whole
-from sweep.store.layout import planned_arrays
+from sweep.store.lifecycle import planned_arrays
 from sweep.store.locations import reason_of
 from sweep.typing import Integers
 

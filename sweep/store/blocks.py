@@ -28,16 +28,19 @@ from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
 from sweep.store.files import (
+    RECEIPTS,
     absent_files,
+    checksum_of,
     delete_files,
     list_folder,
+    packed,
     read_files,
     read_json,
     sync,
+    unpacked,
     write_document,
     write_files,
 )
-from sweep.store.layout import RECEIPTS, checksum_of, packed, unpacked
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
 
 # --------------------------------------------------------------------------------------------------

@@ -13,8 +13,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import google_crc32c
+import numcodecs.zstd
 from zarr.abc.store import Store
 from zarr.buffer import cpu, default_buffer_prototype
+from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
 from zarr.storage import LocalStore
 
@@ -156,3 +159,42 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a file as :func:`whole_file` does."""
     with whole_file(path) as file:
         file.write(content)
+
+
+# --------------------------------------------------------------------------------------------------
+# Chunks of a store, as Zarr writes them: compressed, with a checksum at the end.
+
+RECEIPTS = "commits/receipt"
+"""Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
+
+ZSTD_LEVEL = 3
+"""Level of the compression of every chunk."""
+
+
+def codecs() -> list[Any]:
+    """Return the codecs of every array; a damaged chunk fails its checksum when it is read."""
+    return [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
+
+
+def checksum_of(content: bytes) -> int:
+    """Return the CRC-32C that Zarr wrote at a chunk's end."""
+    return int.from_bytes(content[-4:], "little")
+
+
+def packed(body: bytes) -> bytes:
+    """Return a chunk's content from its bytes before compression, as Zarr writes it."""
+    compressed = bytes(numcodecs.zstd.compress(body, ZSTD_LEVEL))
+    checksum: int = google_crc32c.value(compressed)
+    return compressed + checksum.to_bytes(4, "little")
+
+
+def is_sound(content: bytes) -> bool:
+    """Return whether a chunk fits the checksum at its end."""
+    return bool(google_crc32c.value(content[:-4]) == checksum_of(content))
+
+
+def unpacked(content: bytes) -> bytes:
+    """Return the bytes that :func:`packed` took; ValueError or RuntimeError if damaged."""
+    if not is_sound(content):
+        raise ValueError("its checksum differs")
+    return bytes(numcodecs.zstd.decompress(content[:-4]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import glob
 import json
 import math
@@ -11,6 +12,8 @@ import time
 import uuid
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -18,18 +21,31 @@ from zlib import crc32
 import numpy as np
 import zarr
 import zarr.errors
+from numpy.typing import NDArray
 from zarr.abc.store import Store
+from zarr.dtype import parse_dtype
 from zarr.storage import LocalStore, MemoryStore
 
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.document import MAX_BYTES, read_document
-from sweep.experiment.grid import Blocks
+from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
+from sweep.experiment.grid import TRIAL, Axis, Blocks
+from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
 from sweep.experiment.sampling import texts_in
-from sweep.experiment.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
+from sweep.experiment.schema import (
+    LABELS,
+    PHOTOGRAPH_SCHEMA,
+    VARIABLES,
+    Variable,
+    fixed_values,
+    with_description,
+    with_descriptions,
+)
 from sweep.messages import plain, refusal
-from sweep.model.image_file import read_regular
+from sweep.model.image_file import IMAGE_SUFFIXES, read_regular
 from sweep.plugins.declared import RECORDED, recorded_plugins
+from sweep.store import files, locations
 from sweep.store.blocks import (
     BEGUN,
     RunStore,
@@ -38,43 +54,191 @@ from sweep.store.blocks import (
     committed,
     run_metadata_in,
 )
-from sweep.store.files import (
-    delete_files,
-    encoded,
-    files_in,
-    list_folder,
-    read_files,
-    read_json,
-    sync,
-    write_document,
-    write_files,
-)
-from sweep.store.layout import (
-    FORMAT,
-    RECEIPTS,
-    PlannedArray,
-    codecs,
-    planned_arrays,
-    planned_files,
-)
-from sweep.store.locations import (
-    POINTER,
-    check_writable,
-    checked_url,
-    exists,
-    is_remote,
-    not_a_store,
-    open_group,
-    open_storage,
-    reason_of,
-    storage_at,
-    translate_errors,
-)
 from sweep.store.lock import changing, is_written
 from sweep.store.provenance import environment, fingerprint
 
 if TYPE_CHECKING:
     import xarray as xr
+
+# --------------------------------------------------------------------------------------------------
+# The layout of a store: its arrays, their metadata, and the values of its coordinates.
+
+FORMAT = 8
+"""Version of the layout of stores; another one is refused."""
+
+COORDINATE_CHUNK = 1 << 20
+
+@dataclass(frozen=True, slots=True)
+class PlannedArray:
+    """One array of a store.
+
+    Attributes
+    ----------
+    path
+        Its path in the store.
+    shape, chunks, dtype, dimensions, fill, attributes
+        Its metadata; ``fill`` is None for Zarr's default.
+    values
+        Its values; None for an array to which blocks or receipts are written later.
+    coordinate
+        Whether it is a coordinate that is no dimension.
+    """
+
+    path: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
+    dimensions: tuple[str, ...]
+    fill: Any = None
+    attributes: dict[str, Any] = field(default_factory=dict)
+    values: NDArray[Any] | None = None
+    coordinate: bool = False
+
+    def create(self, group: zarr.Group) -> None:
+        """Create the array and write its values."""
+        options = {} if self.fill is None else {"fill_value": self.fill}
+        array = group.create_array(
+            self.path, shape=self.shape, chunks=self.chunks, dtype=_dtype(self.dtype),
+            dimension_names=self.dimensions, compressors=files.codecs(), attributes=self.attributes,
+            # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
+            config={"write_empty_chunks": True}, **options,
+        )
+        if self.values is not None:
+            array[...] = self.values
+
+
+def planned_files(planned: Iterable[PlannedArray]) -> dict[str, bytes]:
+    """Return the contents of the files that an empty store has by key, except the root's."""
+    memory = MemoryStore()
+    group = zarr.open_group(memory, mode="w", zarr_format=3)
+    for array in planned:
+        array.create(group)
+    return {key: content for key, content in files.files_in(memory).items() if key != "zarr.json"}
+
+
+@cache
+def _dtype(name: str) -> Any:
+    """Return Zarr's data type of a name; it looks through all that it knows, each time."""
+    return parse_dtype(name, zarr_format=3)
+
+
+def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
+    """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
+    variables = pipeline.experiment.variables
+    names = (axis.name for axis in pipeline.experiment.scene_axes)
+    scene_extent = dict(zip(names, extents, strict=True))
+    planned = [each for axis in pipeline.axes for each in _axis(axis)]
+    used = {
+        name: length for variable in variables
+        for name, length in zip(variable.inner, variable.inner_shape, strict=True)
+    }
+    planned += [
+        _coordinate(name, (name,), LABELS[name] or np.arange(used[name], dtype=np.int64), {})
+        for name in sorted(used)
+    ]
+    planned += _distance(pipeline)
+    planned += _photographs(pipeline)
+    planned += [
+        _coordinate(name, (), value, attributes)
+        for name, (value, attributes) in fixed_values(pipeline).items() if name not in VARIABLES
+    ]
+    planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
+    planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
+               for each in planned]
+    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
+    planned.append(
+        PlannedArray(files.RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
+    )
+    return planned
+
+
+def _variable(
+    variable: Variable, pipeline: Pipeline, scene_extent: dict[str, int]
+) -> PlannedArray:
+    names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
+    chunks = tuple(
+        scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
+    )
+    return PlannedArray(
+        variable.name, shape, chunks, variable.dtype, names, variable.fill, variable.attributes(),
+        coordinate=bool(variable.drawn_as),
+    )
+
+
+def _coordinate(
+    path: str, dimensions: tuple[str, ...], values: Any, attributes: Mapping[str, Any]
+) -> PlannedArray:
+    """Return a coordinate of numbers, truth values or texts along dimensions."""
+    array = np.asarray(values)
+    if array.dtype.kind in "TU":
+        array = array.astype(object)
+    return PlannedArray(
+        path, array.shape, tuple(min(length, COORDINATE_CHUNK) for length in array.shape),
+        "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
+        dict(attributes), array, coordinate=dimensions != (path,),
+    )
+
+
+def _axis(axis: Axis) -> list[PlannedArray]:
+    """Return the coordinates of a dimension, and those of the parameters that go together there."""
+    together = [Axis(each.name, {each.name: axis.columns[each.name]}, (each,))
+                for each in axis.parameters if axis.zipped]
+    return [
+        _coordinate(each.name, (axis.name,), each.coordinates(), {
+            "long_name": each.meaning,
+            **({"zip": " ".join(each.columns)} if each.zipped else {}),
+            **({"units": each.unit} if each.unit else {}),
+        })
+        for each in (axis, *together)
+    ]
+
+
+def _distance(pipeline: Pipeline) -> list[PlannedArray]:
+    """Return ``distance_m`` as a coordinate if it follows from ``side_px``."""
+    sides = pipeline.values_of("side_px")
+    if not sides or sides[0] is None:
+        return []
+    axes = [
+        axis for axis in pipeline.experiment.scene_axes
+        if axis.columns.keys() & set(DISTANCE_PARAMETERS)
+    ]
+    values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
+    for k, axis in enumerate(axes):
+        for name in axis.columns.keys() & set(DISTANCE_PARAMETERS):
+            column = np.array(axis.columns[name], dtype=np.float64)
+            values[name] = column.reshape([-1 if j == k else 1 for j in range(len(axes))])
+    distance = np.broadcast_to(
+        np.asarray(distance_of_side(values), dtype=np.float64), tuple(len(axis) for axis in axes)
+    )
+    return [_coordinate(
+        "distance_m", tuple(axis.name for axis in axes), distance,
+        {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
+    )]
+
+
+def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
+    """Return names and digests of photographs as coordinates along their numbers."""
+    trials = pipeline.axis(TRIAL)
+    if PHOTOGRAPHS not in pipeline.given or trials is None:
+        return []
+    # Photographs of a record are in the order of their names.
+    files = sorted(
+        (name, digest) for name, digest in pipeline.files.items()
+        if name.lower().endswith(IMAGE_SUFFIXES)
+    )
+    if pipeline.is_simulated:  # two cameras' photographs have the same names
+        files = files[: len({name.rpartition("/")[2] for name, _ in files})]
+        files *= -(-len(trials) // max(len(files), 1))
+    if len(files) < len(trials):
+        return []
+    names, digests = zip(*files[: len(trials)], strict=True)
+    return [
+        _coordinate("photograph", (TRIAL,), [name.rpartition("/")[2] for name in names],
+                    {"long_name": "file of the photograph"}),
+        _coordinate("sha256", (TRIAL,), digests,
+                    {"long_name": "SHA-256 of the photograph's file"}),
+    ]
+
 
 # --------------------------------------------------------------------------------------------------
 # Files of no block. The run's metadata list them with the CRC-32 of their contents: metadata of
@@ -113,7 +277,7 @@ def changed_files(
 def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
     """Return the contents of the listed files by key, with or without those of tables."""
     keys = [key for key in store.run_metadata["files"] if tables or not is_of_table(key)]
-    return dict(zip(keys, read_files(store.storage, keys), strict=True))
+    return dict(zip(keys, files.read_files(store.storage, keys), strict=True))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -150,8 +314,8 @@ def open_store(url: str, mode: str = "r") -> RunStore:
 
 def open_unchecked(url: str, mode: str = "r") -> RunStore:
     """Open a store that may be damaged; StoreError if its pipeline is lost."""
-    url = checked_url(url)
-    storage = open_storage(url, mode)
+    url = locations.checked_url(url)
+    storage = locations.open_storage(url, mode)
     attributes = read_attributes(url, storage)
     try:
         metadata = run_metadata_in(attributes)
@@ -169,9 +333,10 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
         )
         blocks = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
-        return RunStore(url, open_group(storage, mode), pipeline, metadata["run_id"], blocks)
+        group = locations.open_group(storage, mode)
+        return RunStore(url, group, pipeline, metadata["run_id"], blocks)
     except UNREADABLE:
-        raise StoreError(not_a_store(url)) from None
+        raise StoreError(locations.not_a_store(url)) from None
 
 
 def read_attributes(url: str, storage: Store) -> dict[str, Any]:
@@ -183,16 +348,16 @@ def read_attributes(url: str, storage: Store) -> dict[str, Any]:
         If there are none.
     """
     try:
-        root = read_json(storage, "zarr.json") or {}
+        root = files.read_json(storage, "zarr.json") or {}
         return dict(root["attributes"])
     except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
+        raise StoreError(f"{url}: cannot be read: {locations.reason_of(error)}") from None
     except UNREADABLE:
-        if list_folder(storage, RECEIPTS):
+        if files.list_folder(storage, files.RECEIPTS):
             raise StoreError(
                 f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
             ) from None
-        raise StoreError(not_a_store(url)) from None
+        raise StoreError(locations.not_a_store(url)) from None
 
 
 def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
@@ -206,7 +371,7 @@ def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
     try:
         return run_metadata_in(read_attributes(url, storage))
     except UNREADABLE:
-        raise StoreError(not_a_store(url)) from None
+        raise StoreError(locations.not_a_store(url)) from None
 
 
 def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
@@ -219,7 +384,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     """
     run_id = uuid.uuid4().hex
     planned = planned_arrays(pipeline, extents)
-    files = planned_files(planned)
+    contents = planned_files(planned)
     metadata = {
         "format": FORMAT,
         "run_id": run_id,
@@ -228,30 +393,30 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         "environment": environment(),
         "created": utc_now(),
         "finished": False,
-        "files": checksums(files),
+        "files": checksums(contents),
     }
     root = _sealed(_group_document(root_attributes(pipeline, planned, metadata)))
-    with translate_errors(url, "written"):
-        if is_remote(url):
-            storage = storage_at(url, read_only=False)
-            write_files(storage, {
-                f"{run_id}/{key}": content
-                for key, content in {**files, "zarr.json": encoded(root)}.items()})
+    contents["zarr.json"] = files.encoded(root)
+    with locations.translate_errors(url, "written"):
+        if locations.is_remote(url):
+            storage = locations.storage_at(url, read_only=False)
+            files.write_files(
+                storage, {f"{run_id}/{key}": content for key, content in contents.items()})
             try:
                 _check_free(url)
             except BaseException:
-                sync(storage.delete_dir(run_id))
+                files.sync(storage.delete_dir(run_id))
                 raise
             # The URL points to it once it is complete.
-            write_document(storage, "zarr.json", _group_document({POINTER: run_id}))
+            files.write_document(storage, "zarr.json", _group_document({locations.POINTER: run_id}))
         else:
-            check_writable(url)
+            locations.check_writable(url)
             path = Path(url).resolve()  # a link may lead there
             for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
                 shutil.rmtree(doomed, ignore_errors=True)  # a killed process began it
             building = _beside(path, "new")
             try:
-                write_files(LocalStore(building), {**files, "zarr.json": encoded(root)})
+                files.write_files(LocalStore(building), contents)
                 _check_free(url)
                 building.rename(path)
             except BaseException:
@@ -271,7 +436,7 @@ def _recorded(pipeline: Pipeline) -> dict[str, Any]:
 
 def _check_free(url: str) -> None:
     """Raise StoreError if another process has created a store meanwhile."""
-    if exists(url):
+    if locations.exists(url):
         raise StoreError(f"{url}: another process has made it meanwhile; run it again to continue")
 
 
@@ -319,7 +484,7 @@ def _sealed(root: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_root_sound(store: RunStore) -> bool:
     """Return whether nothing was changed in the root's document, which has a pipeline."""
-    root = read_json(store.storage, "zarr.json") or {}
+    root = files.read_json(store.storage, "zarr.json") or {}
     return root == _sealed(root)
 
 
@@ -336,14 +501,14 @@ def remove_store(url: str) -> None:
     StoreError
         If something else lies there, another process writes it, or it cannot be deleted.
     """
-    storage = open_storage(url, "r+")
+    storage = locations.open_storage(url, "r+")
     metadata = read_run_metadata(url, storage)
-    with translate_errors(url, "overwritten"):
-        if is_remote(url):
-            pointer = storage_at(url, read_only=False)
+    with locations.translate_errors(url, "overwritten"):
+        if locations.is_remote(url):
+            pointer = locations.storage_at(url, read_only=False)
             with changing(url, storage):
-                delete_files(pointer, ["zarr.json"])
-            sync(pointer.delete_dir(str(metadata["run_id"])))
+                files.delete_files(pointer, ["zarr.json"])
+            files.sync(pointer.delete_dir(str(metadata["run_id"])))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
         path = Path(url).resolve()
@@ -406,9 +571,9 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
                  for name, value in dataset.coords.items() if value.dtype.kind == "T"}
     except (*UNREADABLE, RuntimeError) as error:
+        reason = locations.reason_of(error)
         raise StoreError(
-            f"{store.url}: damaged ({reason_of(error)}); `sweep verify --repair` repairs it"
-        ) from None
+            f"{store.url}: damaged ({reason}); `sweep verify --repair` repairs it") from None
     dataset = dataset.assign_coords(texts)
     if not finished:
         dataset = _only_committed(store, dataset, done)
@@ -438,9 +603,7 @@ def _only_committed(
         variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)
         for variable in store.variables
     }
-    drawn = masked.keys() & dataset.coords.keys()
-    return dataset.assign({name: values for name, values in masked.items() if name not in drawn}
-                          ).assign_coords({name: masked[name] for name in drawn})
+    return dataset.assign(masked)  # what is a coordinate stays one
 
 
 # --------------------------------------------------------------------------------------------------
@@ -465,11 +628,11 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
     metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline))
     for ended in ("finished_at", "counts"):
         metadata.pop(ended, None)
-    files = {key: value for key, value in metadata["files"].items() if not is_of_table(key)}
-    with translate_errors(store.url, "written"):
-        write_root(store, {**metadata, "finished": False, "files": files}, pipeline)
+    listed = {key: crc for key, crc in metadata["files"].items() if not is_of_table(key)}
+    with locations.translate_errors(store.url, "written"):
+        write_root(store, {**metadata, "finished": False, "files": listed}, pipeline)
         for name in TABLES:
-            sync(store.storage.delete_dir(name))
+            files.sync(store.storage.delete_dir(name))
 
 
 def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
@@ -477,13 +640,13 @@ def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
 
     Files of an earlier dataset go first: with other dimensions, one's folder is the other's file.
     """
-    files = store.run_metadata["files"]
-    others = {key: each for key, each in files.items() if not key.startswith(f"{name}/")}
+    listed = store.run_metadata["files"]
+    others = {key: crc for key, crc in listed.items() if not key.startswith(f"{name}/")}
     metadata = {**store.run_metadata, "files": others}
-    if len(others) < len(files):
-        with translate_errors(store.url, "written"):
+    if len(others) < len(listed):
+        with locations.translate_errors(store.url, "written"):
             write_root(store, metadata)
-            sync(store.storage.delete_dir(name))
+            files.sync(store.storage.delete_dir(name))
     _write_groups(store, {name: content}, metadata)
 
 
@@ -496,15 +659,16 @@ def _write_groups(
         texts = [label for label in content.variables if content[label].dtype.kind == "U"]
         content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
             memory, group=name, mode="w", zarr_format=3, consolidated=False,
-            encoding={label: {"compressors": codecs()} for label in content.variables},
+            encoding={label: {"compressors": files.codecs()} for label in content.variables},
             write_empty_chunks=True,
         )
     within = tuple(f"{name}/" for name in groups)
-    files = {key: content for key, content in files_in(memory).items() if key.startswith(within)}
-    with translate_errors(store.url, "written"):
-        sync(store.storage.delete_dir(BEGUN))
-        write_files(store.storage, files)
-        write_root(store, {**metadata, "files": {**metadata["files"], **checksums(files)}})
+    contents = {key: content for key, content in files.files_in(memory).items()
+                if key.startswith(within)}
+    with locations.translate_errors(store.url, "written"):
+        files.sync(store.storage.delete_dir(BEGUN))
+        files.write_files(store.storage, contents)
+        write_root(store, {**metadata, "files": metadata["files"] | checksums(contents)})
 
 
 def write_root(
@@ -521,14 +685,14 @@ def write_root(
     if metadata["finished"]:
         memory = MemoryStore()
         keys = [key for key in metadata["files"] if key.endswith("zarr.json")]
-        documents = zip(keys, read_files(store.storage, keys), strict=True)
-        write_files(memory, {
-            "zarr.json": encoded(root), **{key: content for key, content in documents if content}})
+        documents = zip(keys, files.read_files(store.storage, keys), strict=True)
+        files.write_files(memory, {key: content for key, content in documents if content}
+                          | {"zarr.json": files.encoded(root)})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
             zarr.consolidate_metadata(memory, zarr_format=3)
-        root = read_json(memory, "zarr.json") or root
-    write_document(store.storage, "zarr.json", _sealed(root))
+        root = files.read_json(memory, "zarr.json") or root
+    files.write_document(store.storage, "zarr.json", _sealed(root))
 
 
 # --------------------------------------------------------------------------------------------------

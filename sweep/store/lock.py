@@ -25,8 +25,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
-from sweep.store.files import delete_files, list_folder, read_files, write_files
-from sweep.store.layout import RECEIPTS
+from sweep.store.files import RECEIPTS, delete_files, list_folder, read_files, write_files
 from sweep.store.locations import translate_errors
 
 LOCKS = f"{RECEIPTS}/locks"

@@ -37,8 +37,7 @@ from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
 from sweep.store.blocks import Receipt, committed, receipt_key, receipts
-from sweep.store.files import write_files
-from sweep.store.layout import RECEIPTS
+from sweep.store.files import RECEIPTS, write_files
 from sweep.store.lifecycle import create_store, open_store
 
 PROCESSES = 2

@@ -5,7 +5,8 @@ from support.example_results import example_results
 from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, short_name
-from sweep.store.layout import RECEIPTS, planned_arrays
+from sweep.store.files import RECEIPTS
+from sweep.store.lifecycle import planned_arrays
 
 MAX_LINE = 30
 """Characters after which xarray breaks a label; three lines fit beside a chart."""

@@ -22,9 +22,8 @@ from sweep.execution.runner import execute
 from sweep.execution.status import close
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.recomputation import compare
-from sweep.integrity.repair import repair
-from sweep.integrity.verification import verify
+from sweep.integrity.reproduction import compare
+from sweep.integrity.verification import repair, verify
 from sweep.store.blocks import MAX_CHARACTERS, MAX_PER_BLOCK, recorded
 
 TEXT = """

@@ -22,10 +22,9 @@ from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import VARIABLES
-from sweep.integrity.repair import repair
-from sweep.integrity.verification import verify
+from sweep.integrity.verification import repair, verify
 from sweep.store.blocks import begin_block, receipts
-from sweep.store.layout import checksum_of
+from sweep.store.files import checksum_of
 from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
@@ -129,7 +128,7 @@ def here(monkeypatch, tmp_path):
                 computed.append(number)
                 compute_block(store.url, store.run_id, store.blocks[number])
 
-    monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
+    monkeypatch.setattr("sweep.integrity.verification.recompute", recompute)
     return computed
 
 
@@ -296,7 +295,7 @@ ELSEWHERE = {
 VERIFY_EACH = """
 import json, sys
 from sweep.processor import processor
-from sweep.integrity.verification import verify
+from sweep.integrity.verification import repair, verify
 
 found = [verify(url, 40) for url in sys.argv[1:]]
 print(json.dumps([processor(), [[each.sampled, len(each.damage)] for each in found]]))

@@ -15,8 +15,7 @@ from sweep.execution.forecast import check_affordable
 from sweep.execution.runner import execute, tighten
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.repair import repair
-from sweep.integrity.verification import verify
+from sweep.integrity.verification import repair, verify
 from sweep.measure.flags import DetectionStatus
 from sweep.store.blocks import committed, drop_block, receipts
 from sweep.store.lifecycle import open_dataset, open_store

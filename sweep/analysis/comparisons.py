@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +18,12 @@ from sweep.analysis.dataset import (
     axes_of,
     configuration_axes,
     describes,
+    each_cell,
     fingerprint_of,
     is_grid_axis,
     is_sampling_stopped,
     kept_dimensions,
+    largest_cell,
     require_dimension,
     require_poses,
     stored_pipeline,
@@ -116,9 +119,8 @@ def paired_arrays(
 def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
     """Raise DatasetError unless two datasets are of the same scenes and draws."""
     for name, value in first.coords.items():
-        if (is_grid_axis(name, first) and not value.dims
-                and name in second.coords and not second[name].dims):
-            values = value.item(), second[name].item()
+        if is_grid_axis(name, first) and not value.dims and not second.get(name, value).dims:
+            values = value.item(), second.get(name, value).item()
             if values[0] != values[1]:
                 raise DatasetError(f"not the same scenes: {name} is {values[0]} and {values[1]}, "
                                    "with other draws")
@@ -129,72 +131,18 @@ def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
     for name in axes:
         if not np.array_equal(first[name].values, second[name].values):
             raise DatasetError(f"not the same scenes: the values of {name} differ")
-    seeds = [fingerprint_of(side).get("seed") for side in (first, second)]
-    if None not in seeds and seeds[0] != seeds[1]:
-        raise DatasetError(f"not the same draws: seeds {seeds[0]} and {seeds[1]}")
-    sampling = [fingerprint_of(side).get("sampling", "independent") for side in (first, second)]
-    if sampling[0] != sampling[1]:
-        raise DatasetError(f"not the same draws: sampling {sampling[0]} and {sampling[1]}")
-
-
-# --------------------------------------------------------------------------------------------------
-# How far corners and poses moved between two treatments of the same images, as statistics.
-
-CORNERS = "corner_error_px"
-OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
-
-PairStatistic = Statistic[Pair]
-
-ROTATION, _DEPTH = QUANTITIES[:2]
-
-_POSE_DIMENSIONS = 4
-"""Groups, cells, draws and settings: what stands before the dimensions of a pose's corners."""
-
-
-def corners_of(results: xr.Dataset) -> str:
-    """Return the name of the corners' errors: a marker's, or those of a board's markers."""
-    return OF_BOARDS if OF_BOARDS in results else CORNERS
-
-
-def shifts(whose: str, corners: str) -> dict[str, list[PairStatistic]]:
-    """Return what moved, second minus first, ``whose`` in descriptions: by what it is read of.
-
-    ``corners`` as :func:`corners_of` returns it. Of a board the corners count that both found; one
-    without any does not count.
-    """
-    return {
-        "detection": [RootMeanSquare(
-            "corner_shift_rms_px", f"RMS of a corner's coordinate minus {whose}", "px",
-            lambda pair: _corner_shift(pair, corners),
-            lambda pair: pair.compared & pair.first.detected & pair.second.detected)],
-        "estimate": [
-            Mean("range_bias_percent",
-                 f"mean depth error minus {whose}, of the true depth, both solved", "percent",
-                 lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
-                 lambda pair: pair.both_solved),
-            RootMeanSquare(
-                "rotation_shift_deg",
-                f"RMS of the rotation error minus {whose}, both solved and not flipped",
-                ROTATION.units, lambda pair: norm_squared(np.degrees(np.subtract(
-                    pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
-                    dtype=np.float64)))[..., None],
-                lambda pair: pair.first.unflipped & pair.second.unflipped)],
-    }
-
-
-def _corner_shift(pair: Pair, corners: str) -> Floats:
-    """Return the mean squared difference (..., 1) of the corners that both found, else NaN."""
-    moved = np.subtract(pair.second[corners], pair.first[corners], dtype=np.float64) ** 2
-    inner = tuple(range(_POSE_DIMENSIONS, moved.ndim))
-    if corners == CORNERS:
-        return np.asarray(moved.mean(axis=inner)[..., None])
-    found = np.isfinite(moved).sum(axis=inner)
-    total = np.nansum(moved, axis=inner)
-    return np.where(found > 0, total / np.maximum(found, 1), np.nan)[..., None]
+    for key, unsaid, words in (("seed", None, "seeds"), ("sampling", "independent", "sampling")):
+        ours, theirs = (fingerprint_of(side).get(key, unsaid) for side in (first, second))
+        if None not in (ours, theirs) and ours != theirs:
+            raise DatasetError(f"not the same draws: {words} {ours} and {theirs}")
 
 
 # --------------------------------------------------------------------------------------------------
 # Two configurations on the same scenes, pose by pose: what differs, and whether it is chance.
+
+PairStatistic = Statistic[Pair]
+
+ROTATION, _DEPTH = QUANTITIES[:2]
 
 
 @describes
@@ -261,21 +209,18 @@ def compare(
     """
     kept = kept_dimensions(first, per)
     kept_dimensions(second, per)
-    table = paired_table(first, second, kept, bins)
-    return table.drop_vars([
-        "drawn", *(quantity.named("first") for quantity in QUANTITIES),
-        *(f"{quantity.named('first')}{end}" for quantity in QUANTITIES
-          for end in ("_low", "_high"))])
+    return paired_table(first, second, kept, bins).drop_vars("drawn")
 
 
 def paired_table(
     first: xr.Dataset, second: xr.Dataset, kept: Sequence[str], bins: Bins | None,
     quantities: Sequence[Quantity] = QUANTITIES, level: float = LEVEL,
+    more: Sequence[PairStatistic] = (),
 ) -> xr.Dataset:
-    """Return the table of `compare` of some kinds of error.
+    """Return the table of `compare` of some kinds of error, and of ``more`` statistics.
 
-    Beside it there is the first's mean absolute error of the poses that both solved, and whether
-    any cell has two draws, ``drawn``. ``level`` is that of all intervals.
+    Beside it there is whether any cell has two draws, ``drawn``. ``level`` is that of all
+    intervals.
     """
     stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
     if stopped:
@@ -301,6 +246,7 @@ def paired_table(
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
         *(statistic for quantity in quantities for statistic in _differences(quantity, level)),
+        *more,
     ]
     table = aggregate(first, inputs, kept, statistics, Pair, bins, stopped=stopped)
     return table.assign(_tested(table, stopped_level(level) if stopped else level))
@@ -330,38 +276,39 @@ def _agreement(ending: str, reached: Callable[[Poses], Masks]) -> list[PairStati
 
 def _flipped_in_one() -> list[PairStatistic]:
     """Return how many of the poses that both solved one of the two alone has flipped."""
-    words = "poses solved in both, flipped in the {} alone"
-    return [
-        Count("only_first_flipped", words.format("first"),
-              lambda pair: pair.both_solved & pair.first.flipped & ~pair.second.flipped),
-        Count("only_second_flipped", words.format("second"),
-              lambda pair: pair.both_solved & pair.second.flipped & ~pair.first.flipped),
-    ]
+    def count(alone: str, other: str) -> PairStatistic:
+        return Count(
+            f"only_{alone}_flipped", f"poses solved in both, flipped in the {alone} alone",
+            lambda pair: pair.both_solved & getattr(pair, alone).flipped
+            & ~getattr(pair, other).flipped)
+
+    return [count("first", "second"), count("second", "first")]
+
+
+def _both_squares(quantity: Quantity, pair: Pair) -> Floats:
+    """Return the squared absolute errors (..., 2) of both poses."""
+    return np.stack([norm_squared(quantity.vector(side)) for side in (pair.first, pair.second)],
+                    axis=-1)
 
 
 def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
-    def both_squares(pair: Pair) -> Floats:
-        sides = (pair.first, pair.second)
-        return np.stack([norm_squared(quantity.vector(side)) for side in sides], axis=-1)
+    """Return the mean difference and the ratio of a kind of error, of poses that both solved."""
+    squares, words = functools.partial(_both_squares, quantity), quantity.words
 
-    def solved(pair: Pair) -> Masks:
-        return pair.both_solved
+    def ratio(ending: str, also: str, used: Callable[[Pair], Masks]) -> PairStatistic:
+        return RootMeanSquareRatio(
+            f"{quantity.name}_rmse{ending}_ratio", f"second RMS {words} over the first{also}", "1",
+            squares, used, level)
 
-    words = quantity.words
-    differences: list[PairStatistic] = [
+    return [
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
-             quantity.units, lambda pair: np.diff(np.sqrt(both_squares(pair))), solved, level),
-        Mean(quantity.named("first"), f"first mean absolute {words}", quantity.units,
-             lambda pair: np.sqrt(both_squares(pair)[..., :1]), solved),
-        RootMeanSquareRatio(f"{quantity.name}_rmse_ratio", f"second RMS {words} over the first",
-                            "1", both_squares, solved, level),
+             quantity.units, lambda pair: np.diff(np.sqrt(squares(pair))),
+             lambda pair: pair.both_solved, level),
+        ratio("", "", lambda pair: pair.both_solved),
+        *([ratio("_unflipped", ", flipped in neither",
+                 lambda pair: pair.first.unflipped & pair.second.unflipped)]
+          if quantity is ROTATION else []),
     ]
-    if quantity is not ROTATION:
-        return differences
-    return [*differences, RootMeanSquareRatio(
-        f"{quantity.name}_rmse_unflipped_ratio",
-        f"second RMS {words} over the first, flipped in neither", "1", both_squares,
-        lambda pair: pair.first.unflipped & pair.second.unflipped, level)]
 
 
 def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
@@ -388,6 +335,18 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
 
 # --------------------------------------------------------------------------------------------------
 # What a renderer changes against the exact one, paired scene by scene.
+
+CORNERS = "corner_error_px"
+OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
+
+_POSE_DIMENSIONS = 4
+"""Groups, cells, draws and settings: what stands before the dimensions of a pose's corners."""
+
+
+def corners_of(results: xr.Dataset) -> str:
+    """Return the name of the corners' errors: a marker's, or those of a board's markers."""
+    return OF_BOARDS if OF_BOARDS in results else CORNERS
+
 
 @describes
 def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
@@ -447,17 +406,46 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     def pairs(*names: str) -> dict[str, xr.DataArray]:
         return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
 
-    corners = corners_of(results)
-    moved = shifts("the reference's", corners)
-    disagreement: PairStatistic = Rate(
-        "detection_disagreement", "differing of compared",
-        lambda pair: pair.first.detected != pair.second.detected, lambda pair: pair.compared,
-        counts=(("compared", "poses that were looked for with both renderers"),
-                ("differing", "poses detected with one of both renderers only")))
-    detections = aggregate(results, pairs(*DETECTION_INPUTS, corners), kept("detection"),
-                           [disagreement, *moved["detection"]], Pair)
-    poses = aggregate(results, pairs(*ERROR_INPUTS), kept("estimate"), moved["estimate"], Pair)
-    return detections.drop_vars("draws").assign(poses)
+    corners, whose = corners_of(results), "minus the reference's"
+    of_detections: list[PairStatistic] = [
+        Rate("detection_disagreement", "differing of compared",
+             lambda pair: pair.first.detected != pair.second.detected, lambda pair: pair.compared,
+             counts=(("compared", "poses that were looked for with both renderers"),
+                     ("differing", "poses detected with one of both renderers only"))),
+        RootMeanSquare(
+            "corner_shift_rms_px", f"RMS of a corner's coordinate {whose}", "px",
+            lambda pair: _corner_shift(pair, corners),
+            lambda pair: pair.compared & pair.first.detected & pair.second.detected)]
+    of_poses: list[PairStatistic] = [
+        Mean("range_bias_percent",
+             f"mean depth error {whose}, of the true depth, both solved", "percent",
+             lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
+             lambda pair: pair.both_solved),
+        RootMeanSquare(
+            "rotation_shift_deg",
+            f"RMS of the rotation error {whose}, both solved and not flipped", ROTATION.units,
+            lambda pair: norm_squared(np.degrees(np.subtract(
+                pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
+                dtype=np.float64)))[..., None],
+            lambda pair: pair.first.unflipped & pair.second.unflipped)]
+    detections = aggregate(
+        results, pairs(*DETECTION_INPUTS, corners), kept("detection"), of_detections, Pair)
+    return detections.drop_vars("draws").assign(
+        aggregate(results, pairs(*ERROR_INPUTS), kept("estimate"), of_poses, Pair))
+
+
+def _corner_shift(pair: Pair, corners: str) -> Floats:
+    """Return the mean squared difference (..., 1) of the corners that both found, else NaN.
+
+    Of a board the corners count that both found; one without any does not count.
+    """
+    moved = np.subtract(pair.second[corners], pair.first[corners], dtype=np.float64) ** 2
+    inner = tuple(range(_POSE_DIMENSIONS, moved.ndim))
+    if corners == CORNERS:
+        return np.asarray(moved.mean(axis=inner)[..., None])
+    found = np.isfinite(moved).sum(axis=inner)
+    total = np.nansum(moved, axis=inner)
+    return np.where(found > 0, total / np.maximum(found, 1), np.nan)[..., None]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -534,7 +522,10 @@ def regressions(
     kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    table = paired_table(old, new, kept, None, quantities, level)
+    means: list[PairStatistic] = [
+        Mean(each.named("first"), "", each.units, functools.partial(_first_error, each),
+             lambda pair: pair.both_solved) for each in quantities]
+    table = paired_table(old, new, kept, None, quantities, level, means)
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")
@@ -549,6 +540,10 @@ def regressions(
     return found
 
 
+def _first_error(quantity: Quantity, pair: Pair) -> Floats:
+    return np.sqrt(_both_squares(quantity, pair)[..., :1])
+
+
 def _worst(
     table: xr.Dataset, name: str, quantity: str, units: str, configuration: Sequence[str],
     excess: xr.DataArray, worse: xr.DataArray,
@@ -560,14 +555,12 @@ def _worst(
         "worse": worse,
         "excess": excess.fillna(-np.inf).where(worse | ~worse.any(conditions), -np.inf)})
     found = []
-    for index in np.ndindex(*(table.sizes[name] for name in configuration)):
-        one = columns.isel(dict(zip(configuration, index, strict=True))).transpose(*conditions)
-        at = np.unravel_index(int(np.argmax(one["excess"].values)), one["excess"].shape)
-        cell = one.isel(dict(zip(conditions, map(int, at), strict=True)))
+    for at, one in each_cell(columns, configuration):
+        cell = largest_cell(one, one["excess"].transpose(*conditions))
         found.append(Regression(
-            quantity, {name: one[name].item() for name in configuration},
-            {name: cell[name].item() for name in conditions}, float(cell["difference"]),
-            float(cell["low"]), float(cell["high"]), units, bool(one["worse"].any())))
+            quantity, at, {name: cell[name].item() for name in conditions},
+            float(cell["difference"]), float(cell["low"]), float(cell["high"]), units,
+            bool(one["worse"].any())))
     return found
 
 
@@ -634,7 +627,6 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     """
     _require_one_pipeline(first, second)
     scene = axes_of(first, Stage.scene)
-    solved = [dim for dim in axes_of(first) if dim not in scene]
     read = [name for name in (*ERROR_INPUTS, *TRUTH, *CORNER_VARIABLES)
             if name in first and name in second]
     sides = [side[read].drop_vars([*side[read].coords]).compute() for side in (first, second)]
@@ -643,48 +635,45 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
             ours, theirs = (side[name].transpose(*sides[0][name].dims).values for side in sides)
             if not np.allclose(ours, theirs, TRUTH_RTOL, 1e-3 * TRUTH_RTOL, equal_nan=True):
                 raise DatasetError(f"not the same true poses: {name} differs")
-    # A dataset that was cut or joined has NaN where nothing was run.
-    detections, estimates = ([side[name].fillna(0).astype(np.uint8) for side in sides]
-                             for name in ("detection", "estimate"))
-    computed = [~each.isin((DetectionStatus.not_run, DetectionStatus.not_needed))
-                for each in detections]
-    estimated = [~each.isin((EstimateStatus.not_run, EstimateStatus.not_needed))
-                 for each in estimates]
-    solutions_of = [each == EstimateStatus.solved for each in estimates]
-    corners = _summed([_moved(sides, name, computed[0] & computed[1], scene)
-                       for name in CORNER_VARIABLES if name in read])
-    poses = _summed([_motions(sides, solutions_of[0] & solutions_of[1], scene)])
-    detected = _by_flags(DetectionStatus, "detection", detections, computed[0] & computed[1], scene)
-    solutions = _by_flags(
-        EstimateStatus, "estimate", estimates, estimated[0] & estimated[1], scene)
+    columns: dict[str, tuple[xr.DataArray, str, str]] = {}
+    done: dict[str, list[xr.DataArray]] = {}
+    for kind, stage in ((DetectionStatus, "detection"), (EstimateStatus, "estimate")):
+        # A dataset that was cut or joined has NaN where nothing was run.
+        flags = [side[stage].fillna(0).astype(np.uint8) for side in sides]
+        done[stage] = [~each.isin((kind.not_run, kind.not_needed)) for each in flags]
+        both = done[stage][0] & done[stage][1]
+        columns |= {
+            f"{stage}s_compared": (both.sum(scene), "poses computed in both", "1"),
+            f"{stage}s_differing": (((flags[0] != flags[1]) & both).sum(scene),
+                                    "poses computed in both, with another flag", "1"),
+            f"{stage}s": (_by_flags(kind, stage, flags, both, scene),
+                          "poses by their flags in the first and in the second store", "1")}
+    found = done["detection"]
+    corners = _summed([_moved(sides, name, found[0] & found[1])
+                       for name in CORNER_VARIABLES if name in read], scene)
+    poses = _summed([_motions(sides)], scene)
     differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
-    columns: dict[str, tuple[Any, str, str]] = {
-        "detections_compared": (detected.sum(detected.dims[-2:]), "poses computed in both", "1"),
-        "detections_differing": (_off_diagonal(detected),
-                                 "of them, poses with another flag of detection", "1"),
-        "computed_once": ((computed[0] ^ computed[1]).sum(scene),
+    columns |= {
+        "computed_once": ((found[0] ^ found[1]).sum(scene),
                           "poses that one store computed and the other did not", "1"),
         "corners_compared": (corners["both"], "corners that both found", "1"),
         "corners_found_once": (corners["once"], "corners that one of both found", "1"),
         "corners_differing": (corners["differ"], "corners with another coordinate", "1"),
         "corner_shift_px": (corners["distance"], "distance of corners that differ", "px"),
-        "estimates_differing": (_off_diagonal(solutions),
-                                "poses with another flag of the estimate", "1"),
         "poses_compared": (poses["both"], "poses that both solved", "1"),
         "poses_differing": (poses["differ"], "poses with another position or rotation", "1"),
         "position_shift_m": (poses["distance"], "distance of positions that differ", "m"),
         "rotation_shift_deg": (poses["angle"], "angle of rotations that differ", "degree"),
-        "detections": (detected, "poses by their flags in the first and in the second store", "1"),
-        "estimates": (solutions, "poses by their flags in the first and in the second store", "1"),
         "fingerprint": (
             xr.DataArray(np.array([pair for _, *pair in differences], dtype=object).reshape(-1, 2),
                          dims=("entry", "store")),
             "what the results depend on and differs between the stores", ""),
     }
+    del columns["estimates_compared"]
     return xr.Dataset(
         {name: array.assign_attrs(cf_attributes(meaning, units))
          for name, (array, meaning, units) in columns.items()},
-        {**{dim: first[dim] for dim in solved if dim in first.coords},
+        {**{dim: first[dim] for dim in axes_of(first) if dim not in scene and dim in first.coords},
          "statistic": list(STATISTICS), "store": ["first", "second"],
          "entry": np.array([entry for entry, _, _ in differences], dtype=object)})
 
@@ -706,30 +695,21 @@ def _by_flags(
     return found.assign_coords({label: [each.name for each in kind] for label in labels})
 
 
-def _off_diagonal(counts: xr.DataArray) -> xr.DataArray:
-    """Return the poses with two different flags, of (settings, flags, flags)."""
-    total = counts.sum(counts.dims[-2:])
-    return total.copy(data=total.values - np.trace(counts.values, axis1=-2, axis2=-1))
-
-
-def _moved(
-    sides: Sequence[xr.Dataset], name: str, computed: xr.DataArray, scene: Sequence[str]
-) -> xr.Dataset:
-    """Return which corners (..., item) both have, one has and which differ, and how far, px."""
+def _moved(sides: Sequence[xr.Dataset], name: str, computed: xr.DataArray) -> xr.Dataset:
+    """Return which corners both have, one has and which differ, and how far, px."""
     first, second = (side[name] for side in sides)
     found = [xr.apply_ufunc(np.isfinite, each).all("xy") for each in (first, second)]
     both = found[0] & found[1] & computed
-    moved = second.astype(np.float64) - first
-    return _items({
+    return xr.Dataset({
         "both": both, "once": (found[0] ^ found[1]) & computed,
         "differ": both & (first != second).any("xy"),
-        "distance": (moved**2).sum("xy") ** 0.5}, scene)
+        "distance": ((second.astype(np.float64) - first) ** 2).sum("xy") ** 0.5})
 
 
-def _motions(
-    sides: Sequence[xr.Dataset], both: xr.DataArray, scene: Sequence[str]
-) -> xr.Dataset:
-    """Return which poses (..., item) both solved and which differ, and how far: m, degrees."""
+def _motions(sides: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return which poses both solved and which differ, and how far: m, degrees."""
+    solved = [side["estimate"] == EstimateStatus.solved for side in sides]
+    both = solved[0] & solved[1]
     positions, rotations = ([side[name].transpose(*both.dims, "xyz") for side in sides]
                             for name in ("translation_error_m", "rotation_error_rad"))
     changed = [(first != second).any("xyz") for first, second in (positions, rotations)]
@@ -741,25 +721,23 @@ def _motions(
     angle = xr.zeros_like(moved.isel(xyz=0, drop=True))
     angle.values[differ.values] = np.degrees(np.linalg.norm(
         vector_of_rotation(second @ np.swapaxes(first, -1, -2)), axis=-1))
-    return _items({"both": both, "differ": differ, "angle": angle,
-                   "distance": (moved**2).sum("xyz") ** 0.5}, scene)
+    return xr.Dataset({"both": both, "differ": differ, "angle": angle,
+                       "distance": (moved**2).sum("xyz") ** 0.5})
 
 
-def _items(columns: Mapping[str, xr.DataArray], scene: Sequence[str]) -> xr.Dataset:
-    """Return arrays whose dimensions of scenes and of labels are one, ``item``, the last."""
-    table = xr.Dataset(columns)
-    pooled = [dim for dim in table.dims if dim in scene or dim in LABELS]
-    return table.stack(item=pooled, create_index=False)
+def _summed(parts: Sequence[xr.Dataset], scene: Sequence[str]) -> xr.Dataset:
+    """Return counts of masks, and `STATISTICS` of the lengths of what differs.
 
-
-def _summed(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return counts of masks, and `STATISTICS` of the lengths of what differs."""
+    They are over all dimensions of scenes and of labels.
+    """
     def statistics(length: Floats, differ: Masks) -> Floats:
         some = length[differ]
         return np.array([*np.quantile(some, (0.5, 0.99)), some.max()]) if some.size else (
             np.full(len(STATISTICS), np.nan))
 
-    table = xr.concat(parts, "item")
+    table = xr.concat([part.stack(
+        item=[dim for dim in part.dims if dim in scene or dim in LABELS], create_index=False)
+        for part in parts], "item")
     return xr.Dataset({
         name: array.sum("item") if array.dtype.kind == "b" else xr.apply_ufunc(
             statistics, array, table["differ"], input_core_dims=[["item"]] * 2,
@@ -773,13 +751,6 @@ def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:
         require_poses(side)
         pose_arrays(side, ERROR_INPUTS)  # raises for the markers of boards
     require_pairs(first, second)
-    settings = [set(axes_of(side)) - set(axes_of(side, Stage.scene)) for side in (first, second)]
-    if settings[0] != settings[1]:
-        names = ", ".join(sorted(settings[0] ^ settings[1]))
-        raise DatasetError(f"not one pipeline: just one of the two has the axis {names}")
-    for name in sorted(settings[0]):
-        if not np.array_equal(first[name].values, second[name].values):
-            raise DatasetError(f"not one pipeline: the values of {name} differ")
     try:
         ours, theirs = (_parameters(stored_pipeline(side)) for side in (first, second))
     except (KeyError, SweepError):

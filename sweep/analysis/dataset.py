@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -207,6 +207,21 @@ def require_dimension(results: xr.Dataset, *names: str) -> str:
             return name
     raise DatasetError(f"{' or '.join(names)}: no such dimension; "
                        f"there are {', '.join(axes) or 'none'}")
+
+
+def each_cell(
+    table: xr.Dataset, dims: Sequence[str]
+) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
+    """Yield the coordinates along some dimensions, and the part of a table, of each cell."""
+    for index in np.ndindex(*(table.sizes[dim] for dim in dims)):
+        cell = table.isel(dict(zip(dims, index, strict=True)))
+        yield {dim: cell[dim].item() for dim in dims}, cell
+
+
+def largest_cell(table: xr.Dataset, values: xr.DataArray) -> xr.Dataset:
+    """Return the cell of a table at which values over some of its dimensions are largest."""
+    index = np.unravel_index(int(np.argmax(values.to_numpy())), values.shape)
+    return table.isel(dict(zip(values.dims, map(int, index), strict=True)))
 
 
 def stacked(parts: Sequence[Labelled], dim: str) -> Labelled:

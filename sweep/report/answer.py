@@ -10,6 +10,7 @@ from typing import Any
 
 import xarray as xr
 
+from sweep.analysis.dataset import each_cell
 from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.requirements import (
     Decision,
@@ -43,7 +44,7 @@ from sweep.report.report_data import (
     course_of,
     notes_of,
 )
-from sweep.report.table import Column, Table, each_cell, interval_text, number
+from sweep.report.table import Column, Table, interval_text, number
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.dataset import each_cell
 from sweep.analysis.estimator import Bins
 from sweep.analysis.poses import QUANTITIES, Poses
 from sweep.analysis.simulation_gaps import (
@@ -25,7 +26,6 @@ from sweep.report.table import (
     Value,
     axis_label,
     coordinate,
-    each_cell,
     group_cells,
     plural,
 )

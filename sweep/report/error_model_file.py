@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.dataset import each_cell
 from sweep.analysis.error_models import (
     CONDITIONS,
     PREDICTORS,
@@ -23,7 +24,7 @@ from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Findings, Table, Value, each_cell, interval_text, number
+from sweep.report.table import Findings, Table, Value, interval_text, number
 from sweep.version import __version__
 
 SCHEMA = "sweep-error-model/3"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.dataset import each_cell
 from sweep.analysis.decisions import Reach
 from sweep.messages import quoted
 from sweep.report.figure import Figure
@@ -19,7 +20,6 @@ from sweep.report.table import (
     axis_label,
     coordinate,
     coordinates,
-    each_cell,
     number,
     table_of,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple
@@ -424,12 +424,3 @@ def table_of(
         caption, [*(axis_label(units, dim) for dim in dims), *(each.heading for each in wanted)],
         [[*name, *row] for name, row, shown in zip(names, cells, used, strict=False) if shown],
         stub=len(dims))
-
-
-def each_cell(
-    dataset: xr.Dataset, dims: Sequence[str]
-) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
-    """Yield the coordinates along some dimensions, and the part of a dataset, of each cell."""
-    for index in np.ndindex(*(dataset.sizes[dim] for dim in dims)):
-        cell = dataset.isel(dict(zip(dims, index, strict=True)))
-        yield {dim: cell[dim].item() for dim in dims}, cell

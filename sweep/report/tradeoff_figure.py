@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.dataset import each_cell
 from sweep.report.figure import Figure
-from sweep.report.table import Column, Table, each_cell
+from sweep.report.table import Column, Table
 from sweep.tradeoff.pareto import (
     CRITERIA,
     UNITS,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +19,6 @@ from sweep.report.report_data import (
     Configurations,
     ReportData,
     configurations,
-    stacked,
 )
 from sweep.report.table import Column, Table, Value, number
 from sweep.tradeoff.pareto import WRONG, conditions_of
@@ -40,36 +39,14 @@ COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_ra
 """Share -> what it is of."""
 
 
-class Quantity(NamedTuple):
-    """A paired quantity by which one configuration is better than another.
-
-    Attributes
-    ----------
-    words, variable, scale, unit
-        Text, variable of `sweep.analysis.compare`, its factor and unit.
-    equal
-        Value of two equal configurations.
-    large_is_good
-        Whether values above ``equal`` are better.
-    """
-
-    words: str
-    variable: str
-    scale: float = 1.0
-    unit: str = ""
-    equal: float = 1.0
-    large_is_good: bool = False
-
-
-DETECTION = Quantity("detection difference", "detection_difference", 100.0, "points", 0.0, True)
-SOLVED = Quantity("solved difference", "solved_difference", 100.0, "points", 0.0, True)
-ROTATION = Quantity("rotation RMSE ratio", "rotation_rmse_ratio")
-UNFLIPPED = Quantity("rotation RMSE ratio without flips", "rotation_rmse_unflipped_ratio")
-RANGE = Quantity("range RMSE ratio", "range_rmse_ratio")
-
-PAIRED = ("detection difference, points", "solved difference, points", "rotation RMSE ratio",
-          "range RMSE ratio")
-"""Headings of the paired quantities."""
+# Of two equal configurations differences are 0, where large is good, and ratios 1.
+DETECTION = Column("detection difference, points", "detection_difference", 100.0, 0.0)
+SOLVED = Column("solved difference, points", "solved_difference", 100.0, 0.0)
+ROTATION = Column("rotation RMSE ratio", "rotation_rmse_ratio", 1.0, 1.0)
+UNFLIPPED = Column(
+    "rotation RMSE ratio without flips", "rotation_rmse_unflipped_ratio", 1.0, 1.0)
+RANGE = Column("range RMSE ratio", "range_rmse_ratio", 1.0, 1.0)
+PAIRED = (DETECTION, SOLVED, ROTATION, RANGE)
 
 DECIDING_LEVEL = 1.0 - (1.0 - LEVEL) / len(PAIRED)
 """Level of the intervals that decide: two equal configurations are told apart by any of the four
@@ -78,8 +55,7 @@ quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are
 VERDICTS = {1: "better", 0: "not decided", -1: "worse"}
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """One quantity of the best configuration against another one, on the images of both.
 
     Attributes
@@ -164,29 +140,29 @@ class Comparison:
     def table(self) -> Table:
         """Return a row for each configuration, with the best one's paired differences."""
         known, columns = self.known, (Column("n", "looked_for"), *CARDS)
-        headings = [each.heading for each in columns]
+        headings = [each.heading for each in (*columns, *PAIRED)]
         rows = [[name, *cells] for name, *cells in zip(
             known.names, *(each.cells(known.summary) for each in columns), strict=True)]
         caption = "Configurations, with 95 % intervals"
         if not known.several:
-            return Table.of(caption, [CONFIGURATION, *headings], rows)
+            return Table.of(caption, [CONFIGURATION, *headings[: len(columns)]], rows)
         best = all(self.verdict(k) > 0 or known.wrong[k]
                    for k in range(len(rows)) if k != self.best)
         for k, pair in enumerate(self.differences):
             rows[k] += [each.numbers for each in pair] or [None] * len(PAIRED)
             rows[k].insert(1, verdict_words(pair) if k != self.best else
                            "best" if best else "named")
-        few = any(each.quantity == UNFLIPPED.words for pair in self.differences for each in pair)
+        few = any(each.quantity == UNFLIPPED.heading for pair in self.differences for each in pair)
         return Table.of(
             f"{caption}; differences, ratios and verdict: {self.name} against each, on the same "
             f"images{'; rotation without flips where few poses differ by them' if few else ''}",
-            [CONFIGURATION, "verdict", *headings, *PAIRED], rows, stub=2)
+            [CONFIGURATION, "verdict", *headings], rows, stub=2)
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
         return [{"configuration": self.name, "against": name,
                  "verdict": VERDICTS[self.verdict(k)],
-                 "differences": [dataclasses.asdict(each) | {"verdict": VERDICTS[each.verdict]}
+                 "differences": [each._asdict() | {"verdict": VERDICTS[each.verdict]}
                                  for each in self.differences[k]]}
                 for k, name in enumerate(self.known.names) if k != self.best]
 
@@ -250,56 +226,33 @@ def _against_each(
     data: ReportData, known: Configurations, best: int
 ) -> list[tuple[Difference, ...]]:
     """Return the differences of one configuration from each, of no quantity from itself."""
-    at = known.combinations[best]
-    chosen = data.results.isel(known.axes)
-    tables = data.once(("against", *at.items()), lambda: paired(
-        chosen, with_configuration(chosen, at), list(at)))
-    shown, deciding = (stacked(table, known.combinations, known.names) for table in tables)
-    return [() if k == best else _differences(*(
-        each.isel({CONFIGURATION: k}) for each in (shown, deciding)))
-            for k in range(len(known.names))]
+    results = data.results.isel(known.axes)
 
+    def against(k: int) -> tuple[Difference, ...]:
+        one, other = (results.isel(known.combinations[at], drop=True) for at in (k, best))
+        return () if k == best else data.once(
+            ("differences", *known.axes, k, best), lambda: differences_of(one, other))
 
-def paired(
-    first: xr.Dataset, second: xr.Dataset, kept: Sequence[str] = ()
-) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the table of `sweep.analysis.compare`, and that with the intervals that decide."""
-    return compare(first, second, kept), paired_table(
-        first, second, kept, None, QUANTITIES[:2], DECIDING_LEVEL)
+    return [against(k) for k in range(len(known.names))]
 
 
 def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, ...]:
-    """Return how the second of two configurations differs from the first."""
-    return _differences(*paired(first, second))
+    """Return how the second of two configurations differs from the first, on the same images.
 
-
-def _differences(shown: xr.Dataset, deciding: xr.Dataset) -> tuple[Difference, ...]:
+    If few poses are flipped in one of the two alone, the rotation is compared without flips.
+    """
+    shown = compare(first, second)
+    deciding = paired_table(first, second, (), None, QUANTITIES[:2], DECIDING_LEVEL)
     flipped = int(shown["only_first_flipped"]) + int(shown["only_second_flipped"])
     rotation = UNFLIPPED if 0 < flipped < MIN_FLIPPED else ROTATION
     out = []
     for each in (DETECTION, SOLVED, rotation, RANGE):
-        numbers, ends = (
-            Column("", each.variable, each.scale).cells(row)[0] for row in (shown, deciding))
-        above, below = ends.low > each.equal, ends.high < each.equal
-        verdict = int(above) - int(below) if each.large_is_good else int(below) - int(above)
-        out.append(Difference(
-            each.words, numbers.value, numbers.low, numbers.high, each.unit, verdict))
+        (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
+        verdict = int(ends.low > each.level) - int(ends.high < each.level)
+        words, _, unit = each.heading.partition(", ")
+        out.append(Difference(words, numbers.value, numbers.low, numbers.high, unit,
+                              -verdict if each.level else verdict))
     return tuple(out)
-
-
-def with_configuration(results: xr.Dataset, at: Mapping[str, int]) -> xr.Dataset:
-    """Return results in which every configuration has the values of one.
-
-    ``at`` has the index of that one along each axis of configurations.
-    """
-    replaced = {}
-    for name, variable in results.data_vars.items():
-        dims = {dim: index for dim, index in at.items() if dim in variable.dims}
-        if dims:
-            one = variable.isel(dims, drop=True)
-            replaced[name] = one.expand_dims({dim: results[dim] for dim in dims}).transpose(
-                *variable.dims)
-    return results.assign(replaced)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -49,23 +49,18 @@ def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.D
     ArgumentError
         For an axis or a value that the store does not have.
     """
+    kept: dict[str, list[int]] = {}
     for name, value in parse_selection(",".join(at), pipeline).items() if at else ():
-        axis = str(results[name].dims[0]) if name in results.coords and (
-            results[name].ndim == 1) else ""
-        if axis not in axes_of(results):
-            axes = axes_of(results)
+        axis, axes = pipeline.axis_of(name), axes_of(results)
+        if axis is None or axis.name not in axes:
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
                                 f"there are {', '.join(axes)}")
-        values = results[name].to_numpy()
-        if values.dtype.kind in "fiu" and isinstance(value, int | float):
-            same = np.isclose(values, value, rtol=1e-9, atol=0.0)
-        else:
-            same = values.astype(str) == label(value)
-        if not same.any():
-            shown = ", ".join(label(each) for each in values[:20].tolist())
+        values = axis.columns[name]
+        kept[axis.name] = [k for k in kept.get(axis.name, range(len(axis))) if values[k] == value]
+        if not kept[axis.name]:
+            shown = ", ".join(map(label, values[:20]))
             raise ArgumentError("at", f"{name}={label(value)}", f"no such value; there are {shown}")
-        results = results.isel({axis: np.nonzero(same)[0]})
-    return results
+    return results.isel(kept)
 
 
 def pooled_axes(results: xr.Dataset, per: Sequence[str]) -> list[str]:

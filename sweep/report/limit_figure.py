@@ -33,16 +33,15 @@ UNITS = {"degree": "\u00b0", "1": "", "": ""}
 
 def limit_table(limits: xr.Dataset) -> Table:
     """Return a row for each configuration and condition of `sweep.analysis.requirement_limits`."""
-    along, dims = str(limits.attrs["along"]), dimensions(limits)
-    rows = []
-    for at, one in each_cell(limits, dims):
-        rows.append([*map(coordinate, at.values()), limit_text(one),
-                     interval_text(one), bool(one["settled"]), cause_text(one),
-                     beyond_text(one), int(one["poses"])])
+    dims = dimensions(limits)
+    rows = [[*map(coordinate, at.values()), limit_text(one), interval_text(one),
+             bool(one["settled"]), *_failure_texts(one), int(one["poses"])]
+            for at, one in each_cell(limits, dims)]
     required = " and ".join(map(str, limits.attrs["require"]))
     at_all = ", ".join(limits.attrs["at_all"])
     return Table.of(
-        f"How far along {along}: {required}" + (f", at all values of {at_all}" if at_all else ""),
+        f"How far along {limits.attrs['along']}: {required}"
+        + (f", at all values of {at_all}" if at_all else ""),
         [*dims, "met", "95 % interval", "decided", "fails first", "beyond", "poses"], rows,
         stub=len(dims), words=True)
 
@@ -59,17 +58,19 @@ def limit_text(one: xr.Dataset) -> str:
 
     What is not decided is called so, whatever the estimates are.
     """
-    text = _estimate_text(one)
-    if bool(one["settled"]) or Reach(int(one["reach"])) is Reach.not_run:
+    reach, start, value = Reach(int(one["reach"])), float(one["start"]), float(one["value"])
+    bound = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
+    low, high = sorted((start, value))
+    text = {
+        Reach.not_run: "nothing to judge", Reach.never: "at no value", Reach.found: bound,
+        Reach.always: f"at all values, {bound}",
+        Reach.within: f"only at {_place(one, value)}" if low == high else
+                      f"{_place(one, low, unit=False)} to {_place(one, high)}"}[reach]
+    if bool(one["settled"]) or reach is Reach.not_run:
         return text
-    if not is_met_to_value(one):
+    if value != met_to(one):
         return f"not decided: {text}"
-    return text if Reach(int(one["reach"])) is Reach.always else f"{text}, not decided beyond"
-
-
-def is_met_to_value(one: xr.Dataset) -> bool:
-    """Return whether all values up to the limit are decided to be met."""
-    return float(one["value"]) == met_to(one)
+    return text if reach is Reach.always else f"{text}, not decided beyond"
 
 
 def met_to(one: xr.Dataset) -> float:
@@ -77,58 +78,41 @@ def met_to(one: xr.Dataset) -> float:
     return float(one["low" if one.attrs["harder"] == "upwards" else "high"])
 
 
-def _estimate_text(one: xr.Dataset) -> str:
-    reach = Reach(int(one["reach"]))
-    if reach is Reach.not_run:
-        return "nothing to judge"
-    if reach is Reach.never:
-        return "at no value"
-    upwards = one.attrs["harder"] == "upwards"
-    bound = "up to" if upwards else "down to"
-    value = with_unit(one, float(one["value"]))
-    if reach is Reach.always:
-        return f"at all values, {bound} {value}"
-    start = float(one["start"])
-    if reach is Reach.within and start == float(one["value"]):
-        return f"only at {value}"
-    if reach is Reach.within:
-        low, high = sorted((start, float(one["value"])))
-        return f"{_short(one, low)} to {with_unit(one, high)}"
-    return f"{bound} {value}"
-
-
 def interval_text(one: xr.Dataset) -> str:
     """Return the interval of the limit: ``1.1 to 1.3``; an open end is that of the grid."""
     low, high = float(one["low"]), float(one["high"])
     if math.isnan(low) or math.isnan(high):
         return "none"
-    values = np.sort(one[one.attrs["along"]].values)
-    least, most = _short(one, float(values[0])), _short(one, float(values[-1]))
-    if low == high and math.isfinite(low):
-        return f"{_short(one, low)}"
-    ends = [f"below {least}" if low == -math.inf else
-            f"beyond {most}" if low == math.inf else _short(one, low),
-            f"beyond {most}" if high == math.inf else
-            f"below {least}" if high == -math.inf else _short(one, high)]
-    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+    values = one[one.attrs["along"]].values
+    beyond = {-math.inf: f"below {_place(one, float(values.min()), unit=False)}",
+              math.inf: f"beyond {_place(one, float(values.max()), unit=False)}"}
+    texts = [beyond.get(end) or _place(one, end, unit=False) for end in (low, high)]
+    return " to ".join(dict.fromkeys(texts))
 
 
-def cause_text(one: xr.Dataset) -> str:
-    """Return what fails first beyond: ``1.3 m: detection_rate 0.874 (tilt_deg = 60)``."""
-    name = str(one["limited_by"].item())
-    if not name:
-        return ""
-    where = str(one["fails_where"].item())
-    return (f"{with_unit(one, float(one['fails_at']))}: {name.split(maxsplit=1)[0]} "
-            f"{number(float(one['failing_value']))}{f' ({where})' if where else ''}")
+def _failure_texts(one: xr.Dataset) -> tuple[str, str]:
+    """Return what fails first beyond, and whether estimates keep all limits again: perhaps a dip.
+
+    ``1.3 m: detection_rate 0.874 (tilt_deg = 60)``
+    """
+    cause = beyond = ""
+    if name := str(one["limited_by"].item()):
+        where = str(one["fails_where"].item())
+        cause = (f"{_place(one, float(one['fails_at']))}: {name.split(maxsplit=1)[0]} "
+                 f"{number(float(one['failing_value']))}{f' ({where})' if where else ''}")
+    if float(one["met_beyond"]) > 0:
+        beyond = ("kept again by estimate, farthest at "
+                  f"{_place(one, float(one['farthest_beyond']))}")
+    return cause, beyond
 
 
-def beyond_text(one: xr.Dataset) -> str:
-    """Return whether the estimates keep all limits again beyond: then there may be a dip."""
-    count = int(np.nan_to_num(float(one["met_beyond"])))
-    if not count:
-        return ""
-    return f"kept again by estimate, farthest at {with_unit(one, float(one['farthest_beyond']))}"
+def _place(one: xr.Dataset, value: float, *, unit: bool = True) -> str:
+    """Return a value of the axis with its unit."""
+    axis = one[one.attrs["along"]]
+    values: list[float] = axis.values.astype(float).tolist()
+    text = dict(zip(values, coordinates(values), strict=True)).get(value, coordinate(value))
+    units = str(axis.attrs.get("units", ""))
+    return text + UNITS.get(units, f" {units}") if unit else text
 
 
 def values_met(one: xr.Dataset) -> int:
@@ -151,35 +135,17 @@ def are_decided(limits: xr.Dataset) -> Masks:
     return np.asarray(decided & judged | ~judged & judged.any())
 
 
-def summary_line(limits: xr.Dataset) -> str:
-    """Return how many limits are decided, and from which end they are read."""
-    decided = are_decided(limits)
-    open_limits, count = int((~decided).sum()), decided.size
-    easy, hard = ("small", "large") if limits.attrs["harder"] == "upwards" else ("large", "small")
-    decision = (
-        f"{open_limits:,} limits of {count:,} are not decided to one value of the grid (more "
-        "--max-trials decide more)") if open_limits else "all limits are decided"
-    return f"{decision}; read from {easy} to {hard} values of {limits.attrs['along']}"
-
-
 def limit_findings(limits: xr.Dataset) -> Findings:
     """Return limits as findings, which print themselves; status 3 if one is not decided."""
-    store = str(limits.attrs["store"])
+    store, decided = str(limits.attrs["store"]), are_decided(limits)
+    easy, hard = ("small", "large") if limits.attrs["harder"] == "upwards" else ("large", "small")
+    line = "all limits are decided" if decided.all() else (
+        f"{int((~decided).sum()):,} limits of {decided.size:,} are not decided to one value of the "
+        "grid (more --max-trials decide more)")
+    line += f"; read from {easy} to {hard} values of {limits.attrs['along']}"
     return Findings(
-        [limit_table(limits), summary_line(limits)], as_json(limits) | {"store": store}, limits,
-        0 if are_decided(limits).all() else UNDECIDED, (f"sweep report {quoted(store)}", ""))
-
-
-def with_unit(one: xr.Dataset, value: float) -> str:
-    """Return a value of the axis with its unit."""
-    units = str(one[one.attrs["along"]].attrs.get("units", ""))
-    unit = UNITS.get(units, f" {units}")
-    return f"{_short(one, value)}{unit}"
-
-
-def _short(one: xr.Dataset, value: float) -> str:
-    values: list[float] = one[one.attrs["along"]].values.astype(float).tolist()
-    return dict(zip(values, coordinates(values), strict=True)).get(value, coordinate(value))
+        [limit_table(limits), line], as_json(limits) | {"store": store}, limits,
+        0 if decided.all() else UNDECIDED, (f"sweep report {quoted(store)}", ""))
 
 
 def as_json(limits: xr.Dataset) -> dict[str, Any]:

@@ -15,15 +15,16 @@ from typing import Any
 import cv2
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from matplotlib.patches import Patch
+from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
-from sweep.integrity.reproduction import StoredValues, compare
+from sweep.integrity.reproduction import compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.report.report_data import AREA, ReportData, store_errors
 from sweep.report.table import Table, coordinate, number, plural
@@ -31,31 +32,25 @@ from sweep.report.table import Table, coordinate, number, plural
 # --------------------------------------------------------------------------------------------------
 # One scene as a picture, with the truth and the detections drawn on it.
 
-Colour = tuple[int, int, int]
+# Of the palette of Okabe and Ito, distinguishable by the colour-blind.
+TRUTH, DETECTED, OTHER, REJECTED, CHESSBOARD = "#009e73", "#d55e00", "#cc79a7", "#f0e442", "#0072b2"
+FRAME = "#e69f00"
+AXES = {"estimated x": "#e60000", "y": "#00aa00", "z": "#0050e6"}
 
-# Blue, green, red; of the palette of Okabe and Ito, distinguishable by the colour-blind.
-TRUTH: Colour = (115, 158, 0)
-DETECTED: Colour = (0, 94, 213)
-OTHER: Colour = (167, 121, 204)
-REJECTED: Colour = (66, 228, 240)
-CHESSBOARD: Colour = (178, 114, 0)
-AXES: tuple[Colour, Colour, Colour] = ((0, 0, 230), (0, 170, 0), (230, 80, 0))
-PAPER: Colour = (255, 255, 255)
-INK: Colour = (40, 40, 40)
-
-LEGEND: tuple[tuple[str, Colour], ...] = (
-    ("true outline", TRUTH), ("detected corners (dot: the first)", DETECTED),
-    ("other detection", OTHER), ("rejected candidate", REJECTED),
-    ("estimated x", AXES[0]), ("y", AXES[1]), ("z", AXES[2]),
-    ("corners of a chessboard", CHESSBOARD),
-)
-"""The meaning of the colours."""
+LEGEND = {
+    "true outline": TRUTH, "detected corners (dot: the first)": DETECTED,
+    "other detection": OTHER, "rejected candidate": REJECTED, **AXES,
+    "corners of a chessboard": CHESSBOARD,
+}
+"""Labels and their colours."""
 
 MAX_SIDE = 900
-MIN_SIDE = 560
+"""Pixels that the larger side of a picture has at most, unless the image has more."""
 
-SHIFT = 4
-"""Fractional bits of the drawn coordinates."""
+MAX_INCHES, MIN_DPI = 10, 100
+"""Width of a picture, in whose proportion lines and letters are drawn, and dots an inch."""
+
+MAX_ENLARGEMENT = 24
 
 MARGIN = 0.35
 """Of the marker's side, shown around it."""
@@ -66,13 +61,10 @@ SMALL = 0.08
 """Share of a picture's larger side below which a marker is shown enlarged in a corner, too."""
 
 INSET = 0.36
-"""Share of a picture's smaller side that this takes."""
+"""Share of a picture's sides that this takes."""
 
-CAPTION_DPI = 100
-"""Dots an inch of the caption, which grows with pictures wider than `CAPTION_PX`."""
-
-CAPTION_PX, CAPTION_CHARS, CAPTION_COLUMNS = 1000, 90, 4
-"""Pixels, characters, and entries of the legend across a caption."""
+CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
+"""Characters of a caption's line, and entries of its legend side by side."""
 
 
 def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
@@ -89,15 +81,83 @@ def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
         First line of the caption: the pose on its grid. Then come what was drawn at random, flags
         and errors, and the legend.
     """
-    picture = _with_inset(draw_outlines(scene), scene)
-    texts = [title, _drawn_text(scene), result_text(scene)]
-    caption = _caption("\n".join(filter(None, texts)), _legend(scene),
-                       max(picture.shape[1], MIN_SIDE))
-    width = max(picture.shape[1], caption.shape[1])
-    return np.vstack([
-        cv2.copyMakeBorder(
-            part, 0, 0, spare := (width - part.shape[1]) // 2, width - part.shape[1] - spare,
-            cv2.BORDER_CONSTANT, value=PAPER) for part in (picture, caption)])
+    encoded = scene_png(scene, "\n".join(filter(
+        None, [title, _drawn_text(scene), result_text(scene)])))
+    return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR),
+                      dtype=np.uint8)
+
+
+def scene_png(scene: SceneInspection, caption: str = "") -> bytes:
+    """Return a scene enlarged as a PNG; with a caption also with a legend below it."""
+    height, width = scene.image.shape
+    scale = max(1, min(MAX_SIDE // max(height, width), MAX_ENLARGEMENT))
+    dpi = max(MIN_DPI, scale * width / MAX_INCHES)
+    canvas = Canvas((scale * width / dpi, scale * height / dpi), dpi=dpi)
+    axes = canvas.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    _draw(axes, scene)
+    if caption:
+        _enlarge_small(axes, scene)
+        inches = scale * width / dpi
+        chars = max(MIN_CHARS, round(CHARS_AN_INCH * inches))
+        axes.legend(
+            title="\n".join(part for line in caption.split("\n")
+                            for part in textwrap.wrap(line, chars)),
+            alignment="left", frameon=False, loc="upper left", bbox_to_anchor=(0, 0),
+            ncols=max(2, round(COLUMNS * inches / MAX_INCHES)))
+    encoded = io.BytesIO()
+    canvas.savefig(encoded, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0)
+    return encoded.getvalue()
+
+
+def _draw(axes: Axes, scene: SceneInspection) -> None:
+    """Draw image, truth and detections on axes whose coordinates are pixels of the frame."""
+    left, top, right, bottom = scene.window
+    # The centre of pixel 0 is 0: the image begins half a pixel before it.
+    extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
+    axes.imshow(scene.image, cmap="gray", vmin=0, vmax=255, interpolation="nearest", extent=extent)
+    several = len(scene.true_markers) > 1
+    found = scene.markers[np.isfinite(scene.markers).all(axis=(1, 2))]
+    for label, quads, thickness in (
+        ("rejected candidate", scene.rejected, 1.0),
+        ("other detection", other_quadrilaterals(scene), 1.5),
+        ("true outline", scene.true_markers, 2.0 if several else 3.5),
+        ("detected corners (dot: the first)", found, 1.0 if several else 1.5),
+    ):
+        for k, quad in enumerate(quads):
+            if np.isfinite(quad).all():
+                axes.add_patch(Polygon(quad, fill=False, edgecolor=LEGEND[label],
+                                       linewidth=thickness, label="" if k else label))
+    size = 4.0 if several else 8.0
+    circles: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": size}
+    axes.plot(*found.reshape(-1, 2).T, color=DETECTED, markerfacecolor="none", **circles)
+    axes.plot(*found[:, 0].T, color=DETECTED, **circles)
+    chessboard = scene.chessboard[np.isfinite(scene.chessboard).all(axis=1)]
+    if len(chessboard):
+        axes.plot(*chessboard.T, color=CHESSBOARD, markerfacecolor="none",
+                  label="corners of a chessboard", **circles)
+    if np.isfinite(scene.axes_px).all():
+        for (label, colour), end in zip(AXES.items(), scene.axes_px[1:], strict=True):
+            axes.plot(*np.stack([scene.axes_px[0], end]).T, color=colour, linewidth=2, label=label)
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+
+
+def _enlarge_small(axes: Axes, scene: SceneInspection) -> None:
+    """Frame a small marker, and show it enlarged in the corner that is farthest from it."""
+    cut = cut_to_marker(scene)
+    shown, part = np.reshape(scene.window, (2, 2)), np.reshape(cut.window, (2, 2))
+    size = shown[1] - shown[0]
+    if cut is scene or (part[1] - part[0]).max() > 2 * SMALL * size.max():
+        return
+    # Axes begin at the lower left corner, images at the upper left one.
+    near = part.mean(axis=0) < shown.mean(axis=0)
+    inset = axes.inset_axes((
+        0.98 - INSET if near[0] else 0.02, 0.02 if near[1] else 0.98 - INSET, INSET, INSET))
+    inset.set(xticks=[], yticks=[])
+    inset.spines[:].set(color=FRAME, linewidth=2)
+    _draw(inset, cut)
+    (x0, y0), (x1, y1) = part - 0.5
+    axes.indicate_inset((x0, y0, x1 - x0, y1 - y0), inset, edgecolor=FRAME, alpha=1.0)
 
 
 def cut_to_marker(scene: SceneInspection) -> SceneInspection:
@@ -117,88 +177,6 @@ def cut_to_marker(scene: SceneInspection) -> SceneInspection:
         scene, image=np.ascontiguousarray(image), window=(int(x0), int(y0), int(x1), int(y1)))
 
 
-def _scale(scene: SceneInspection, side: float = MAX_SIDE) -> int:
-    """Return by which factor the image is enlarged so that it has at most that side."""
-    return max(1, min(int(side) // int(max(scene.image.shape)), 24))
-
-
-def _with_inset(canvas: NDArray[np.uint8], scene: SceneInspection) -> NDArray[np.uint8]:
-    """Return the picture with a frame around a small marker, and the frame's content enlarged."""
-    height, width = canvas.shape[:2]
-    cut = cut_to_marker(scene)
-    x0, y0, x1, y1 = cut.window
-    scale = _scale(scene)
-    if cut is scene or scale * max(x1 - x0, y1 - y0) > 2 * SMALL * max(height, width):
-        return canvas
-    inset = draw_outlines(cut, INSET * min(height, width))
-    line = max(2, round(max(height, width) / 600))
-    frame = scale * (np.array([x0, y0, x1, y1]) - np.tile(scene.window[:2], 2))
-    size, room = np.array(inset.shape[1::-1]), np.array([width, height])
-    corner = np.where((frame[:2] + frame[2:]) < room, room - size - 3 * line, 3 * line)
-    x, y = corner
-    canvas[y : y + size[1], x : x + size[0]] = inset
-    for box in (frame + np.array([-1, -1, 1, 1]) * 2 * line, np.append(corner, corner + size)):
-        for colour, thickness in ((INK, 3 * line), (PAPER, line)):
-            cv2.rectangle(canvas, box[:2].tolist(), box[2:].tolist(), colour, thickness)
-    return canvas
-
-
-def draw_outlines(scene: SceneInspection, side: float = MAX_SIDE) -> NDArray[np.uint8]:
-    """Return a scene enlarged to about a side, (H, W, 3), without a caption.
-
-    Parameters
-    ----------
-    scene
-        Image, truth and detections.
-    side
-        Pixels that the larger side has at most, unless the image has more.
-    """
-    scale = _scale(scene, side)
-    enlarged = cv2.resize(
-        scene.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
-    )
-    canvas = np.asarray(cv2.cvtColor(enlarged, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    origin = np.array(scene.window[:2], dtype=np.float64)
-    weight = max(2, round(max(canvas.shape[:2]) / 700))
-
-    def at(points: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return points (n, 2) px of the frame as fixed-point coordinates of the picture."""
-        # The centre of pixel 0 lies half an enlarged pixel inside the picture.
-        moved = (points - origin + 0.5) * scale - 0.5
-        clipped = np.clip(moved, -1e6, 1e6)
-        return np.asarray(np.round(clipped * 2**SHIFT), dtype=np.int32)
-
-    def outline(points: NDArray[np.float64], colour: Colour, thickness: int) -> None:
-        if np.isfinite(points).all():
-            cv2.polylines(
-                canvas, [at(points).reshape(-1, 1, 2)], isClosed=True, color=colour,
-                thickness=thickness, lineType=cv2.LINE_AA, shift=SHIFT,
-            )
-
-    for quad in scene.rejected:
-        outline(quad, REJECTED, 1)
-    for quad in other_quadrilaterals(scene):
-        outline(quad, OTHER, weight)
-    several = len(scene.true_markers) > 1
-    for quad in scene.true_markers:
-        outline(quad, TRUTH, weight + (1 if several else 3))
-    radius = 3 if several else 6
-    for quad in scene.markers[np.isfinite(scene.markers).all(axis=(1, 2))]:
-        outline(quad, DETECTED, 1 if several else weight)
-        for k, corner in enumerate(at(quad).tolist()):
-            filled = cv2.FILLED if k == 0 else 1 if several else weight
-            cv2.circle(
-                canvas, corner, radius << SHIFT, DETECTED, filled, cv2.LINE_AA, SHIFT
-            )
-    for corner in at(scene.chessboard[np.isfinite(scene.chessboard).all(axis=1)]).tolist():
-        cv2.circle(canvas, corner, radius << SHIFT, CHESSBOARD, weight, cv2.LINE_AA, SHIFT)
-    if np.isfinite(scene.axes_px).all():
-        ends = at(scene.axes_px).tolist()
-        for colour, end in zip(AXES, ends[1:], strict=True):
-            cv2.line(canvas, ends[0], end, colour, weight + 1, cv2.LINE_AA, SHIFT)
-    return canvas
-
-
 def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
     """Return the decoded quadrilaterals that are not the scene's markers."""
     return [
@@ -207,49 +185,12 @@ def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
     ]
 
 
-def _legend(scene: SceneInspection) -> list[tuple[str, Colour]]:
-    """Return the entries of the legend that a scene needs."""
-    present = (
-        True, np.isfinite(scene.markers).all(axis=(1, 2)).any(), other_quadrilaterals(scene),
-        scene.rejected, *[np.isfinite(scene.axes_px).all()] * 3,
-        np.isfinite(scene.chessboard).any())
-    return [entry for entry, shown in zip(LEGEND, present, strict=True) if shown]
-
-
-def _caption(
-    text: str, legend: Sequence[tuple[str, Colour]], width: int
-) -> NDArray[np.uint8]:
-    """Return a legend below lines of text as a picture (h, w, 3) of about a width in px."""
-    scale = max(1.0, width / CAPTION_PX)
-    chars = round(CAPTION_CHARS * width / scale / CAPTION_PX)
-    lines = [part for line in text.split("\n") for part in textwrap.wrap(line, chars)]
-    canvas = Canvas((width / scale / CAPTION_DPI, 1), dpi=CAPTION_DPI * scale)
-    canvas.legend(
-        handles=[Patch(facecolor=css_colour(colour), label=entry) for entry, colour in legend],
-        title="\n".join(lines), alignment="left", frameon=False,
-        ncols=max(1, round(CAPTION_COLUMNS * width / scale / CAPTION_PX)))
-    encoded = io.BytesIO()
-    canvas.savefig(encoded, format="png", bbox_inches="tight", dpi=canvas.dpi)
-    return np.asarray(cv2.imdecode(np.frombuffer(encoded.getvalue(), np.uint8), cv2.IMREAD_COLOR),
-                      dtype=np.uint8)
-
-
 def _drawn_text(scene: SceneInspection) -> str:
     """Return what was drawn at random for the scene; empty if nothing was."""
     drawn = ", ".join(
         f"{name} {float(value):.5g}" for name, value in scene.values.items()
         if name not in VARIABLES and value.ndim == 0)
     return f"drawn: {drawn}" if drawn else ""
-
-
-def css_colour(colour: Colour) -> str:
-    """Return a colour as CSS has it.
-
-    >>> css_colour((255, 128, 0))
-    '#0080ff'
-    """
-    blue, green, red = colour
-    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -290,24 +231,6 @@ def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
         return (f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
                 f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
     return " ".join(coordinate(float(number)) for number in value.ravel())
-
-
-# --------------------------------------------------------------------------------------------------
-# One cell of a report's store.
-
-def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
-    """Return the stored values of the cell at an index along each axis, by variable.
-
-    Raises
-    ------
-    StoreError
-        If the store cannot be read.
-    """
-    variables = data.pipeline.experiment.variables
-    names = [variable.name for variable in variables if variable.name in data.results.variables]
-    with store_errors(data.store):
-        cell = data.results[names].isel(index).load()
-    return {name: np.asarray(cell[name].values) for name in names}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -426,7 +349,11 @@ def scenes_of(data: ReportData) -> Iterator[Scene]:
 
 
 def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
-    stored = stored_cell(data, index)
+    names = [variable.name for variable in data.pipeline.experiment.variables
+             if variable.name in data.results.variables]
+    with store_errors(data.store):
+        single_cell = data.results[names].isel(index)
+        stored = {name: np.asarray(single_cell[name].values) for name in names}
     at = selection_text(data.pipeline, index)
     command = f"sweep show {pipeline_file(data.pipeline)}"
     command += f" --at {shlex.quote(at)}" if at else ""
@@ -442,17 +369,16 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
         scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
-        picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
+        picture = scene_png(cut_to_marker(inspected))  # the page has a caption of its own
         # The store may be another machine's: as `sweep verify`, within the tolerances for those.
         difference = compare(inspected.values, stored, data.pipeline.experiment.variables,
                              same_processor=False)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
-    _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     result = result_text(inspected)
     return dataclasses.replace(
-        scene, result=result, picture=encoded.tobytes(),
+        scene, result=result, picture=picture,
         problem=f"Differs from the store: {difference}." if difference else "",
         alt=f"Rendered {data.pipeline.target_word} with its true outline and the detections: "
             f"{result}",

@@ -32,7 +32,6 @@ from sweep.report.report_data import ReportData
 from sweep.report.scenes import (
     LEGEND,
     Scene,
-    css_colour,
     pipeline_file,
     scenes_of,
 )
@@ -154,7 +153,7 @@ def page(
     text = environment.get_template("page.html" if html else "page.jinja").render(
         policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
         scenes=scenes, require=require, base=quote(folder),
-        legend=[(text, css_colour(colour)) for text, colour in LEGEND])
+        legend=LEGEND)
     return text.rstrip("\n") + "\n"
 
 

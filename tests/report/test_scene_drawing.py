@@ -1,11 +1,12 @@
 """The picture of one scene: what its caption says, and that a small marker is seen in it."""
 
+import cv2
 import numpy as np
 import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report.scenes import TRUTH, cut_to_marker, draw_outlines, draw_scene
+from sweep.report.scenes import TRUTH, cut_to_marker, draw_scene, scene_png
 
 FRAME = {
     "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},
@@ -20,7 +21,8 @@ def inspected(at, *, whole_frame=True):
 
 def share_of(picture, colour, box):
     x0, y0, x1, y1 = box
-    return float((picture[y0:y1, x0:x1] == colour).all(axis=2).mean())
+    blue_green_red = list(bytes.fromhex(colour[1:]))[::-1]
+    return float((picture[y0:y1, x0:x1] == blue_green_red).all(axis=2).mean())
 
 
 @pytest.mark.parametrize(("bearing", "corner"), [(-30, "right"), (30, "left")])
@@ -29,7 +31,8 @@ def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(beari
     picture = draw_scene(scene, "title")
     left, right = (0, 0, 600, 1200), (1000, 0, 1600, 1200)
     assert share_of(picture, TRUTH, right if corner == "right" else left) > 0.0005
-    plain = draw_outlines(scene)
+    plain = cv2.imdecode(np.frombuffer(scene_png(scene), np.uint8), cv2.IMREAD_COLOR)
+    assert plain.shape == (1200, 1600, 3)
     assert share_of(plain, TRUTH, right if corner == "right" else left) == 0
     assert picture.shape[0] > plain.shape[0]
 

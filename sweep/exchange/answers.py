@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-import math
+import functools
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from sweep.errors import ArgumentError, PipelineError, StoreError
-from sweep.messages import nearest, nearest_file, plain
+from sweep.messages import nearest, nearest_file, plain, refusal
 from sweep.model.pose import rotation_of_vector
 from sweep.plugins.recording import OF_TARGET, REJECTED
 from sweep.typing import Floats, Integers
@@ -93,15 +92,9 @@ class Conventions:
 
     def rotations(self, theirs: Floats) -> Floats:
         """Return rotations (N, 3, 3) of our marker frame, of those of theirs."""
-        return np.asarray(theirs @ frame_axes(self.frame))
-
-
-def frame_axes(frame: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return the rotation (3, 3) from our marker frame to one of given directions.
-
-    Its rows are the frame's axes in ours: a point is ours = axesᵀ · theirs.
-    """
-    return np.array([DIRECTIONS[word] for word in frame], dtype=np.float64)
+        # Rows are their axes in our frame: a point in ours is axesᵀ times theirs.
+        axes = np.array([DIRECTIONS[word] for word in self.frame], dtype=np.float64)
+        return np.asarray(theirs @ axes)
 
 
 def _words(text: str) -> list[str]:
@@ -128,93 +121,78 @@ ALIASES = {
 SEPARATORS = ",;\t"
 """The header has most of the one that separates; with semicolons, commas are decimal points."""
 
+STEM = r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$"
+"""What is left out of an image's name: folders, and the suffix."""
+
 NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 
 MAX_PX = 1e7
 MAX_M = 1e9
 MAX_TURN = 1e6
 
-MAX_FAULTS = 20
-"""Faults that are listed; the others are counted."""
-
 MAX_TOLD_COLUMNS = 12
 
 _NAME = re.compile(r"(\d{6,})-[0-9a-f]{8}")
 
-
-@dataclass(slots=True)
-class _Faults:
-    """The faults of a file: line, and text; those beyond the listed ones are counted."""
-
-    source: str
-    texts: list[str] = field(default_factory=list)
-    count: int = 0
-
-    def add(self, line: int, text: str) -> None:
-        self.count += 1
-        if self.count <= MAX_FAULTS:
-            self.texts.append(f"{self.source}: line {line}: {plain(text, 300)}")
-
-    def check(self) -> None:
-        """Raise PipelineError if there are faults: a line each, in the order of the file."""
-        if self.count > MAX_FAULTS:
-            self.texts.append(f"... and {self.count - MAX_FAULTS:,} faults more")
-        if self.count:
-            raise PipelineError(self.texts)
+Faults = dict[int, str]
+"""Line of the file -> its first fault."""
 
 
-def _text(path: Path, faults: _Faults) -> str:
+def _refused(source: str, faults: Faults) -> PipelineError:
+    """Return the error that lists faults in the order of the file."""
+    return refusal([
+        f"{source}: line {line}: {plain(faults[line], 300)}" for line in sorted(faults)])
+
+
+def _text(path: Path, source: str) -> str:
     """Return a file's text in any encoding that a byte order mark names, else UTF-8."""
     try:
         content = path.read_bytes()
     except (OSError, ValueError) as error:
         reason = f"{plain(getattr(error, 'strerror', None) or error)}{nearest_file(path)}"
-        raise StoreError(f"{faults.source}: cannot be read: {reason}") from None
+        raise StoreError(f"{source}: cannot be read: {reason}") from None
     encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError as error:
-        faults.add(content[: error.start].count(b"\n") + 1, "not UTF-8 text; expected CSV")
-        return ""
+        line = content[: error.start].count(b"\n") + 1
+        raise _refused(source, {line: "not UTF-8 text; expected CSV"}) from None
     if "\0" in text:
-        faults.add(text[: text.index("\0")].count("\n") + 1, "not text: a zero byte")
-    elif text.lstrip()[:1] in ("{", "["):
-        faults.add(1, "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,...")
+        line = text[: text.index("\0")].count("\n") + 1
+        raise _refused(source, {line: "not text: a zero byte"})
+    if text.lstrip()[:1] in ("{", "["):
+        raise _refused(
+            source, {1: "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,..."})
     return text
 
 
-def _rows(text: str, faults: _Faults) -> list[tuple[int, dict[str, str]]]:
-    """Return line and cells, by our names of columns, of the rows of a CSV text.
+def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
+    """Return the cells of a CSV text as text, by our names of columns and by line.
 
     Empty lines and lines that begin with ``#`` are left out. The header must have image and id, and
     all columns of the corners, of the pose, or of both.
     """
-    numbered = [
-        (number, line) for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
+    lines = {
+        number: line for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
         if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not numbered:
-        return []
-    separator = max(SEPARATORS, key=numbered[0][1].count)
-    (first, written), *rows = [
-        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])])
-        for number, line in numbered
-    ]
+    }
+    separator = max(SEPARATORS, key=next(iter(lines.values()), "").count)
+    rows = {number: [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+            for number, line in lines.items()}
+    first = next(iter(rows), 0)
+    written = rows.pop(first, ["image", "id", *CORNER_COLUMNS])
     header = [ALIASES.get(name.lower(), name.lower()) for name in written]
     if fault := _header_fault(header, written):
-        faults.add(first, fault)
-        faults.check()
-    for number, row in rows:
-        if len(row) != len(header):
-            faults.add(number, f"{len(row)} values; expected {len(header)}, as the header has")
-    numbers = {*CORNER_COLUMNS, *VECTOR, *QUATERNION, *POSITION} if separator == ";" else ()
-    return [
-        (number, {
-            name: cell.replace(",", ".") if name in numbers else cell
-            for name, cell in zip(header, row, strict=True)
-        })
-        for number, row in rows if len(row) == len(header)
-    ]
+        raise _refused(source, {first: fault})
+    faults |= {number: f"{len(row)} values; expected {len(header)}, as the header has"
+               for number, row in rows.items() if len(row) != len(header)}
+    table = pd.DataFrame.from_dict(
+        {number: row for number, row in rows.items() if number not in faults},
+        orient="index", columns=header, dtype=str)
+    if separator == ";":
+        numbers = table.columns != "image"
+        table.loc[:, numbers] = table.loc[:, numbers].replace(",", ".", regex=True)
+    return table
 
 
 def _header_fault(header: Sequence[str], written: Sequence[str]) -> str:
@@ -245,16 +223,6 @@ def _header_fault(header: Sequence[str], written: Sequence[str]) -> str:
 
 # --------------------------------------------------------------------------------------------------
 # Answers of other programs: detections and poses, read with all their faults told.
-
-class _Answer(NamedTuple):
-    """One row: an image's index, an ID, corners (8,), angles (3 or 4) and position (3,)."""
-
-    image: int
-    marker_id: int
-    corners: Sequence[float]
-    angles: Sequence[float]
-    position: Sequence[float]
-
 
 @dataclass(slots=True)
 class Answers:
@@ -303,96 +271,82 @@ def read_answers(
     StoreError
         If the file cannot be read.
     """
-    faults = _Faults(plain(path, 300))
-    text = _text(path, faults)
-    faults.check()
-    answers: list[_Answer] = []
-    lines: dict[tuple[int, int], int] = {}
-    angles = 3
-    for line, row in _rows(text, faults):
-        try:
-            answer = _answer(row, images)
-            if answer is None:
-                continue
-            key = answer.image, answer.marker_id
-            if doubled == "refuse" and answer.marker_id != REJECTED and key in lines:
-                what = "a pose without an ID" if key[1] == OF_TARGET else f"ID {key[1]}"
-                raise ValueError(
-                    f"image {row['image']} has {what} twice, here and in line {lines[key]}; delete "
-                    "one, or pass --doubled nearest: the one nearest to the truth counts, as of "
-                    "detectors that run here"
-                )
-            lines[key] = line
-            angles = len(answer.angles)
-            answers.append(answer)
-        except ValueError as error:
-            faults.add(line, str(error))
-    faults.check()
-    image, marker_id, corners, turns, position = (
-        np.array([answer[k] for answer in answers]) for k in range(5)
-    )
-    turns = turns.reshape(-1, angles).astype(np.float64)
-    known = np.isfinite(turns).all(axis=1)
-    rotation = np.full((len(turns), 3, 3), np.nan)
-    rotation[known] = (
-        rotation_of_vector(turns[known]) if angles == 3
-        else Rotation.from_quat(np.roll(turns[known], -1, axis=1)).as_matrix()
-    )
+    source, faults = plain(path, 300), Faults()
+    table = _table(_text(path, source), source, faults)
+
+    def judge(wrong: pd.Series, words: Callable[[pd.Series], str]) -> None:
+        """Note a fault of the lines that are wrong and have none yet."""
+        for line in wrong.index[wrong]:
+            faults.setdefault(line, words(table.loc[line]))
+
+    def unknown_image(row: pd.Series) -> str:
+        other = _NAME.fullmatch(re.sub(STEM, "", row["image"]))
+        return f"image {plain(row['image'])} is not among those that were exported" + (
+            "; it is of another export" if other else
+            f"; expected a name such as {next(iter(images), '')}.png")
+
+    def lacking(row: pd.Series, what: str, names: Sequence[str]) -> str:
+        missing = ", ".join(name for name in names if not row.get(name))
+        return f"no {missing}; expected all numbers of the {what}, or none"
+
+    def no_number(row: pd.Series) -> str:
+        name = next(name for name in cells if row.get(name) and np.isnan(numbers[name][row.name]))
+        return f"{name} = {plain(row[name])}: expected a finite number"
+
+    judge(table["image"] == "", lambda _: "no image; expected the name of one")
+    stems = table["image"].str.replace(STEM, "", regex=True)
+    judge(~stems.isin(images.keys()), unknown_image)
+    turns = list(QUATERNION if QUATERNION[0] in table else VECTOR)
+    corner_names, pose_names = list(CORNER_COLUMNS), [*turns, *POSITION]
+    cells = table.reindex(columns=[*corner_names, *pose_names], fill_value="")
+    # An image without an ID and without numbers was searched in vain.
+    some = (table["id"] != "") | (cells != "").any(axis=1)
+    table, cells, stems = table[some], cells[some], stems[some]
+    for what, names in (("corners", corner_names), ("pose", pose_names)):
+        empty = cells[names] == ""
+        judge(empty.any(axis=1) & ~empty.all(axis=1),
+              functools.partial(lacking, what=what, names=names))
+    numbers = cells.apply(_numbers).astype(np.float64)
+    judge(((cells != "") & numbers.isna()).any(axis=1), no_number)
+    corners, angles, position = (
+        numbers[names] for names in (corner_names, turns, list(POSITION)))
+    has_corners, has_pose = (each.notna().all(axis=1) for each in (corners, position))
+    of_target = (table["id"] == "") & has_pose & ~has_corners
+    marker_id = _numbers(table["id"]).where(~of_target, OF_TARGET)
+    judge(~of_target & ~((marker_id % 1 == 0) & marker_id.between(REJECTED, 2**31 - 1)),
+          lambda row: f"id {plain(row['id'])}: expected a whole number, or -1 for a candidate that "
+          "was not decoded; none beside the pose of a board")
+    judge(~has_corners & ~has_pose, lambda _: "an ID without corners and without a pose")
+    judge((corners.abs() > MAX_PX).any(axis=1),
+          lambda _: f"corners beyond {MAX_PX:.0e} px; expected pixels of the image")
+    judge((position.abs() > MAX_M).any(axis=1),
+          lambda _: f"a position beyond {MAX_M:.0e}; expected metres")
+    length = np.sqrt((angles**2).sum(axis=1))
+    if len(turns) == 4:
+        judge(has_pose & ((length - 1).abs() > 0.01), lambda row: (
+            f"a quaternion of length {length[row.name]:.3g}; expected w, x, y, z of length 1"))
+    judge((angles.abs() > MAX_TURN).any(axis=1),
+          lambda _: f"a rotation vector beyond {MAX_TURN:.0e}; expected radians")
+    if doubled == "refuse":
+        first = pd.Series(table.index, table.index).groupby([stems, marker_id]).transform("first")
+        judge((first != table.index) & (marker_id != REJECTED), lambda row: (
+            f"image {row['image']} has "
+            f"{'a pose without an ID' if of_target[row.name] else 'ID ' + row['id']} twice, here "
+            f"and in line {first[row.name]}; delete one, or pass --doubled nearest: the one "
+            "nearest to the truth counts, as of detectors that run here"))
+    if faults:
+        raise _refused(source, faults)
+    rotation = np.full((len(table), 3, 3), np.nan)
+    known = has_pose.to_numpy()
+    given = angles.to_numpy()[known]
+    rotation[known] = rotation_of_vector(given) if len(turns) == 3 else (
+        Rotation.from_quat(np.roll(given, -1, axis=1)).as_matrix())
     return Answers(
-        image.astype(np.int64), marker_id.astype(np.int64),
-        conventions.corners(corners.reshape(-1, 4, 2).astype(np.float64)),
-        conventions.rotations(rotation), position.reshape(-1, 3).astype(np.float64),
-    )
+        stems.map(images).to_numpy(np.int64), marker_id.to_numpy(np.int64),
+        conventions.corners(corners.to_numpy().reshape(-1, 4, 2)),
+        conventions.rotations(rotation), position.to_numpy())
 
 
-def _answer(row: Mapping[str, str], images: Mapping[str, int]) -> _Answer | None:
-    """Return what a row says; None of an image that was searched in vain. ValueError: a fault."""
-    if not row["image"]:
-        raise ValueError("no image; expected the name of one")
-    stem = re.sub(r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$", "", row["image"])
-    if stem not in images:
-        raise ValueError(
-            f"image {plain(row['image'])} is not among those that were exported"
-            + ("; it is of another export" if _NAME.fullmatch(stem) else
-               f"; expected a name such as {next(iter(images), '')}.png")
-        )
-    angle_names = QUATERNION if QUATERNION[0] in row else VECTOR
-    if not any(row.get(name) for name in ("id", *CORNER_COLUMNS, *angle_names, *POSITION)):
-        return None
-    corners = _numbers(row, "corners", CORNER_COLUMNS)
-    pose = _numbers(row, "pose", (*angle_names, *POSITION))
-    angles, position = pose[:-3], pose[-3:]
-    marker_id = OF_TARGET
-    if row["id"] or math.isnan(position[0]) or not math.isnan(corners[0]):
-        number = float(row["id"]) if re.fullmatch(NUMBER, row["id"]) else math.nan
-        if not (number.is_integer() and REJECTED <= number < 2**31):
-            raise ValueError(
-                f"id {plain(row['id'])}: expected a whole number, or -1 for a candidate that was "
-                "not decoded; none beside the pose of a board"
-            )
-        marker_id = int(number)
-    if math.isnan(corners[0]) and math.isnan(position[0]):
-        raise ValueError("an ID without corners and without a pose")
-    if any(abs(number) > MAX_PX for number in corners):
-        raise ValueError(f"corners beyond {MAX_PX:.0e} px; expected pixels of the image")
-    if any(abs(number) > MAX_M for number in position):
-        raise ValueError(f"a position beyond {MAX_M:.0e}; expected metres")
-    if angle_names is QUATERNION and abs(math.hypot(*angles) - 1) > 0.01:
-        raise ValueError(
-            f"a quaternion of length {math.hypot(*angles):.3g}; expected w, x, y, z of length 1")
-    if any(abs(number) > MAX_TURN for number in angles):
-        raise ValueError(f"a rotation vector beyond {MAX_TURN:.0e}; expected radians")
-    return _Answer(images[stem], marker_id, corners, angles, position)
-
-
-def _numbers(row: Mapping[str, str], what: str, names: Sequence[str]) -> list[float]:
-    """Return the numbers of columns; NaN if a row has none of them, or the file no column."""
-    missing = [name for name in names if not row.get(name)]
-    if len(missing) == len(names):
-        return [math.nan] * len(names)
-    if missing:
-        raise ValueError(f"no {', '.join(missing)}; expected all numbers of the {what}, or none")
-    for name in names:
-        if not re.fullmatch(NUMBER, row[name]):
-            raise ValueError(f"{name} = {plain(row[name])}: expected a finite number")
-    return [float(row[name]) for name in names]
+def _numbers(texts: pd.Series) -> pd.Series:
+    """Return the numbers of texts; NaN for others."""
+    return texts.where(texts.str.fullmatch(NUMBER), "nan").astype(np.float64)

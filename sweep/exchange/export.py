@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,9 +24,9 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.exchange.images import (
     BATCH,
     ImageBatch,
-    TruthTables,
     image_batch,
     write_errors,
+    write_truth,
 )
 from sweep.execution.forecast import free_disk
 from sweep.experiment.pipeline import Pipeline
@@ -164,20 +164,19 @@ def export(
                 progress(done, count)
         write_whole(target / CHECKSUMS, "".join(
             f"{digest}  {name}\n" for name, digest in sorted(digests.items())).encode())
-        tables = TruthTables(pipeline, windowed)
-        tables.write(target)
-        cameras = target / "cameras"
-        cameras.mkdir(exist_ok=True)
-        for camera, name in tables.cameras.items():
-            write_whole(cameras / f"{name}.opencv.yml", camera.opencv_yaml().encode())
-            write_whole(cameras / f"{name}.ros.yaml", camera.ros_yaml(name).encode())
+        cameras, images, invisible = write_truth(pipeline, target, windowed=windowed)
+        (target / "cameras").mkdir(exist_ok=True)
+        for camera, name in cameras.items():
+            path = target / "cameras" / name
+            write_whole(path.with_suffix(".opencv.yml"), camera.opencv_yaml().encode())
+            write_whole(path.with_suffix(".ros.yaml"), camera.ros_yaml(name).encode())
         write_whole(target / "README.md", Template(GUIDE.read_text(encoding="utf-8")).render(
-            title=pipeline.heading, images=tables.images, invisible=tables.invisible,
+            title=pipeline.heading, images=images, invisible=invisible,
             windowed=windowed, target=pipeline.target_word,
         ).encode())
     return Export(
-        str(folder), tables.images, tables.invisible, written, len(digests) - written, damaged,
-        size, len(tables.cameras), time.perf_counter() - started,
+        str(folder), images, invisible, written, len(digests) - written, damaged, size,
+        len(cameras), time.perf_counter() - started,
     )
 
 
@@ -268,8 +267,7 @@ def _remove_changed(folder: Path) -> int:
     return count
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
+class _Part(NamedTuple):
     """What became of a run of scenes: its images' paths and digests, counts, and bytes."""
 
     digests: dict[str, str]

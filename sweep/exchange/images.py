@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 import pandas as pd
 import xarray as xr
+import yaml
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LABELS, VARIABLES, Variable
+from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.polygon import signed_areas
@@ -149,22 +150,18 @@ class FileCamera:
         fx, fy, cx, cy = self.view
         matrices = {
             "camera_matrix": (3, self.matrix),
-            "distortion_coefficients": (1, self.distortion),
+            "distortion_coefficients": (1, list(self.distortion)),
             "rectification_matrix": (3, np.eye(3).ravel().tolist()),
             "projection_matrix": (
                 3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
             ),
         }
-        return "\n".join([
-            f"image_width: {self.width_px}", f"image_height: {self.height_px}",
-            f"camera_name: {name}",
-            f"distortion_model: {MODELS.get(len(self.distortion), 'rational_polynomial')}",
-            *(
-                f"{key}:\n  rows: {rows}\n  cols: {len(values) // rows}\n  data: "
-                f"[{', '.join(repr(float(value)) for value in values)}]"
-                for key, (rows, values) in matrices.items()
-            ), "",
-        ])
+        return str(yaml.safe_dump({
+            "image_width": self.width_px, "image_height": self.height_px, "camera_name": name,
+            "distortion_model": MODELS.get(len(self.distortion), "rational_polynomial"),
+            **{key: {"rows": rows, "cols": len(values) // rows, "data": values}
+               for key, (rows, values) in matrices.items()},
+        }, sort_keys=False, default_flow_style=None))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -180,129 +177,112 @@ POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Columns of the rotation vector in rad and of the position in m."""
 
 
-@dataclass(slots=True)
-class TruthTables:
-    """Tables of the truth of an export's images.
+def write_truth(
+    pipeline: Pipeline, folder: Path, *, windowed: bool
+) -> tuple[dict[FileCamera, str], int, int]:
+    """Write ``truth.csv``, ``truth_coco.json`` and ``truth.nc`` of an export's images.
 
-    Attributes
-    ----------
-    pipeline, windowed
-        What is exported.
-    cameras
-        Camera -> its name, in order of appearance.
-    images, invisible
-        Scenes with an image, and those without.
+    Of targets with a chessboard ``truth_chessboard.csv``, too.
+
+    Returns
+    -------
+    The cameras' names, in order of appearance; the number of scenes with an image, and of those
+    without.
     """
-
-    pipeline: Pipeline
-    windowed: bool
-    cameras: dict[FileCamera, str] = field(default_factory=dict)
-    images: int = 0
-    invisible: int = 0
-
-    def write(self, folder: Path) -> None:
-        """Write ``truth.csv``, ``truth_coco.json`` and ``truth.nc`` into a folder.
-
-        Of targets with a chessboard ``truth_chessboard.csv``, too.
-        """
-        drawn = self.pipeline.experiment.drawn
-        columns: dict[str, list[Any]] = {}
-        tables: list[pd.DataFrame] = []
-        chessboards: list[pd.DataFrame] = []
-        for batch in image_batches(self.pipeline, windowed=self.windowed):
-            scenes, targets = batch.scenes, batch.targets
-            drawn_values = batch.values  # noqa: PD011  (of scenes, not of a table)
-            of_batch: dict[str, Any] = {
-                **{name: function(scenes) for name, function in GEOMETRY.items()},
-                "marker_area_px": target_areas_px(scenes, targets),
-                "image": np.where(
-                    batch.visible, [f"{name}.png" for name in batch.names], "").astype(object),
-                "true_corners_px": (
-                    targets.corners_px[:, 0] if targets.targets.are_markers else targets.corners_px
-                ),
-                **{each.name: drawn_values[each.drawn_as].broadcast(len(batch))
-                   for each in drawn},
-            }
-            for name, values in of_batch.items():
-                columns.setdefault(name, []).append(values)
-            of_images = self._of_images(batch, of_batch)
-            tables.append(_of_squares(batch, of_images))
-            chessboards.append(_of_chessboards(batch, of_images))
-        table = pd.concat(tables, ignore_index=True)
-        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-        self.images = int((whole["image"] != "").sum())
-        self.invisible = len(whole["image"]) - self.images
-        write_whole(folder / "truth.csv", _csv(table))
-        if len(chessboard := pd.concat(chessboards, ignore_index=True)):
-            write_whole(folder / "truth_chessboard.csv", _csv(chessboard))
-        write_whole(folder / "truth_coco.json", _coco(table).encode())
-        dataset = self._dataset(whole, drawn)
-        write_whole(folder / "truth.nc", bytes(dataset.to_netcdf(engine="scipy")))
-
-    def _of_images(self, batch: ImageBatch, variables: dict[str, Any]) -> pd.DataFrame:
-        """Return a row an image of a batch with these variables, and note its cameras."""
-        scenes, axes = batch.scenes, self.pipeline.experiment.scene_axes
-        first, last = batch.windows[:, :2], batch.windows[:, 2:]
-        view = scenes.cameras.view
-        cameras = [
-            self.cameras.setdefault(FileCamera.of(scenes, row), f"camera-{len(self.cameras)}")
-            if visible else "" for row, visible in enumerate(batch.visible.tolist())
-        ]
-        pose = np.column_stack([variables["true_rvec"], scenes.translation, scenes.size_m])
-        table = pd.DataFrame({
-            "image": variables["image"],
-            **dict(zip((*POSE, "size_m"), pose.T, strict=True)),
-            **dict(zip(("width_px", "height_px"), (last - first).T, strict=True)),
-            **dict(zip(("origin_x_px", "origin_y_px"), first.T, strict=True)),
-            **dict(zip(("fx_px", "fy_px"), view[:, :2].T, strict=True)),
-            **dict(zip(("cx_px", "cy_px"), (view[:, 2:] - first).T, strict=True)),
-            "camera": cameras, "marker_area_px": variables["marker_area_px"],
-        })
-        indices = self.pipeline.experiment.all_scenes.indices(batch.numbers)
-        for axis, along in zip(axes, indices, strict=True):
-            for name, values in axis.columns.items():
-                if name not in (*table, "marker_id", "dictionary"):
-                    labels = [label(v) if isinstance(v, tuple) else v for v in values]
-                    table[name] = [labels[k] for k in along.tolist()]
-        for each in self.pipeline.experiment.drawn:
-            if each.name not in table:
-                table[each.name] = variables[each.name]
-        return table
-
-    def _dataset(
-        self, columns: dict[str, NDArray[Any]], drawn: Sequence[Variable]
-    ) -> xr.Dataset:
-        """Return the truth over the experiment's scene axes."""
-        axes = self.pipeline.experiment.scene_axes
-        dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
-        drawn_names = {each.name for each in drawn}
-        described = {name: VARIABLES[name] for name in (*GEOMETRY, "marker_area_px")} | {
-            each.name: each for each in drawn}
-        inner = {name: each.inner for name, each in described.items() if name not in drawn_names}
-        inner["true_corners_px"] = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
-        attributes = {name: each.attributes() for name, each in described.items()} | {
-            "true_corners_px": {
-                "long_name": "true corners in the frame; pixel (0, 0) is the centre of the top "
-                "left pixel", "units": "px"},
-            "image": {"long_name": "name of the image; empty where the target is not visible"},
+    columns: dict[str, list[Any]] = {}
+    cameras: dict[FileCamera, str] = {}
+    tables: list[pd.DataFrame] = []
+    chessboards: list[pd.DataFrame] = []
+    for batch in image_batches(pipeline, windowed=windowed):
+        scenes, targets = batch.scenes, batch.targets
+        drawn_values = batch.values  # noqa: PD011  (of scenes, not of a table)
+        of_batch: dict[str, Any] = {
+            **{name: function(scenes) for name, function in GEOMETRY.items()},
+            "marker_area_px": target_areas_px(scenes, targets),
+            "image": np.where(
+                batch.visible, [f"{name}.png" for name in batch.names], "").astype(object),
+            "true_corners_px": (
+                targets.corners_px[:, 0] if targets.targets.are_markers else targets.corners_px
+            ),
+            **{each.name: drawn_values[each.drawn_as].broadcast(len(batch))
+               for each in pipeline.experiment.drawn},
         }
-        variables: dict[str, Any] = {
-            name: (
-                dims + inner.get(name, ()), values.reshape(shape + values.shape[1:]),
-                attributes[name],
-            )
-            for name, values in columns.items()
-        }
-        coordinates: dict[str, Any] = {
-            each.path: (each.dimensions, _plain(each.values), each.attributes)
-            for each in planned_arrays(self.pipeline, shape)
-            if each.values is not None  # noqa: PD011  (of an array that is planned)
-            and {*each.dimensions} <= {*dims, "corner", "xy", "xyz"}
-        } | {name: variables.pop(name) for name in drawn_names}
-        return xr.Dataset(
-            variables, coordinates,
-            {"title": self.pipeline.heading, "pipeline": self.pipeline.text},
-        )
+        for name, values in of_batch.items():
+            columns.setdefault(name, []).append(values)
+        of_images = _of_images(pipeline, batch, of_batch, cameras)
+        tables.append(_of_squares(batch, of_images))
+        chessboards.append(_of_chessboards(batch, of_images))
+    table, chessboard = (pd.concat(parts, ignore_index=True) for parts in (tables, chessboards))
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    write_whole(folder / "truth.csv", _csv(table))
+    if len(chessboard):
+        write_whole(folder / "truth_chessboard.csv", _csv(chessboard))
+    write_whole(folder / "truth_coco.json", json.dumps(_coco(table)).encode())
+    write_whole(folder / "truth.nc", bytes(_dataset(pipeline, whole).to_netcdf(engine="scipy")))
+    images = int((whole["image"] != "").sum())
+    return cameras, images, len(whole["image"]) - images
+
+
+def _of_images(
+    pipeline: Pipeline, batch: ImageBatch, variables: dict[str, Any], cameras: dict[FileCamera, str]
+) -> pd.DataFrame:
+    """Return a row an image of a batch with these variables, and note its cameras."""
+    scenes, experiment = batch.scenes, pipeline.experiment
+    first, last = batch.windows[:, :2], batch.windows[:, 2:]
+    view = scenes.cameras.view
+    names = [
+        cameras.setdefault(FileCamera.of(scenes, row), f"camera-{len(cameras)}") if visible else ""
+        for row, visible in enumerate(batch.visible.tolist())
+    ]
+    pose = np.column_stack([variables["true_rvec"], scenes.translation, scenes.size_m])
+    table = pd.DataFrame({
+        "image": variables["image"],
+        **dict(zip((*POSE, "size_m"), pose.T, strict=True)),
+        **dict(zip(("width_px", "height_px"), (last - first).T, strict=True)),
+        **dict(zip(("origin_x_px", "origin_y_px"), first.T, strict=True)),
+        **dict(zip(("fx_px", "fy_px"), view[:, :2].T, strict=True)),
+        **dict(zip(("cx_px", "cy_px"), (view[:, 2:] - first).T, strict=True)),
+        "camera": names, "marker_area_px": variables["marker_area_px"],
+    })
+    indices = experiment.all_scenes.indices(batch.numbers)
+    for axis, along in zip(experiment.scene_axes, indices, strict=True):
+        for name, values in axis.columns.items():
+            if name not in (*table, "marker_id", "dictionary"):
+                labels = [label(v) if isinstance(v, tuple) else v for v in values]
+                table[name] = [labels[k] for k in along.tolist()]
+    for each in experiment.drawn:
+        if each.name not in table:
+            table[each.name] = variables[each.name]
+    return table
+
+
+def _dataset(pipeline: Pipeline, columns: dict[str, NDArray[Any]]) -> xr.Dataset:
+    """Return the truth over the experiment's scene axes."""
+    axes = pipeline.experiment.scene_axes
+    dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
+    drawn = {each.name: each for each in pipeline.experiment.drawn}
+    described = {name: VARIABLES[name] for name in (*GEOMETRY, "marker_area_px")}
+    inner = {name: each.inner for name, each in described.items()}
+    inner["true_corners_px"] = ("marker", "corner", "xy")[-columns["true_corners_px"].ndim + 1:]
+    attributes = {name: each.attributes() for name, each in (described | drawn).items()} | {
+        "true_corners_px": {
+            "long_name": "true corners in the frame; pixel (0, 0) is the centre of the top "
+            "left pixel", "units": "px"},
+        "image": {"long_name": "name of the image; empty where the target is not visible"},
+    }
+    variables: dict[str, Any] = {
+        name: (dims + inner.get(name, ()), values.reshape(shape + values.shape[1:]),
+               attributes[name])
+        for name, values in columns.items()
+    }
+    coordinates: dict[str, Any] = {
+        each.path: (each.dimensions, _plain(each.values), each.attributes)
+        for each in planned_arrays(pipeline, shape)
+        if each.values is not None  # noqa: PD011  (of an array that is planned)
+        and {*each.dimensions} <= {*dims, "corner", "xy", "xyz"}
+    } | {name: variables.pop(name) for name in drawn}
+    return xr.Dataset(
+        variables, coordinates, {"title": pipeline.heading, "pipeline": pipeline.text})
 
 
 def _plain(values: Any) -> Any:
@@ -362,48 +342,43 @@ COCO_INFO = {
 """What the COCO-like file says of itself."""
 
 
-def _coco(table: pd.DataFrame) -> str:
+def _coco(table: pd.DataFrame) -> dict[str, Any]:
     """Return rows of truth.csv as COCO keypoints; a category is a dictionary's marker."""
-    records = table.to_dict("records")
-    markers = [(row["dictionary"], row["id"]) for row in records]
-    categories = {marker: number for number, marker in enumerate(dict.fromkeys(markers), 1)}
-    images = {row["image"]: row for row in records}
-    numbers = {name: number for number, name in enumerate(images)}
-    content = {
+    images = table.drop_duplicates("image")
+    markers = table.drop_duplicates(["dictionary", "id"])
+    image_of = dict(zip(images["image"], range(len(images)), strict=True))
+    category_of = {each: number for number, each in enumerate(
+        zip(markers["dictionary"], markers["id"], strict=True), 1)}
+    points = table[list(CORNERS)].to_numpy().reshape(-1, 4, 2)
+    size = table[["width_px", "height_px"]].to_numpy()[:, None]
+    seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=2) & (
+        table[["visible"]].to_numpy() > 0)
+    boxes = np.concatenate([points.min(axis=1), np.ptp(points, axis=1)], axis=1)
+    pose = table[list(POSE)].to_numpy()
+    return {
         "info": COCO_INFO,
         "images": [
-            {"id": numbers[name], "file_name": f"images/{name}", "width": row["width_px"],
-             "height": row["height_px"]}
-            for name, row in images.items()
+            {"id": image_of[name], "file_name": f"images/{name}", "width": width, "height": height}
+            for name, width, height in images[["image", "width_px", "height_px"]].itertuples(
+                index=False)
         ],
         "annotations": [
-            _coco_annotation(row, number, numbers[row["image"]], categories[marker])
-            for number, (row, marker) in enumerate(zip(records, markers, strict=True))
+            {"id": k, "image_id": image_of[name], "category_id": category_of[dictionary, marker],
+             "iscrowd": 0, "bbox": boxes[k].tolist(), "area": area,
+             "segmentation": [points[k].ravel().tolist()],
+             # COCO's 2: visible.
+             "keypoints": np.column_stack([points[k], 2 * seen[k]]).ravel().tolist(),
+             "num_keypoints": int(seen[k].sum()),
+             "rvec": pose[k, :3].tolist(), "tvec_m": pose[k, 3:].tolist()}
+            for k, (name, dictionary, marker, area) in enumerate(zip(
+                table["image"], table["dictionary"], table["id"],
+                np.abs(signed_areas(points)).tolist(), strict=True))
         ],
         "categories": [
             {"id": number, "name": f"{dictionary} {marker}", "supercategory": dictionary,
              "marker_id": marker, "keypoints": list(LABELS["corner"])}
-            for (dictionary, marker), number in categories.items()
+            for (dictionary, marker), number in category_of.items()
         ],
-    }
-    return json.dumps(content)
-
-
-def _coco_annotation(
-    row: dict[Any, Any], number: int, image: int, category: int
-) -> dict[str, Any]:
-    points = np.array([row[name] for name in CORNERS]).reshape(4, 2)
-    size = np.array([row["width_px"], row["height_px"]])
-    least, extent = points.min(axis=0), np.ptp(points, axis=0)
-    seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=1) & bool(row["visible"])
-    flat = points.ravel().tolist()
-    return {
-        "id": number, "image_id": image, "category_id": category, "iscrowd": 0,
-        "bbox": [*least.tolist(), *extent.tolist()],
-        "area": float(abs(signed_areas(points[None])[0])), "segmentation": [flat],
-        "keypoints": np.column_stack([points, 2 * seen]).ravel().tolist(),  # COCO's 2: visible
-        "num_keypoints": int(seen.sum()),
-        "rvec": [row[name] for name in POSE[:3]], "tvec_m": [row[name] for name in POSE[3:]],
     }
 
 

@@ -5,7 +5,6 @@ import pytest
 
 import sweep
 from support.blocks import run_cells
-from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -120,27 +119,3 @@ def test_a_believed_focal_scale_scales_the_distance_of_a_frontal_marker():
     columns = run_cells(chosen, []).columns["translation_error_m"]
     z = 0.5 + np.array([column[0, 2] for column in columns])
     np.testing.assert_allclose(z / z[1], scales, rtol=1e-6)  # errors are float32
-
-
-# What is refused and what is told.
-
-@pytest.mark.parametrize(("camera", "estimator", "line"), [
-    ({}, {"believed": "calibration"}, "give calibration_sd under [camera] (or a camera_file)"),
-    ({"calibration_sd": SD}, {"believed": "calibration", "believed_fx_px": 600},
-     "believed_fx_px = 600: expected no other belief about the camera beside believed"),
-    ({"calibration_sd": [1, 1]}, {}, "calibration_sd = [1, 1]: expected a list of 0, 4, 8, 9"),
-    ({"calibration_sd": [1] * 8}, {}, "expected 4 numbers, of fx, fy, cx and cy, or 9"),
-    ({"calibration_sd": SD, "distortion": []}, {}, "distortion is empty"),
-    ({"calibration_sd": [-1, 1, 1, 1]}, {}, "expected standard deviations of at least 0"),
-    ({"calibration_sd": SD, "calibration_covariance": np.eye(9).ravel().tolist()}, {},
-     "expected calibration_sd or calibration_covariance, not both"),
-    ({"calibration_covariance": [1, 2, 0, 0, 2, 1, *[0] * 10]}, {}, "no correlation beyond 1"),
-    ({"calibration_covariance": [1, 0.5, 0, 0, 0, 1, *[0] * 10]}, {}, "expected a symmetric"),
-    ({}, {"believed_focal_scale": 1.01, "believed_fx_px": 600},
-     "believed_fx_px = 600: expected believed_focal_scale or believed_fx_px, not both"),
-])
-def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line):
-    with pytest.raises(PipelineError) as refused:
-        pipeline(camera, {"solver": "ippe", **estimator}, 1)
-    (told,) = str(refused.value).split("\n")
-    assert line in told

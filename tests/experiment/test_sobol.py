@@ -1,11 +1,9 @@
 """Draws that are Sobol' points, scrambled."""
 
 import numpy as np
-import pytest
 from scipy import stats
 
 import sweep
-from sweep.errors import PipelineError
 from sweep.experiment.draws import (
     BITS,
     REPLICATES,
@@ -103,17 +101,6 @@ def test_replicates_are_independent():
     ]
     assert abs(np.corrcoef(*means)[0, 1]) < 0.08
     assert means[0].var() < 1 / 12 / 4 / 3
-
-
-@pytest.mark.parametrize(("settings", "sections", "line"), [
-    (["trial=40"], {}, "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),
-    (["sampling=halton"], {}, 'sampling = "halton": expected one of independent, sobol'),
-])
-def test_what_cannot_be_sampled_evenly_is_one_line(settings, sections, line):
-    with pytest.raises(PipelineError) as refusal:
-        pipeline(*settings, **sections)
-    assert str(refusal.value).removeprefix("pipeline: ").startswith(line)
-    assert "\n" not in str(refusal.value)
 
 
 def test_sampling_is_part_of_what_stores_must_share():

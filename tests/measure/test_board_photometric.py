@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from support.blocks import run_cells
-from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, EstimateStatus
 from sweep.measure.photometric import Photometric
@@ -85,9 +84,3 @@ def test_board_with_a_wrong_marker_is_solved_from_the_others(monkeypatch):
     columns, relative = computed(GRID, 2)
     assert (columns["estimate"] == EstimateStatus.solved).all()
     assert np.abs(relative).max() < 6
-
-
-def test_points_have_no_meaning_beside_all_pixels():
-    for setting in ('points="each_marker"', 'refine="vvs"'):
-        with pytest.raises(PipelineError, match="beside solver = photometric"):
-            computed(GRID, 1, setting)

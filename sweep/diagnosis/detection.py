@@ -111,26 +111,22 @@ class DetectionModel:
             the simulation has too few poses.
         """
         rvec, tvec = (np.atleast_2d(np.asarray(each, dtype=np.float64)) for each in (rvec, tvec_m))
-        frame, at = _conditions(rvec, tvec, self.focal_size_px_m)
+        turn, at = frames(rvec, tvec), _conditions(rvec, tvec, self.focal_size_px_m)
         basis = hat_basis(at, [self.side_knots, self.angle_knots])
-        knots = np.stack([(each[0], each[-1]) for each in (self.side_knots, self.angle_knots)])
-        known = ((knots[:, 0] <= at) & (at <= knots[:, 1])).all(axis=1)
+        first, last = ([self.side_knots[k], self.angle_knots[k]] for k in (0, -1))
+        known = ((at >= first) & (at <= last)).all(axis=1)
         known &= bearing_of(tvec) <= self.max_bearing_deg
         known &= ((basis > 0) <= (self.poses >= MIN_AT_KNOT)).all(axis=1)
-        turn = np.zeros((len(tvec), 6, 6))
-        turn[:, :3, :3] = frame * np.linalg.norm(tvec, axis=1)[:, None, None]
-        turn[:, 3:, 3:] = frame
         covariance = turn @ _of_symmetric(
             np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
-        bias += self.shift * np.repeat([tvec[:, 2], np.ones(len(tvec))], 3, axis=0).T
+        bias += self.shift * _lengths(tvec[:, 2])
         middle = math.exp(float(np.median(self.ambiguity_knots)))
         ratio = np.broadcast_to(
             np.asarray(middle if ambiguity is None else ambiguity, dtype=np.float64), len(tvec))
         odds = _flip_basis(at, ratio, self.flip_knots) @ self.flips
-        unknown = ~known
         for values in (covariance, bias, odds):
-            values[unknown] = np.nan
+            values[~known] = np.nan
         return xr.Dataset({
             "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
             "bias": (("pose", "row"), bias, {"units": "m, radian"}),
@@ -167,8 +163,9 @@ def error_model(
         A simulation of one detector setting and one solver, with drawn poses: its path, or results
         of `open`, of which one setting was chosen with ``.isel``.
     photographs
-        A store of `photos` with the same setting and solver, or its results: the covariance is
-        multiplied by a factor, so that it describes their errors. Judge it on others.
+        A store of `photos` with the same setting and solver, or its results: six factors along and
+        about the line of sight, the tilt and across widen the covariance, so that it describes
+        their errors. Judge it on others.
 
     Returns
     -------
@@ -200,31 +197,22 @@ def error_model(
 
 
 def _opened(store: xr.Dataset | str | os.PathLike[str]) -> xr.Dataset:
-    return store if isinstance(store, xr.Dataset) else open_dataset(os.fspath(store))
+    return store if isinstance(store, xr.Dataset) else open_dataset(store)
 
 
 def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
-    """Return a model whose covariance times a factor describes the errors in photographs."""
-    found = judged(model, photographs)
-    used = np.isfinite(found["squared_error"].values)
-    if used.sum() < MIN_PHOTOGRAPHED:
-        raise DatasetError(
-            f"{used.sum()} solved poses of photographs that are not flipped and that the "
-            f"simulation knows: a factor needs {MIN_PHOTOGRAPHED} or more; take more photographs, "
-            "or simulate their poses (`sweep.twins`)")
-    error, covariance, deviations = (
-        found[name].values[used] for name in ("error", "covariance", "truth_std"))
-    factor = 1.0
+    """Return a model whose covariance times six factors describes the errors in photographs."""
     for _ in range(ROUNDS):  # the truth's own errors are not multiplied
-        factor *= float(squared_errors(error, factor * covariance, deviations).mean()) / 6.0
-    return dataclasses.replace(
-        model, log_covariance=model.log_covariance + math.log(factor) * np.eye(6))
-
-
-def squared_errors(errors: Floats, covariance: Floats, deviations: Floats) -> Floats:
-    """Return squares (n,) of errors (n, 6) in units of a covariance and of the truth's own one."""
-    both = covariance + np.eye(6) * deviations[:, None, :] ** 2
-    return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(both), errors))
+        whitened = judged(model, photographs)["whitened"].values
+        squares = whitened[np.isfinite(whitened[:, 0])] ** 2
+        if len(squares) < MIN_PHOTOGRAPHED:
+            raise DatasetError(
+                f"{len(squares)} solved poses of photographs that are not flipped and that the "
+                f"simulation knows: factors need {MIN_PHOTOGRAPHED} or more; take more "
+                "photographs, or simulate their poses (`sweep.twins`)")
+        model = dataclasses.replace(model, log_covariance=_stretched(
+            model.log_covariance, np.diag(squares.mean(axis=0))))
+    return model
 
 
 def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
@@ -233,22 +221,27 @@ def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        As `DetectionModel.at`, and ``error`` (pose, row): estimated minus true, less the bias;
-        ``truth_std`` (pose, row), 0 where it is not known; ``flipped``; ``squared_error``: the
-        error's square in units of both covariances, 6 on average where these are right, NaN of
-        flipped poses and where nothing is known.
+        As `DetectionModel.at`, and ``rvec``, ``tvec_m`` (pose, xyz): the estimates; ``error``
+        (pose, row): estimated minus true, less the bias; ``truth_std`` (pose, row), 0 where it is
+        not known; ``flipped``; ``whitened`` (pose, row): errors in the frame of `frames`, divided
+        by the root of the sum of both covariances, uncorrelated with variance 1 where these are
+        right, NaN of flipped poses and where nothing is known; ``squared_error``: the sum of their
+        squares, 6 on average.
     """
     errors, rvec, tvec, ratio, flipped, deviations = estimated(results)
     found = model.at(rvec, tvec, ratio)
-    lengths = np.linalg.norm(tvec, axis=1)
-    left = errors * np.repeat([lengths, np.ones(len(tvec))], 3, axis=0).T - found["bias"].values
-    squares = np.full(len(left), np.nan)
+    errors = errors - found["bias"].values
+    whitened = np.full(errors.shape, np.nan)
     used = found["known"].values & ~flipped
-    squares[used] = squared_errors(
-        left[used], found["covariance"].values[used], deviations[used])
+    back = np.linalg.inv(frames(rvec, tvec)[used])
+    both = found["covariance"].values[used] + np.eye(6) * deviations[used, None] ** 2
+    whitened[used] = _whitened(
+        np.einsum("nij,nj->ni", back, errors[used]), back @ both @ back.transpose(0, 2, 1))
     return found.assign(
-        error=(("pose", "row"), left), truth_std=(("pose", "row"), deviations),
-        flipped=("pose", flipped), squared_error=("pose", squares))
+        rvec=(("pose", "xyz"), rvec), tvec_m=(("pose", "xyz"), tvec), flipped=("pose", flipped),
+        error=(("pose", "row"), errors), truth_std=(("pose", "row"), deviations),
+        whitened=(("pose", "row"), whitened),
+        squared_error=("pose", (whitened**2).sum(axis=1)))
 
 
 def of_simulation(results: xr.Dataset) -> DetectionModel:
@@ -258,21 +251,19 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
         raise DatasetError(f"{len(tvec):,} solved poses; a model of one detection needs "
                            f"{MIN_POSES:,} or more: more trials")
     focal_size = float(focal_size_of(results).mean())
-    frame, at = _conditions(rvec, tvec, focal_size)
-    right = ~flipped
-    slant = tvec[:, 2] / np.linalg.norm(tvec, axis=1)
-    per_z = np.repeat([slant, np.ones(len(tvec))], 3, axis=0).T
+    at = _conditions(rvec, tvec, focal_size)
     # Across the line of sight, where errors are small: those along it would hide the shift.
     across = sight_rotation(tvec).transpose(0, 2, 1)[:, :2]
-    moved = np.linalg.solve(across[:, :, :2] * slant[:, None, None],
+    moved = np.linalg.solve(across[:, :, :2] * tvec[:, 2, None, None],
                             across @ errors[:, :3, None])[..., 0]
     shift = np.zeros(6)
-    shift[[0, 1, 3, 4]] = np.median(np.concatenate([moved, errors[:, 3:5]], axis=1)[right], axis=0)
-    errors -= shift * per_z
-    errors = np.einsum("nji,nkj->nki", frame, errors.reshape(-1, 2, 3)).reshape(-1, 6)
+    shift[[0, 1, 3, 4]] = np.median(
+        np.concatenate([moved, errors[:, 3:5]], axis=1)[~flipped], axis=0)
     side, angle = (np.quantile(at[:, k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
     angle[0] = 0.0 if angle[0] < FRONTAL_DEG else angle[0]
-    basis, errors = hat_basis(at[right], [side, angle]), errors[right]
+    errors = errors - shift * _lengths(tvec[:, 2])
+    errors = np.einsum("nij,nj->ni", np.linalg.inv(frames(rvec, tvec)), errors)[~flipped]
+    basis = hat_basis(at[~flipped], [side, angle])
     poses = basis.sum(axis=0)
 
     def means(values: Floats) -> Floats:
@@ -288,20 +279,19 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
             np.linalg.solve((basis.T / sd**2) @ basis + np.eye(len(poses)) * (1e-3 / sd**2).mean(),
                             (basis.T / sd**2) @ error)
             for error, sd in zip(errors.T, spread.T, strict=True)], axis=-1)
-        whitened = np.einsum("nij,nj->ni", _of_symmetric(
-            -0.5 * np.einsum("nk,kij->nij", basis, log_covariance), np.exp), errors - basis @ bias)
-        root = _of_symmetric(0.5 * log_covariance, np.exp)
-        log_covariance = _of_symmetric(
-            root @ means(whitened[:, :, None] * whitened[:, None, :]) @ root, np.log)
+        whitened = _whitened(errors - basis @ bias, _of_symmetric(
+            np.einsum("nk,kij->nij", basis, log_covariance), np.exp))
+        log_covariance = _stretched(
+            log_covariance, means(whitened[:, :, None] * whitened[:, None, :]))
     # Inverses of covariances of n poses are too large by n / (n - 7) on average (Anderson, "An
     # introduction to multivariate statistical analysis", 2003, section 7.7), and the means' errors
     # add 1 / n. Heavy tails are worth fewer normal poses: n over Mardia's kurtosis / 48.
     tails = max(float(((whitened**2).sum(axis=1) ** 2).mean()) / 48.0, 1.0)
     wider = np.log((poses + tails) / np.maximum(poses - 7.0 * tails, 0.5 * poses + 1.0))
-    log_covariance = log_covariance + wider[:, None, None] * np.eye(6)
     ambiguity = np.quantile(np.log(ratio[ratio > 0]), AMBIGUITY_SHARES)
     model = DetectionModel(
-        focal_size, side, angle, ambiguity, shift, bias, log_covariance, poses, np.zeros(0),
+        focal_size, side, angle, ambiguity, shift, bias,
+        log_covariance + wider[:, None, None] * np.eye(6), poses, np.zeros(0),
         float(bearing_of(tvec).max()))
     return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
 
@@ -309,56 +299,75 @@ def of_simulation(results: xr.Dataset) -> DetectionModel:
 def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks, Floats]:
     """Return errors (n, 6) of solved poses, estimates, ambiguity, flips, and errors of the truth.
 
-    Errors are along and about the camera's axes, those of positions over the estimated range; the
-    truth's standard deviations (n, 6), in metres and radians, are 0 where they are not known.
+    Errors are along and about the camera's axes, in metres and radians; the truth's standard
+    deviations (n, 6) are 0 where they are not known.
 
     Raises
     ------
     DatasetError
         If there are several settings or solvers, or other variables are missing.
     """
-    names = ("true_rvec", "true_tvec_m", "rotation_error_rad", "translation_error_m",
-             "reprojection_error_px", "alternative_reprojection_error_px", "flipped", "estimate")
+    vectors = ("true_rvec", "true_tvec_m", "rotation_error_rad", "translation_error_m")
+    numbers = ("reprojection_error_px", "alternative_reprojection_error_px", "flipped")
+    names = [*vectors, *numbers, "estimate"]
     if missing := [name for name in names if name not in results]:
         raise DatasetError(f"no variable {missing[0]}: expected a run that solves poses")
-    scene = results["true_tvec_m"].dims
-    if several := [f"{name} ({results.sizes[name]})" for name in results["estimate"].dims
+    scene, dims = results["true_tvec_m"].dims, results["estimate"].dims
+    if several := [f"{name} ({results.sizes[name]})" for name in dims
                    if name not in scene and results.sizes[name] > 1]:
-        raise DatasetError(f"several settings: {', '.join(map(str, several))}: choose one with "
+        raise DatasetError(f"several settings: {', '.join(several)}: choose one with "
                            "results.isel(...)")
-    one = {dim: 0 for dim in results["estimate"].dims if dim not in scene}
-    poses = [dim for dim in scene if dim != "xyz"]
-    own = ["truth_std"] if "truth_std" in results else []
-    table = results[[*names, *own]].isel(one, drop=True).load().stack(
-        pose=poses, create_index=False)
-    used = (table["estimate"] == EstimateStatus.solved).values
-    deviations = np.zeros((used.sum(), 6))
-    if own:  # rotation, then position
-        stored = np.nan_to_num(table["truth_std"].transpose("pose", ...).values[used])
-        deviations = stored[:, [3, 4, 5, 0, 1, 2]].astype(np.float64)
-    rvec, tvec, rotation, position = (
-        table[name].transpose("pose", "xyz").values[used].astype(np.float64) for name in names[:4])
-    chosen, other, flipped = (table[name].values[used] for name in names[4:7])
-    estimate = tvec + position
-    turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
-    errors = np.concatenate(
-        [position / np.linalg.norm(estimate, axis=1)[:, None], rotation], axis=1)
+    table = results[names + ["truth_std"] * ("truth_std" in results)].isel(
+        dict.fromkeys(set(dims) - set(scene), 0), drop=True).load().stack(
+        pose=[dim for dim in scene if dim != "xyz"], create_index=False).transpose("pose", ...)
+    table = table.isel(pose=(table["estimate"] == EstimateStatus.solved).values)
+    rvec, tvec, rotation, position = (table[name].values.astype(np.float64) for name in vectors)
+    chosen, other, flipped = (table[name].values for name in numbers)
+    deviations = np.zeros((len(tvec), 6))
+    if "truth_std" in table:  # rotation, then position
+        deviations[:] = np.nan_to_num(table["truth_std"].values[:, [3, 4, 5, 0, 1, 2]])
     known = np.isfinite(other) & (other > 0)  # a solver may return one solution alone
     ratio = np.divide(chosen, other, out=np.zeros(len(other)), where=known)
-    return errors, turned, estimate, ratio, flipped == Flipped.flipped, deviations
+    turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
+    return (np.concatenate([position, rotation], axis=1), turned, tvec + position, ratio,
+            flipped == Flipped.flipped, deviations)
 
 
-def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> tuple[Floats, Floats]:
-    """Return the frames (n, 3, 3) of estimates, and ln(side) and viewing angle (n, 2)."""
+def frames(rvec: Floats, tvec: Floats) -> Floats:
+    """Return what turns errors (6,) of estimates to the camera's axes, in m and rad (n, 6, 6).
+
+    They are of the position over the range and of the rotation, along and about x in the direction
+    in which the estimated marker is tilted, y across, z along the line of sight.
+    """
     sight = sight_rotation(tvec)
     normal = np.einsum("nji,nj->ni", sight, rotation_of_vector(rvec)[..., 2])
-    length = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-12)
-    cosine, sine = normal[:, 0] / length, normal[:, 1] / length
-    nothing, one = np.zeros_like(cosine), np.ones_like(cosine)
-    about = np.stack([np.stack(row, axis=-1) for row in (
-        (cosine, -sine, nothing), (sine, cosine, nothing), (nothing, nothing, one))], axis=-2)
-    return sight @ about, np.stack(
-        [np.log(focal_size / tvec[:, 2]), viewing_angle_of(rvec, tvec)], axis=-1)
+    azimuth = np.arctan2(normal[:, 1], normal[:, 0])
+    turn = np.zeros((len(tvec), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = sight @ rotation_of_vector(
+        np.outer(azimuth, [0.0, 0.0, 1.0]))
+    return np.asarray(turn * _lengths(np.linalg.norm(tvec, axis=1))[:, None])
+
+
+def _lengths(length: Floats) -> Floats:
+    """Return units (n, 6) of errors of which those of positions are relative to a length (n,)."""
+    return np.repeat([length, np.ones(len(length))], 3, axis=0).T
+
+
+def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> Floats:
+    """Return ln(side) and viewing angle (n, 2) of estimates."""
+    return np.stack([np.log(focal_size / tvec[:, 2]), viewing_angle_of(rvec, tvec)], axis=-1)
+
+
+def _whitened(errors: Floats, covariance: Floats) -> Floats:
+    """Return errors (n, m) divided by the root of their covariances."""
+    return np.asarray(np.einsum(
+        "nij,nj->ni", _of_symmetric(covariance, lambda values: values**-0.5), errors))
+
+
+def _stretched(logarithms: Floats, second_moments: Floats) -> Floats:
+    """Return logarithms of covariances with which whitened errors had these second moments."""
+    root = _of_symmetric(0.5 * logarithms, np.exp)
+    return _of_symmetric(root @ second_moments @ root, np.log)
 
 
 def _of_symmetric(matrices: Floats, function: Callable[[Floats], Floats]) -> Floats:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from sweep.diagnosis.causes import AGREE
 from sweep.diagnosis.inference import (
+    AGREE,
+    CAUSES,
     DECIDES,
     Explanation,
     Measurement,
-    Ranking,
-    measured,
     next_measurement,
     rank,
+    rivals,
 )
 from sweep.diagnosis.observations import (
     READABLE_PX,
@@ -93,101 +92,75 @@ def diagnose(
     rows = read_observations(
         observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
         zero_sd_m=zero_sd_m, compared=compared)
-    ranking = rank(rows)
+    ranked = rank(rows)
+    shown = [each for each in ranked[:SHOWN] if each.probability >= LEAST_SHARE] or ranked[:1]
     if figure is not None:
-        write_figure([residual_figure(rows, ranking)], figure)
-    return findings(rows, ranking)
-
-
-def findings(rows: Observations, ranking: Ranking) -> Findings:
-    """Return the answer of a ranking."""
-    first, rivals = ranking.explanations[0], ranking.rivals
-    measurement = next_measurement(rows, first, rivals[0]) if rivals else None
-    sentence = _sentence(rows, ranking, measurement)
-    shown = _shown(ranking)
+        write_figure([residual_figure(rows, shown)], figure)
+    first, open_ = ranked[0], rivals(ranked)
+    measurement = next_measurement(rows, first, open_[0]) if open_ else None
+    sentence = _sentence(rows, first, open_, measurement)
+    sizes = [size_of(each, rows) for each in shown]
     causes = Table.of(
         "Causes by posterior probability", ("cause", "probability", "misfit", "its size"),
-        [(name_of(each), number(share), number(_misfit(each)), size_of(each, rows))
-         for each, share in shown], words=True)
-    single = {cause.name: cause for each, _ in shown for cause in each.causes}
+        [(each.words("name"), number(each.probability), number(each.misfit[each.best]), size)
+         for each, size in zip(shown, sizes, strict=True)], words=True)
+    single = {cause.name: cause for each in shown for cause in each.causes}
     tests = Table.of(
         "What they mean, and the test that decides", ("cause", "meaning", "test"),
         [(cause.name, cause.title, cause.test) for cause in single.values()], words=True)
-    row, component, value = measured(rows)
+    row, component = rows.cells
+    value, components = rows.measured[rows.cells], [COMPONENTS[k] for k in component]
     predictions = Table.of(
         "What the tape should have read, m, if it is this cause",
-        ("row", "measured", "m", *(f"{k + 1}: {name_of(each)}"
-                                   for k, (each, _) in enumerate(shown))),
-        [(f"{row[k] + 1}", COMPONENTS[component[k]], f"{value[k]:.4f}",
-          *(f"{each.fitted[k]:.4f}" for each, _ in shown)) for k in range(len(row))], stub=2)
+        ("row", "measured", "m",
+         *(f"{k}: {each.words('name')}" for k, each in enumerate(shown, 1))),
+        [(f"{row[k] + 1}", components[k], f"{value[k]:.4f}",
+          *(f"{each.fitted[k]:.4f}" for each in shown)) for k in range(len(row))], stub=2)
+    missing = {cause.title: lack for cause in CAUSES if (lack := cause.lacks(rows))}
     numbers = {
-        "sentence": sentence, "decided": not rivals,
+        "sentence": sentence, "decided": not open_,
         "causes": [{
-            "causes": sorted(each.names) or [AGREE], "title": title_of(each),
-            "probability": float(share), "size": size_of(each, rows), "misfit": _misfit(each),
-            "test": _test(each), "predicted_m": each.fitted} for each, share in shown],
-        "cannot_tell": [name_of(each) for each in (first, *rivals)] if rivals else [],
+            "causes": sorted(each.names) or [AGREE], "title": each.words("title"),
+            "probability": each.probability, "size": size,
+            "misfit": float(each.misfit[each.best]), "test": each.words("test", "; "),
+            "predicted_m": each.fitted} for each, size in zip(shown, sizes, strict=True)],
+        "cannot_tell": [each.words("name") for each in (first, *open_)] if open_ else [],
         "measure_next": None if measurement is None else measurement._asdict(),
-        "measured_m": value, "row": row + 1, "component": [COMPONENTS[k] for k in component],
-        "notes": list(rows.notes),
-        "not_looked_for": ranking.missing,
+        "measured_m": value, "row": row + 1, "component": components,
+        "notes": list(rows.notes), "not_looked_for": missing,
     }
     lines = [f"note: {note}" for note in rows.notes]
-    if ranking.missing:
+    if missing:
         lines.append("not looked for: " + "; ".join(
-            f"{title} (needs {lack})" for title, lack in ranking.missing.items()))
+            f"{title} (needs {lack})" for title, lack in missing.items()))
     return Findings([causes, tests, predictions, *lines, sentence], numbers,
-                    status=UNDECIDED if rivals else 0)
-
-
-def name_of(each: Explanation) -> str:
-    """Return the names of an explanation's causes."""
-    return " and ".join(cause.name for cause in each.causes)
-
-
-def title_of(each: Explanation) -> str:
-    """Return an explanation in words."""
-    return " and ".join(cause.title for cause in each.causes)
+                    status=UNDECIDED if open_ else 0)
 
 
 def size_of(each: Explanation, rows: Observations) -> str:
     """Return how large the causes are, with one standard deviation."""
-    texts, first, k = [], 0, each.best
-    for cause, spread, ratio in zip(
-            each.causes, each.correction.spread[k], each.correction.ratio[k], strict=True):
-        width = cause.columns(rows, np.ones((1, 1, 3)), np.ones(1)).shape[-1]
-        for number_of_column in range(first, first + width):
-            mean = each.numbers[k, number_of_column]
-            sd = math.sqrt(each.covariance[k, number_of_column, number_of_column])
-            scale, unit = cause.unit
+    texts = []
+    numbers = zip(each.numbers, np.sqrt(np.diagonal(each.covariance)), strict=True)
+    for cause, way in zip(each.causes, each.way, strict=True):
+        (scale, unit), ratio, spread = cause.unit, way["ratio"][0], way["spread"][0]
+        for _, (mean, sd) in zip(cause.columns(rows, np.ones((1, 1, 3)), np.ones(1)), numbers,
+                                 strict=False):
             texts.append(f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
                          f"(± {100.0 * spread * sd:.2g} %)" if spread else
                          f"{scale * mean:+.3g} ± {scale * sd:.2g} {unit}")
-        first += width
-    label = each.correction.labels[k]
-    return "; ".join([*texts, *([label] if label else [])])
+    return "; ".join([*texts, *(label for way in each.way for label in way["label"] if label)])
 
 
-def _misfit(each: Explanation) -> float:
-    return float(each.misfit[each.best])
-
-
-def _test(each: Explanation) -> str:
-    return "; ".join(cause.test for cause in each.causes)
-
-
-def _shown(ranking: Ranking) -> list[tuple[Explanation, float]]:
-    pairs = list(zip(ranking.explanations, ranking.probability.tolist(), strict=True))
-    return [pair for pair in pairs[:SHOWN] if pair[1] >= LEAST_SHARE] or pairs[:1]
-
-
-def _sentence(rows: Observations, ranking: Ranking, measurement: Measurement | None) -> str:
+def _sentence(
+    rows: Observations, first: Explanation, open_: Sequence[Explanation],
+    measurement: Measurement | None,
+) -> str:
     """Return the answer in one sentence, with what to do."""
-    first, rivals = ranking.explanations[0], ranking.rivals
-    count = len(measured(rows)[0])
-    if (_misfit(first) - count) ** 2 > 2.0 * SURPRISING * count and _misfit(first) > count:
-        return (f"No known cause explains these rows: even {name_of(first)} misses them by "
-                f"{np.sqrt(_misfit(first) / count):.2g} standard deviations; look for a mistaken "
+    misfit, test = float(first.misfit[first.best]), first.words("test", "; ")
+    count = len(rows.cells[0])
+    if (misfit - count) ** 2 > 2.0 * SURPRISING * count and misfit > count:
+        return (f"No known cause explains these rows: even {first.words('name')} misses them by "
+                f"{np.sqrt(misfit / count):.2g} standard deviations; look for a mistaken "
                 "row, or state a larger tape_sd_m.")
     if not first.names and (rows.side_px < READABLE_PX).any():
         return ("What was said agrees with what was measured, but no detector reads so small a "
@@ -197,31 +170,31 @@ def _sentence(rows: Observations, ranking: Ranking, measurement: Measurement | N
                 "show.")
     if measurement is None:
         size = size_of(first, rows)
-        return f"It is {title_of(first)}{': ' + size if size else ''}. To be sure: {_test(first)}."
-    names = [name_of(first), *(name_of(each) for each in rivals)]
+        return f"It is {first.words('title')}{': ' + size if size else ''}. To be sure: {test}."
+    names = [first.words("name"), *(each.words("name") for each in open_)]
     confounded = {"size", "focal_length"} <= set(names) and not np.isfinite(
-        rows.position[:, :2]).any()
-    open_ = f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}: " + (
+        rows.measured[:, :2]).any()
+    between = f"Cannot tell between {', '.join(names[:-1])} and {names[-1]}: " + (
         "size and focal length are confounded, distances show their product alone; "
         if confounded else "")
     if measurement.difference < DECIDES:
-        return (f"{open_}no further row of this kind would decide (at best "
-                f"{measurement.difference:.1f} standard deviations); {_test(first)}.")
+        return (f"{between}no further row of this kind would decide (at best "
+                f"{measurement.difference:.1f} standard deviations); {test}.")
     what = {"distance": "the straight distance", "x": "x, to the right of the optical axis",
             "z": "z, along the optical axis"}[measurement.component]
-    return (f"{open_}measure {what} at {number(measurement.distance_m)} m, "
+    return (f"{between}measure {what} at {number(measurement.distance_m)} m, "
             f"{measurement.bearing_deg:.0f} degrees off the axis, where {names[0]} and {names[1]} "
-            f"differ by {measurement.difference:.1f} standard deviations; or {_test(first)}.")
+            f"differ by {measurement.difference:.1f} standard deviations; or {test}.")
 
 
-def residual_figure(rows: Observations, ranking: Ranking) -> Figure:
+def residual_figure(rows: Observations, shown: Sequence[Explanation]) -> Figure:
     """Return a figure of measured minus predicted, in standard deviations, by cause and value."""
-    _, _, value = measured(rows)
+    value = rows.measured[rows.cells]
     heading = Column("measured - predicted, standard deviations", "residual", level=0.0)
     table = Table.of("What each cause leaves unexplained", (
         "cause", "measured value, in the order of the rows", heading.heading), [
-        (name_of(each), k + 1, Value(float(residual)))
-        for each, _ in _shown(ranking) for k, residual in enumerate(
-            (value - each.fitted) / np.sqrt(each.predicted.variance[each.best]))], stub=2)
+        (each.words("name"), k + 1, Value(float(residual)))
+        for each in shown for k, residual in enumerate(
+            (value - each.fitted) / each.sd)], stub=2)
     return Figure("residuals", table.caption, "", table, [heading],
                   x=table.headings[1], by="cause")

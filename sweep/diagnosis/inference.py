@@ -1,32 +1,295 @@
-"""Posterior odds of causes: linear Gaussian evidence of each way in which a cause is undone."""
+"""Causes of wrong poses, how each is undone, and their posterior probabilities."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from sweep.diagnosis.causes import (
-    AGREE,
-    CAUSES,
-    FLIPS,
-    PAIRS_PRIOR,
-    STRAIGHT,
-    Cause,
-    Correction,
-    straight_differs,
+from sweep.diagnosis.observations import Observations, tape_sd
+from sweep.model.marker import module_count, overhang
+from sweep.typing import Floats
+
+# A cause is told by how it is undone: the true position is A t of the said position t, plus columns
+# times unknown numbers. In the tape's units every scale is then linear, and what the tape does not
+# know stays the tape's, however wrong the program is. A scale that may be anything is a row of
+# narrow ones, each linear about its middle.
+
+NAMED_SD = 0.01
+"""Relative standard deviation of a named ratio: by how much prints and rulers are off."""
+
+SMALL_SD, FREE_SD = 0.03, 0.35
+"""Standard deviations of ln(ratio): of a print or a calibration that is a little off, and of one
+that is wrong altogether."""
+
+STEP = 0.06
+"""Distance of the middles of ln(ratio) from one another."""
+
+FAR = np.arange(1.6, 3.7, 0.4)
+FAR_SD = 0.25
+"""Middles of ln(ratio) of sizes left at a default, and their spread."""
+
+INCH = 25.4
+UNITS = (10.0, 100.0, 1000.0, INCH, INCH / 10.0, 1.0 / 0.3048, 1000.0 / INCH)
+"""Ratios of units that are taken for one another: mm, cm, m; inch and mm, cm; foot, inch and m."""
+
+FOCAL_RATIOS = {
+    2.0: "calibrated at twice the resolution, or without binning",
+    0.5: "calibrated at half the resolution, or with binning",
+    1.5: "calibrated at 1.5 times the resolution (1920 for 1280)",
+    2 / 3: "calibrated at 2/3 of the resolution (1280 for 1920)",
+    4 / 3: "calibrated with 4/3 of the rows or columns (crop of 4:3)",
+    0.75: "calibrated with 3/4 of the rows or columns (crop of 4:3)",
+    3.0: "calibrated at 3 times the resolution (1920 for 640)",
+    1 / 3: "calibrated at 1/3 of the resolution (640 for 1920)",
+}
+
+
+Ways = NDArray[np.void]
+WAY = np.dtype([
+    ("log_weight", np.float64), ("matrix", np.float64, (3, 3)), ("ratio", np.float64),
+    ("spread", np.float64), ("square", np.float64), ("label", np.str_, 80)])
+"""A way in which a cause is undone: logarithm of its prior probability; said position to true one,
+at the middle of the prior; how many times too large what was said is, there; standard deviation of
+ln(ratio) about it, 0 if there is no ratio; how many times larger the square is in the image than
+f size / z of what was said; its name, empty if the ratio may be anything."""
+
+
+def ways_of(
+    matrix: Floats, label: Sequence[str] = ("",), weight: ArrayLike = 1.0,
+    ratio: ArrayLike = 1.0, spread: ArrayLike = 0.0, square: ArrayLike = 1.0,
+) -> Ways:
+    """Return the ways (c,) of one cause of matrices (c, 3, 3); a number stands for all of them."""
+    ways = np.zeros(len(matrix), WAY)
+    ways["matrix"], ways["ratio"], ways["spread"], ways["square"] = matrix, ratio, spread, square
+    ways["log_weight"] = np.log(weight)
+    ways["log_weight"] -= np.logaddexp.reduce(ways["log_weight"])
+    ways["label"][: len(label)] = label
+    return ways
+
+
+def undone(ways: Sequence[Ways]) -> Floats:
+    """Return said position to true one (c, 3, 3) by ways (c,) of several causes together."""
+    return functools.reduce(np.matmul, (each["matrix"] for each in ways))
+
+
+def _as_it_is(_: Observations) -> Ways:
+    return ways_of(np.eye(3)[None])
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One cause.
+
+    Attributes
+    ----------
+    name, title
+        Its name in JSON, and in words.
+    prior
+        Prior weight, relative to the others.
+    test
+        What would decide without another distance.
+    ways
+        How it is undone in these observations.
+    columns
+        True positions (c, n, 3) and the ways' spreads (c, 1, 1) -> what one standard deviation of
+        each unknown number adds to the positions, (c, n, 3) or what is broadcast to it.
+    lacks
+        What observations lack for it to be looked for, empty if nothing.
+    unit
+        Prior standard deviation of the columns' numbers in this unit, and the unit.
+    """
+
+    name: str
+    title: str
+    prior: float
+    test: str
+    ways: Callable[[Observations], Ways] = _as_it_is
+    columns: Callable[[Observations, Floats, Floats], Sequence[Floats]] = lambda *_: ()
+    lacks: Callable[[Observations], str] = lambda _: ""
+    unit: tuple[float, str] = (1.0, "")
+
+
+def ratios(
+    named: Mapping[float, str], share: float, axes: Sequence[float], far_share: float = 0.0
+) -> Ways:
+    """Return ways of a ratio: ``named`` ones, together ``share``, near 1, any, or far from 1.
+
+    The said positions are that many times too long along ``axes`` (3,), 1 or 0 each.
+    """
+    middles = np.arange(-24, 25) * STEP
+    density = np.exp(-0.5 * (middles / FREE_SD) ** 2)
+    far = np.concatenate([FAR, -FAR]) if far_share else np.zeros(0)
+    free = 1.0 - share - far_share
+    log_ratio, weight, spread = np.concatenate([np.broadcast_arrays(*group) for group in (
+        (np.log(list(named)), share / len(named), NAMED_SD), ([0.0], 0.6 * free, SMALL_SD),
+        (middles, 0.4 * free * density / density.sum(), 0.6 * STEP),
+        (far, far_share / max(len(far), 1), FAR_SD))], axis=1)
+    matrix = np.eye(3) * np.exp(-np.outer(log_ratio, axes))[:, None, :]
+    return ways_of(matrix, [*named.values()], weight, np.exp(log_ratio), spread)
+
+
+def size_ratios(dictionary: str) -> dict[float, str]:
+    """Return ratios of sizes taken for the black square's, with their names.
+
+    >>> size_ratios("DICT_APRILTAG_36h11")[1.25]
+    'the white margin taken for the edge (10/8)'
+    """
+    n, beyond = (module_count(dictionary), overhang(dictionary)) if dictionary else (8, 0)
+    edge = n + 2 * beyond
+    found = {} if not beyond else {
+        edge / n: f"the outer border taken for the detected square ({edge}/{n})",
+        n / edge: f"the detected square taken for the outer border ({n}/{edge})",
+    }
+    # A wider square of a family with an overhang ends in white anyway.
+    margin = {} if beyond else {
+        (n + 2) / n: f"the white margin taken for the edge ({n + 2}/{n})",
+        (n - 2) / n: f"the bits taken for the square, without its border ({n - 2}/{n})",
+    }
+    if not dictionary:  # any family: with a margin or an overhang
+        margin |= {8 / 6: "the white margin taken for the edge (8/6)",
+                   7 / 5: "the white margin taken for the edge (7/5)",
+                   9 / 5: "the outer border taken for the detected square (9/5)",
+                   5 / 9: "the detected square taken for the outer border (5/9)"}
+    return found | margin | {
+        0.5: "half of the side", 2.0: "twice the side (or the side for its half)",
+        2**0.5: "the diagonal taken for the side"}
+
+
+def _unit_ways(_: Observations) -> Ways:
+    # A size in other units makes tvec as long as it is itself, and f size / z stays the side in the
+    # image; a tvec in other units does not.
+    ratio = np.array([unit**sign for unit in UNITS for sign in (1, -1)])
+    labels = [f"{name} {'longer' if each > 1 else 'shorter'} by {max(each, 1 / each):.4g}"
+              for name in ("size_m", "tvec") for each in ratio]
+    both = np.tile(ratio, 2)
+    return ways_of(np.eye(3) / both[:, None, None], labels, 1.0, both, NAMED_SD,
+                   np.concatenate([np.ones(len(ratio)), ratio]))
+
+
+def along_sight(points: Floats) -> Floats:
+    """Return unit vectors (..., 3) of the lines of sight."""
+    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
+
+
+OFFSET_SD_M, TURN_SD_DEG, BIAS_SD_PX, DELAY_SD_S = 0.1, 4.0, 1.5, 0.1
+"""Standard deviations of an offset of the lens, a turn of the frame, a bias of corners (pixels of
+the square's side) and a delay."""
+
+
+def _offset_columns(rows: Observations, points: Floats, _spread: Floats) -> Sequence[Floats]:
+    return [OFFSET_SD_M * way for way in (
+        np.eye(3) if rows.spatial else along_sight(points)[None])]
+
+
+def _axis_ways(_: Observations) -> Ways:
+    """Return a frame that is turned a little, and axes that are named or pointed otherwise."""
+    swaps = [np.eye(3)[list(order)] * np.array(signs)[:, None]
+             for order in itertools.permutations(range(3))
+             for signs in itertools.product((1.0, -1.0), repeat=3)]
+    labels = [", ".join(
+        f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]} is {axis}"
+        for row, axis in zip(swap, "xyz", strict=True)) for swap in swaps]
+    others = len(swaps) - 1  # the first is the frame as it is
+    return ways_of(np.stack(swaps), ["", *labels[1:]], [0.5, *[0.5 / others] * others])
+
+
+def _turn_columns(_: Observations, points: Floats, _spread: Floats) -> Sequence[Floats]:
+    return [np.radians(TURN_SD_DEG) * np.cross(axis, points) for axis in np.eye(3)]
+
+
+def _half_pixel_ways(rows: Observations) -> Ways:
+    camera = rows.camera
+    slopes = (0.5 / camera.fx_px, 0.5 / camera.fy_px) if camera is not None else (0.0, 0.0)
+    matrix = np.stack([np.eye(3)] * 2)
+    matrix[:, :2, 2] = np.outer([1.0, -1.0], slopes)
+    return ways_of(matrix, [
+        f"centres of pixels counted from {one} in one place, from {other} in the other"
+        for one, other in (("0.5", "0"), ("0", "0.5"))])
+
+
+def _lateral(rows: Observations) -> str:
+    return "" if np.isfinite(rows.measured[:, :2]).any() else "measured x_m or y_m"
+
+
+def _known_square(rows: Observations) -> str:
+    return "" if rows.known_square else "--camera and size_m"
+
+
+def _straight(rows: Observations) -> str:
+    if not rows.lateral or rows.compared != "z":
+        return "tvec_x_m and tvec_y_m beside tvec_z_m"
+    return "" if straight_differs(rows) else "rows farther from the optical axis"
+
+
+def straight_differs(rows: Observations) -> bool:
+    """Return whether z is another number than the straight distance in some row."""
+    gap = np.linalg.norm(rows.said, axis=1) - rows.said[:, 2]
+    seen = gap > 2.0 * np.hypot(rows.measured_sd[:, 3], rows.zero_sd_m)
+    return bool(seen[np.isfinite(rows.measured[:, 3])].any())
+
+
+def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]:
+    return [points * spread]
+
+
+AGREE = "agree"
+FLIPS = "flips"
+UNITS_TAKEN = "units"
+STRAIGHT = "z_for_range"
+CAUSES = (
+    Cause(AGREE, "the numbers agree with what is expected", 4.0, "nothing to test"),
+    Cause("size", "wrong size of the marker (another edge, or a scaled or bent print)", 3.0,
+          "measure the square whose corners are detected with a caliper, flat on a table",
+          lambda rows: ratios(size_ratios(rows.dictionary), 0.6, (1, 1, 1), 0.05), _scaled),
+    Cause("focal_length", "wrong focal length (resolution, another camera, crop, autofocus)", 2.5,
+          "photograph a ruler at a known distance: f is its pixels times distance / length; "
+          "compare the file's image size with the image's",
+          lambda _: ratios(FOCAL_RATIOS, 0.4, (0, 0, 1)),
+          lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
+    Cause(UNITS_TAKEN, "units taken for one another (m, cm, mm, inch, foot)", 1.0,
+          "print size and tvec with their units", _unit_ways, _scaled),
+    Cause(STRAIGHT, "z taken for the straight distance", 1.5,
+          "compare the tape with sqrt(x² + y² + z²)", lacks=_straight),
+    Cause("offset", "an offset (zero point of the tape, place of the lens, another frame)", 1.0,
+          "measure one more distance: an offset stays, a factor grows",
+          columns=_offset_columns, unit=(1e3 * OFFSET_SD_M, "mm")),
+    Cause("axes", "axes or frame turned", 1.0,
+          "move the marker to the right: x alone must grow; down: y; away: z",
+          _axis_ways, _turn_columns, _lateral, (TURN_SD_DEG, "degrees")),
+    Cause("half_pixel", "half a pixel (convention of corners or calibration)", 0.7,
+          "detect a rendered marker whose corners are known (`sweep export`)",
+          _half_pixel_ways, lacks=lambda rows: _lateral(rows) or _known_square(rows)),
+    Cause("refinement", "bias of the corner refinement", 1.0,
+          "run the other refinement on the same images: its bias differs",
+          columns=lambda rows, points, _: [-BIAS_SD_PX / rows.side_px[:, None] * points],
+          lacks=_known_square, unit=(BIAS_SD_PX, "px")),
+    Cause("motion", "motion during the exposure, a rolling shutter or a late time stamp", 1.0,
+          "measure standing still",
+          columns=lambda rows, points, _: [
+              DELAY_SD_S * np.nan_to_num(rows.speed)[:, None] * along_sight(points)],
+          lacks=lambda rows: "" if np.nan_to_num(rows.speed).any() else "speed_m_s",
+          unit=(1e3 * DELAY_SD_S, "ms")),
+    Cause(FLIPS, "flips (the mirrored solution of the plane)", 0.5,
+          "print both solutions of solvePnPGeneric with their reprojection errors",
+          lacks=lambda rows: "" if np.isfinite(rows.yaw_off).any()
+          else "yaw_deg and rvec_x, rvec_y, ..."),
 )
-from sweep.diagnosis.observations import Observations
-from sweep.typing import Floats, Integers
+"""All causes; prior weights follow how often public questions turned out to be each."""
 
-PAIRED = ("size", "focal_length", STRAIGHT, "offset", "axes", "half_pixel", "refinement", "motion",
-          FLIPS)
-"""Causes that are also looked for two at a time."""
+PAIRS_PRIOR = 0.05
+"""Prior weight of two causes at once, relative to one."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Evidence of each cause, or of two, and their posterior probabilities.
 
 CLEAR_ODDS = 20.0
 """Posterior odds from which on one explanation is told from another: 0.95 to 0.05."""
@@ -41,14 +304,6 @@ ROTATION_SD_DEG = 3.0
 """Standard deviation of an estimated yaw."""
 
 
-class Predicted(NamedTuple):
-    """What the tape should have read (c, d), how columns change it, and its variance (c, d)."""
-
-    mean: Floats
-    columns: Floats
-    variance: Floats
-
-
 @dataclass(frozen=True)
 class Explanation:
     """One cause, or two, fitted to observations.
@@ -59,92 +314,82 @@ class Explanation:
         One or two.
     log_evidence
         Logarithm of the prior weight times the marginal likelihood.
-    correction
-        The ways (c,) in which it is undone.
-    way_share
-        Posterior probability of each way (c,).
-    numbers, covariance
-        Posterior mean (c, k) and covariance (c, k, k) of the columns' numbers, in prior standard
-        deviations: the causes' own first, then bias and zero points.
     misfit
-        Squared distance (c,) of what was measured from each way's prediction, in standard
-        deviations, with all that is unknown.
+        Squared distance (c,) of what was measured from the prediction of each way in which they
+        are undone, in standard deviations, with all that is unknown.
+    best
+        The likeliest way.
+    way
+        That way alone, of each cause.
+    numbers, covariance
+        Posterior mean (k,) and covariance (k, k) of its unknown numbers, in prior standard
+        deviations: the causes' own first, then bias and zero points.
+    fitted, sd
+        What the tape should have read (d,), and the standard deviations of its noise.
     yaw_evidence
         Log-likelihood of the measured yaws.
-    predicted
-        What the tape should have read.
+    probability
+        Posterior probability among all explanations.
     """
 
     causes: tuple[Cause, ...]
     log_evidence: float
-    correction: Correction
-    way_share: Floats
+    misfit: Floats
+    best: int
+    way: Sequence[Ways]
     numbers: Floats
     covariance: Floats
-    misfit: Floats
+    fitted: Floats
+    sd: Floats
     yaw_evidence: float
-    predicted: Predicted
+    probability: float = math.nan
 
     @property
     def names(self) -> frozenset[str]:
         """Names of the causes; empty if the numbers agree."""
         return frozenset(cause.name for cause in self.causes) - {AGREE}
 
-    @property
-    def best(self) -> int:
-        """Number of the likeliest way."""
-        return int(np.argmax(self.way_share))
-
-    @property
-    def fitted(self) -> Floats:
-        """What the tape should have read (d,), by the likeliest way."""
-        k = self.best
-        return np.asarray(self.predicted.mean[k] + self.predicted.columns[k] @ self.numbers[k])
+    def words(self, attribute: str, between: str = " and ") -> str:
+        """Return the name, title or test of all causes."""
+        return between.join(getattr(cause, attribute) for cause in self.causes)
 
 
-def measured(rows: Observations) -> tuple[Integers, Integers, Floats]:
-    """Return what was measured (d,): row, component (0 to 2: x, y, z; 3: straight), and metres."""
-    table = np.concatenate([rows.position, rows.tape[:, None]], axis=1)
-    row, component = np.nonzero(np.isfinite(table))
-    return row, component, np.asarray(table[row, component])
+def predict(
+    rows: Observations, causes: Sequence[Cause], ways: Sequence[Ways]
+) -> tuple[Floats, Floats, Floats]:
+    """Return what the tape should read by each way (c,) of undoing causes.
 
-
-def predict(rows: Observations, causes: Sequence[Cause], correction: Correction) -> Predicted:
-    """Return what the tape should read by each way (c,) of undoing causes."""
-    points = np.einsum("cij,nj->cni", correction.matrix, rows.said)
-    side = np.clip(rows.side_px * correction.square[:, None], *SIDE_LIMITS_PX)[..., None]
+    Of all measured numbers (c, d), how unknown numbers change them (c, d, k), and the variance of
+    their noise (c, d).
+    """
     bias, bias_sd, noise, lateral = rows.expected
+    row, component = rows.cells
+    points = np.einsum("cij,nj->cni", undone(ways), rows.said)
+    square = np.prod([each["square"] for each in ways], axis=0)[:, None]
+    side = np.clip(rows.side_px * square, *SIDE_LIMITS_PX)[..., None]
     points = points * (1.0 - bias / side)
-    sight = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    row, component, _ = measured(rows)
-    straight = (component == 3)[:, None]
+    sight = along_sight(points)
     # Change of what is measured with the position: a component, or along the line of sight.
-    plain_z = rows.compared == "z" and straight_differs(rows) and all(
+    along_z = rows.compared == "z" and straight_differs(rows) and all(
         cause.name != STRAIGHT for cause in causes)
-    onto = np.where(straight, np.eye(3)[2] if plain_z else sight[:, row],
-                    np.eye(4)[component][:, :3])
-    onto = np.broadcast_to(onto, (len(points), len(row), 3))
-    mean = (points[:, row] * onto).sum(axis=-1)
-    nuisance = np.zeros((*points.shape, 1))
-    nuisance[..., 0] = -bias_sd / side * points
-    columns = np.concatenate([
-        *(cause.columns(rows, points, spread) for cause, spread in zip(
-            causes, correction.spread.T, strict=True)), nuisance], axis=-1)
-    seen = np.einsum("cdi,cdik->cdk", onto, columns[:, row])
-    zeros = rows.zero_sd_m * np.eye(4)[component]
-    seen = np.concatenate(
-        [seen, np.broadcast_to(zeros, (len(points), *zeros.shape))[..., np.unique(component)]],
-        axis=-1)
+    onto = np.where((component == 3)[:, None],
+                    np.eye(3)[2] if along_z else sight[:, row], np.eye(4, 3)[component])
+    moves = [move for cause, way in zip(causes, ways, strict=True)
+             for move in cause.columns(rows, points, way["spread"][:, None, None])]
+    moves.append(-bias_sd / side * points)
+    seen = [(onto * np.broadcast_to(move, points.shape)[:, row]).sum(axis=-1) for move in moves]
+    # Each measured component has a zero point of its own.
+    seen += [np.broadcast_to(rows.zero_sd_m * (component == k), seen[0].shape)
+             for k in np.unique(component)]
     # Noise grows with the distance as measured: with that of the points a factor that brings them
     # near would explain many rows by less noise.
-    known = np.where(np.isfinite(rows.tape), rows.tape, rows.position[:, 2])
+    known = np.where(np.isfinite(rows.measured[:, 3]), rows.measured[:, 3], rows.measured[:, 2])
     distance = np.where(np.isfinite(known), np.abs(known), np.linalg.norm(points, axis=-1))[:, row]
     focal = rows.camera.fx_px if rows.camera is not None else 1000.0
     along = (onto * sight[:, row]).sum(axis=-1)
-    tape = np.where(component == 3, rows.tape_sd[row], rows.position_sd[row])
-    variance = tape**2 + distance**2 * (
+    variance = rows.measured_sd[row, component] ** 2 + distance**2 * (
         (along * noise / side[:, row, 0]) ** 2 + (1.0 - along**2) * (lateral / focal) ** 2)
-    return Predicted(mean, seen, variance)
+    return (points[:, row] * onto).sum(axis=-1), np.stack(seen, axis=-1), variance
 
 
 def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> Explanation:
@@ -156,92 +401,62 @@ def explain(rows: Observations, causes: tuple[Cause, ...], log_prior: float) -> 
     marginal likelihood is N(m, S + J Jᵀ), by Woodbury's identity (Rasmussen and Williams, "Gaussian
     processes for machine learning", 2006, appendix A.3). Ways are summed.
     """
-    correction = causes[0].ways(rows)
-    for cause in causes[1:]:
-        correction = correction.times(cause.ways(rows))
-    predicted = predict(rows, causes, correction)
-    residual = measured(rows)[2] - predicted.mean
-    weighted = predicted.columns / predicted.variance[..., None]
-    precision = np.eye(predicted.columns.shape[-1]) + np.einsum(
-        "cdk,cdl->ckl", predicted.columns, weighted)
+    each_one = [cause.ways(rows) for cause in causes]
+    every = np.indices([len(ways) for ways in each_one]).reshape(len(causes), -1)
+    ways = [own[index] for own, index in zip(each_one, every, strict=True)]
+    mean, columns, variance = predict(rows, causes, ways)
+    residual = rows.measured[rows.cells] - mean
+    weighted = columns / variance[..., None]
+    precision = np.eye(columns.shape[-1]) + np.einsum("cdk,cdl->ckl", columns, weighted)
     covariance = np.linalg.inv(precision)
-    slope = np.einsum("cdk,cd->ck", weighted, residual)
-    numbers = np.einsum("ckl,cl->ck", covariance, slope)
+    numbers = np.einsum("ckl,cdl,cd->ck", covariance, weighted, residual, optimize=True)
     # As a sum of squares: the shorter difference of two large numbers came out below zero.
-    left = residual - np.einsum("cdk,ck->cd", predicted.columns, numbers)
-    misfit = (left**2 / predicted.variance).sum(axis=-1) + (numbers**2).sum(axis=-1)
-    likelihood = -0.5 * (
-        misfit + np.log(2.0 * math.pi * predicted.variance).sum(axis=-1)
-        + np.linalg.slogdet(precision)[1])
-    joint = correction.log_weight + likelihood
-    total = float(np.logaddexp.reduce(joint))
-    yaw = _yaw_evidence(rows, flips=any(cause.name == FLIPS for cause in causes))
+    left = residual - np.einsum("cdk,ck->cd", columns, numbers)
+    misfit = (left**2 / variance).sum(axis=-1) + (numbers**2).sum(axis=-1)
+    joint = sum(each["log_weight"] for each in ways) - 0.5 * (
+        misfit + np.log(2.0 * math.pi * variance).sum(axis=-1) + np.linalg.slogdet(precision)[1])
+    yaw = _yaw_evidence(rows, FLIP_SHARE if any(cause.name == FLIPS for cause in causes) else 0.0)
+    k = int(np.argmax(joint))
     return Explanation(
-        causes, total + log_prior + yaw, correction,
-        np.exp(joint - total), numbers, covariance, misfit, yaw, predicted)
+        causes, float(np.logaddexp.reduce(joint)) + log_prior + yaw, misfit, k,
+        [each[[k]] for each in ways], numbers[k], covariance[k],
+        mean[k] + columns[k] @ numbers[k], np.sqrt(variance[k]), yaw)
 
 
-def _yaw_evidence(rows: Observations, *, flips: bool) -> float:
+def _yaw_evidence(rows: Observations, flipped_share: float) -> float:
     """Return the log-likelihood of the measured yaws: each as said, or as said or mirrored."""
-    known = np.isfinite(rows.yaw * rows.yaw_said)
-    spread = np.hypot(rows.yaw_sd, ROTATION_SD_DEG)[known]
-
-    def normal(said: Floats) -> Floats:
-        # A marker seen from behind or turned by 180 degrees is some other mistake: no tail is
-        # thinner than a uniform share of 1 %.
-        off = (rows.yaw - said)[known]
-        off = (off + 180.0) % 360.0 - 180.0
-        return np.asarray(0.99 * np.exp(-0.5 * (off / spread) ** 2) / (
-            spread * math.sqrt(2.0 * math.pi)) + 0.01 / 360.0)
-
-    share = FLIP_SHARE if flips else 0.0
-    return float(np.log((1.0 - share) * normal(rows.yaw_said)
-                        + share * normal(rows.yaw_mirrored)).sum())
+    known = np.isfinite(rows.yaw_off[:, 0])
+    spread = np.hypot(rows.yaw_sd, ROTATION_SD_DEG)[known, None]
+    off = (rows.yaw_off[known] + 180.0) % 360.0 - 180.0
+    # A marker seen from behind or turned by 180 degrees is some other mistake: no tail is thinner
+    # than a uniform share of 1 %.
+    likelihood = 0.99 * np.exp(-0.5 * (off / spread) ** 2) / (
+        spread * math.sqrt(2.0 * math.pi)) + 0.01 / 360.0
+    return float(np.log(likelihood @ [1.0 - flipped_share, flipped_share]).sum())
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """Explanations by posterior probability, the likeliest first.
-
-    Attributes
-    ----------
-    explanations
-        All of them.
-    probability
-        Posterior probability of each.
-    missing
-        Title of a cause that was not looked for -> what observations lack for it.
-    """
-
-    explanations: tuple[Explanation, ...]
-    probability: Floats
-    missing: dict[str, str]
-
-    @property
-    def rivals(self) -> tuple[Explanation, ...]:
-        """Explanations that the first is not told from; a cause beside the first is none."""
-        first = self.explanations[0]
-        return tuple(
-            each for each, share in zip(self.explanations[1:], self.probability[1:], strict=True)
-            if first.names and not first.names < each.names
-            and share * CLEAR_ODDS > self.probability[0])
-
-
-def rank(rows: Observations) -> Ranking:
+def rank(rows: Observations) -> list[Explanation]:
     """Return all explanations of observations, by posterior probability."""
-    missing = {cause.title: lack for cause in CAUSES if (lack := cause.lacks(rows))}
-    found = [cause for cause in CAUSES if cause.title not in missing]
+    found = [cause for cause in CAUSES if not cause.lacks(rows)]
     total = sum(cause.prior for cause in found)
     chosen: list[tuple[tuple[Cause, ...], float]] = [
         ((cause,), cause.prior / total) for cause in found]
     chosen += [
         ((a, b), PAIRS_PRIOR * a.prior * b.prior / total**2)
-        for a, b in itertools.combinations([each for each in found if each.name in PAIRED], 2)]
+        for a, b in itertools.combinations(
+            [cause for cause in found if cause.name not in {AGREE, UNITS_TAKEN}], 2)]
     explanations = [explain(rows, causes, math.log(prior)) for causes, prior in chosen]
     evidence = np.array([each.log_evidence for each in explanations])
-    order = np.argsort(-evidence, kind="stable")
-    share = np.exp(evidence - np.logaddexp.reduce(evidence))[order]
-    return Ranking(tuple(explanations[k] for k in order), share, missing)
+    share = np.exp(evidence - np.logaddexp.reduce(evidence))
+    return [dataclasses.replace(explanations[k], probability=float(share[k]))
+            for k in np.argsort(-evidence, kind="stable")]
+
+
+def rivals(ranked: Sequence[Explanation]) -> list[Explanation]:
+    """Return explanations that the first is not told from; a cause beside the first is none."""
+    first, *others = ranked
+    return [each for each in others if first.names and not first.names < each.names
+            and each.probability * CLEAR_ODDS > first.probability]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -278,48 +493,43 @@ class Measurement(NamedTuple):
 
 def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Measurement:
     """Return the row at which two explanations differ most relative to their uncertainty."""
-    reach = np.linalg.norm(np.einsum("ij,nj->ni", a.correction.matrix[a.best], rows.said), axis=1)
+    undo = undone(a.way)[0]
+    reach = np.linalg.norm(rows.said @ undo.T, axis=1)
     near, far = reach.min() / 3.0, reach.max() * 3.0
-    if rows.camera is not None and np.isfinite(rows.size_m):
-        true = reach * rows.side_px  # focal length times size, as the image shows it
-        near = max(near, float(np.median(true)) / (
+    if rows.camera is not None and rows.known_square:
+        focal_size = float(np.median(reach * rows.side_px))  # as the image shows it
+        near = max(near, focal_size / (
             MOST_SHARE * (rows.camera.height_px or 2.0 * rows.camera.cy_px)))
-        far = max(min(far, float(np.median(true)) / FEWEST_PX), near * 1.5)
-    count = 15
-    distance = np.tile(np.geomspace(near, far, count), len(DIRECTIONS_DEG))
-    bearing = np.radians(np.repeat(DIRECTIONS_DEG, count))
+        far = max(min(far, focal_size / FEWEST_PX), near * 1.5)
+    bearing, distance = (each.ravel() for each in np.meshgrid(
+        np.radians(DIRECTIONS_DEG), np.geomspace(near, far, 15), indexing="ij"))
     truth = distance[:, None] * np.stack(
         [np.sin(bearing), np.zeros_like(bearing), np.cos(bearing)], axis=-1)
     # What the program would say if a were right.
-    said = truth @ np.linalg.inv(a.correction.matrix[a.best]).T
+    said = truth @ np.linalg.inv(undo).T
     said[:, 2] = np.maximum(said[:, 2], 1e-3)
-    n, some = len(said), np.full(len(said), np.nan)
-    spread = np.maximum(0.002, 0.005 * np.linalg.norm(truth, axis=1))
-    position = np.where([True, False, True], truth, np.nan)
-    moves = np.nan_to_num(rows.speed).any()
-    speed = np.full(n, np.nanmean([*rows.speed, 0.0]) if moves else np.nan)
+    unknown = np.full((len(said), 2), np.nan)
     new = dataclasses.replace(
-        rows, said=said, lateral=True, tape=np.linalg.norm(truth, axis=1), tape_sd=spread,
-        position=position, position_sd=spread, yaw=some, yaw_said=some, yaw_mirrored=some,
-        yaw_sd=some, speed=speed)
-    row, which, _ = measured(new)
+        rows, said=said, lateral=True, yaw_off=unknown, yaw_sd=unknown[:, 0],
+        measured=np.column_stack([truth[:, 0], unknown[:, 0], truth[:, 2], distance]),
+        measured_sd=np.tile(tape_sd(distance), (4, 1)).T,
+        speed=np.full(len(said), np.nanmean([*rows.speed, 0.0])))
+    row, which = new.cells
     means, variances = [], []
     for each in (a, b):
-        predicted = predict(new, each.causes, each.correction.one(each.best))
         # The unknown zero points are those of the new row alone where it measures a new component.
-        own = each.numbers.shape[-1] - len(np.unique(measured(rows)[1]))
-        numbers = each.numbers[each.best][:own]
-        columns = predicted.columns[0, :, :own]
-        means.append(predicted.mean[0] + columns @ numbers)
-        variances.append(np.einsum(
-            "dk,kl,dl->d", columns, each.covariance[each.best][:own, :own], columns)
-            + predicted.variance[0] / 2.0 + 0.5 * rows.zero_sd_m**2)
+        own = len(each.numbers) - len(np.unique(rows.cells[1]))
+        mean, columns, variance = (part[0] for part in predict(new, each.causes, each.way))
+        columns = columns[:, :own]
+        means.append(mean + columns @ each.numbers[:own])
+        variances.append(
+            np.einsum("dk,kl,dl->d", columns, each.covariance[:own, :own], columns)
+            + variance / 2.0 + 0.5 * rows.zero_sd_m**2)
     difference = np.abs(means[0] - means[1]) / np.sqrt(variances[0] + variances[1])
     # Of rows that decide well enough the one that is nearest to those measured.
     enough = difference >= min(float(difference.max()), 2.0 * DECIDES)
-    effort = np.abs(np.log(np.linalg.norm(truth[row], axis=1) / np.median(reach)))
+    effort = np.abs(np.log(distance[row] / np.median(reach)))
     k = int(np.argmin(np.where(enough, effort, np.inf)))
     return Measurement(
-        float(np.linalg.norm(truth[row[k]])),
-        float(np.degrees(np.arctan2(truth[row[k], 0], truth[row[k], 2]))),
+        float(distance[row[k]]), float(np.degrees(bearing[row[k]])),
         {0: "x", 2: "z", 3: "distance"}[int(which[k])], float(difference[k]))

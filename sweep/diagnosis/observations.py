@@ -2,50 +2,56 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
-import dataclasses
+import io
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 
+from sweep.declaration import check_table
 from sweep.errors import ArgumentError
+from sweep.experiment.parameters import PARAMETERS
+from sweep.experiment.pipeline import parse_settings
 from sweep.measure.detectors import DetectorSetting, make_detector
 from sweep.measure.solver import both_planar_solutions
-from sweep.messages import nearest, plain
+from sweep.messages import nearest, plain, refusal
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey, read_regular
-from sweep.model.marker import dictionary_names
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
 from sweep.photographs.folder import detect_markers
 from sweep.photographs.truth import camera_of_file, cameras_of, lens_of
-from sweep.typing import Floats
+from sweep.typing import Floats, Integers
 
-SAID = ("tvec_x_m", "tvec_y_m", "tvec_z_m", "range_m", "rvec_x", "rvec_y", "rvec_z")
-TAPE = ("tape_m", "tape_sd_m", "x_m", "y_m", "z_m", "position_sd_m", "yaw_deg", "yaw_sd_deg",
-        "speed_m_s")
-CORNERS = tuple(f"corner{k}_{axis}_px" for k in range(4) for axis in "xy")
-COLUMNS = {*SAID, *TAPE, *CORNERS, "marker_id"}
+MEASURED = ["x_m", "y_m", "z_m", "tape_m"]
+TVEC, RVEC = ["tvec_x_m", "tvec_y_m", "tvec_z_m"], ["rvec_x", "rvec_y", "rvec_z"]
+CORNERS = [f"corner{k}_{axis}_px" for k in range(4) for axis in "xy"]
+COLUMNS = [*TVEC, "range_m", *RVEC, *MEASURED, "tape_sd_m", "position_sd_m", "yaw_deg",
+           "yaw_sd_deg", "speed_m_s", "marker_id", *CORNERS]
 """Columns of numbers; further ones are refused, empty cells are unknown."""
 
 IMAGE = "image"
 """Column of image files in which the corners are detected, from the CSV file's folder."""
 
-WHOLE = (SAID[:2], SAID[4:], CORNERS)
-"""Columns of which a row has all or none."""
+NEEDED = {
+    "tape_sd_m": ["tape_m"], "position_sd_m": MEASURED[:3], "yaw_sd_deg": ["yaw_deg"],
+    "yaw_deg": [RVEC[0], CORNERS[0]],
+    **{name: [other] for vector in (TVEC[:2], RVEC, CORNERS)
+       for name, other in zip(vector, [*vector[1:], vector[0]], strict=True)}}
+"""Column -> columns of which a row needs one beside it: of a vector it has all or none."""
 
-NEEDED = {"tape_sd_m": ("tape_m",), "position_sd_m": ("x_m", "y_m", "z_m"),
-          "yaw_sd_deg": ("yaw_deg",), "yaw_deg": ("rvec_x", CORNERS[0])}
-"""Column -> columns of which a row needs one beside it."""
-
-POSITIVE = ("tape_m", "tape_sd_m", "position_sd_m", "yaw_sd_deg")
-"""Columns whose numbers are above 0."""
+MOST_M = 1e7
+RANGES = {
+    **dict.fromkeys((*TVEC[:2], *MEASURED), (-MOST_M, MOST_M)),
+    **dict.fromkeys(("tvec_z_m", "range_m", "tape_m"), (1e-5, MOST_M)),
+    **dict.fromkeys(("tape_sd_m", "position_sd_m", "yaw_sd_deg"), (1e-9, MOST_M))}
+"""Column -> numbers between which it can be, in whatever unit."""
 
 TAPE_SD_M, TAPE_SHARE = 0.002, 0.005
 """Standard deviation of a tape if none is given: the larger of 2 mm and 0.5 %."""
@@ -71,14 +77,47 @@ UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
 """Side of the square where neither camera nor size are known."""
 
-LENGTHS_M = (1e-5, 1e7)
-"""Lengths between which positions and tapes can be, in whatever unit."""
-
 MAX_ROWS = 1000
 """Rows that are judged within half a minute."""
 
 READABLE_PX = 4.0
 """Sides below this cannot be read: the numbers are in other units than the size."""
+
+
+BELIEFS = {each.name: each for each in (
+    replace(PARAMETERS["size_m"], default=math.nan),
+    replace(PARAMETERS["dictionary"], default=""),
+    replace(PARAMETERS["cornerRefinementMethod"], name="refinement", default=""),
+    replace(PARAMETERS["size_m"], name="zero_sd_m", default=ZERO_SD_M),
+    replace(PARAMETERS["cornerRefinementMethod"], name="compared", default="z",
+            choices=("z", "range")))}
+"""Settings of `sweep diagnose`."""
+
+
+def beliefs(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all settings, of those that are given and neither None nor empty.
+
+    Raises
+    ------
+    PipelineError
+        A line for each setting that is not known or cannot be.
+    """
+    values, faults = check_table(
+        BELIEFS, {name: value for name, value in given.items() if value not in {None, ""}},
+        "sweep diagnose")
+    if faults:
+        raise refusal(faults)
+    return values
+
+
+def settings_of(texts: Sequence[str]) -> dict[str, Any]:
+    """Return the values of settings, as ``--set`` takes them.
+
+    >>> settings_of(["size_m=0.153", "dictionary=DICT_4X4_50"])
+    {'size_m': 0.153, 'dictionary': 'DICT_4X4_50'}
+    """
+    found = parse_settings(texts, BELIEFS)
+    return {name: beliefs(found)[name] for name in found}
 
 
 @dataclass(frozen=True)
@@ -93,13 +132,12 @@ class Observations:
         Whether the program's x and y are known.
     spatial
         Whether positions were measured, and not straight distances alone.
-    tape, tape_sd
-        Straight distance from the lens to the marker's centre (n,), m, NaN where unknown.
-    position, position_sd
-        Measured positions (n, 3), m, NaN where unknown, and their standard deviation (n,).
-    yaw, yaw_said, yaw_mirrored, yaw_sd
-        The marker's turn about the vertical (n,), degrees: measured, said, and that of the other
-        planar solution; 0 where it faces along the optical axis, NaN where unknown.
+    measured, measured_sd
+        Measured x, y, z and straight distance from the lens to the marker's centre (n, 4), m, NaN
+        where unknown, and their standard deviations (n, 4).
+    yaw_off, yaw_sd
+        Measured minus said turn of the marker about the vertical, degrees, and the same of the
+        other planar solution (n, 2), NaN where unknown; standard deviation of the measured (n,).
     speed
         Speed of the marker away from the camera (n,), m/s, NaN where unknown.
     camera
@@ -117,13 +155,9 @@ class Observations:
     said: Floats
     lateral: bool
     spatial: bool
-    tape: Floats
-    tape_sd: Floats
-    position: Floats
-    position_sd: Floats
-    yaw: Floats
-    yaw_said: Floats
-    yaw_mirrored: Floats
+    measured: Floats
+    measured_sd: Floats
+    yaw_off: Floats
     yaw_sd: Floats
     speed: Floats
     camera: Calibration | None
@@ -132,12 +166,23 @@ class Observations:
     refinement: str
     zero_sd_m: float
     compared: str
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def cells(self) -> tuple[Integers, Integers]:
+        """Row and component (0 to 3: x, y, z, straight) of each measured number (d,)."""
+        row, component = np.nonzero(np.isfinite(self.measured))
+        return row, component
+
+    @property
+    def known_square(self) -> bool:
+        """Whether the square's side in the image follows from the program's beliefs."""
+        return self.camera is not None and math.isfinite(self.size_m)
 
     @property
     def side_px(self) -> Floats:
         """Side of the square in the image (n,), as the program's own numbers have it."""
-        if self.camera is None or not math.isfinite(self.size_m):
+        if self.camera is None or not self.known_square:
             return np.full(len(self.said), UNKNOWN_SIDE_PX)
         return np.asarray(self.camera.fx_px * self.size_m / self.said[:, 2])
 
@@ -149,94 +194,77 @@ class Observations:
 
 def read_observations(
     source: str | os.PathLike[str] | Mapping[str, Sequence[Any]], *,
-    camera: str | os.PathLike[str] | Calibration | None = None, size_m: float | None = None,
-    dictionary: str = "", refinement: str = "", zero_sd_m: float = ZERO_SD_M,
-    compared: str = "z",
+    camera: str | os.PathLike[str] | Calibration | None = None, **given: Any,
 ) -> Observations:
-    """Return checked observations, of a CSV file or of columns (n,).
+    """Return checked observations, of a CSV file or of columns (n,), with `beliefs`.
 
     Raises
     ------
     ArgumentError
         One line on the first thing that cannot be: a column, a number, a unit.
+    PipelineError
+        A line for each setting that is not known or cannot be.
     """
-    columns = dict(source) if isinstance(source, Mapping) else _read_csv(os.fspath(source))
-    for name in columns:
-        if name not in (*COLUMNS, IMAGE):
-            raise _fault(f"column {plain(name)} is not known{nearest(name, sorted(COLUMNS))}; "
-                         f"expected {', '.join(SAID)} and {', '.join(TAPE)}, or {IMAGE}, or "
-                         f"corners {CORNERS[0]} ...")
-    count = max((len(values) for values in columns.values()), default=0)
-    if not 0 < count <= MAX_ROWS:
-        raise _fault(f"{count or 'no'} rows: expected 1 to {MAX_ROWS} below the header")
-    for setting, value, known in (
-        ("dictionary", dictionary, dictionary_names()), ("refinement", refinement, [*REFINEMENTS]),
-        ("compared", compared, ["z", "range"]),
-    ):
-        if value and value not in known:
-            expected = nearest(value, known) or f"; expected one of {', '.join(known)}"
-            raise ArgumentError(setting, plain(value), f"is not known{expected}")
-    for name, number in (("size_m", size_m), ("zero_sd_m", zero_sd_m)):
-        if number is not None and not 0 < number < math.inf:
-            raise ArgumentError(name, number, "expected metres above 0")
+    folder = Path() if isinstance(source, Mapping) else Path(source).parent
+    cells = _cells(source)
+    table, settings, notes = _numbers(cells), beliefs(given), list[str]()
     believed = camera if camera is None or isinstance(camera, Calibration) else camera_of_file(
         os.fspath(camera))
-    values = {name: _numbers(name, columns[name], count) if name in columns
-              else np.full(count, np.nan) for name in COLUMNS}
-    notes: list[str] = []
-    if IMAGE in columns:
-        folder = Path() if isinstance(source, Mapping) else Path(source).parent
-        _detect(values, [folder / name for name in columns[IMAGE]], dictionary, refinement)
-        notes.append(f"corners were detected in the images, {refinement or 'none'} refined")
-    _check_complete(values)
-    said, rvec = (np.stack([values[name] for name in SAID[k : k + 3]], axis=-1) for k in (0, 4))
-    if np.isfinite(values[CORNERS[0]]).all() and not np.isfinite(said[:, 2]).all():
-        if believed is None or size_m is None:
+    if IMAGE in cells:
+        images = [folder / name for name in cells[IMAGE]]
+        table[CORNERS] = _detected(table, images, settings["dictionary"], settings["refinement"])
+        notes.append("corners were detected in the images, "
+                     f"{settings['refinement'] or 'none'} refined")
+    there = table.notna()
+    for name, others in NEEDED.items():
+        _each_row(~there[name] | there[others].any(axis=1),
+                  f"{name} needs {' or '.join(others)} beside it")
+    said, rvec = table[TVEC].to_numpy(), table[RVEC].to_numpy()
+    if there[CORNERS].all(axis=None) and not there[TVEC].all(axis=None):
+        if believed is None or math.isnan(settings["size_m"]):
             raise _fault("corners need --camera and --set size_m=...")
-        said, rvec = _solved(values, believed, size_m)
+        said, rvec = _solved(table[CORNERS].to_numpy(), believed, settings["size_m"])
         notes.append("the poses were solved from the corners with this camera and size")
     lateral = bool(np.isfinite(said[:, :2]).all())
     if not lateral:
-        distance = np.where(np.isfinite(said[:, 2]), said[:, 2], values["range_m"])
-        said = np.stack([np.zeros(count), np.zeros(count), distance], axis=-1)
-        compared = "range"
-    position = np.stack([values[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
-    _each_row(np.isfinite(said).all(axis=1) & (said[:, 2] > 0),
+        said = np.outer(table["tvec_z_m"].fillna(table["range_m"]), [0.0, 0.0, 1.0])
+        settings["compared"] = "range"
+    _each_row(np.isfinite(said).all(axis=1),
               "expected tvec_z_m or range_m above 0: the position that the program said")
-    _each_row(np.isfinite([values["tape_m"], *position.T, values["yaw_deg"]]).any(axis=0),
+    _each_row(there[[*MEASURED, "yaw_deg"]].any(axis=1),
               "expected tape_m, or one of x_m, y_m, z_m: what was measured by tape")
-    _each_row(lateral | ~np.isfinite(position[:, :2]).any(axis=1),
+    _each_row(lateral | ~there[MEASURED[:2]].any(axis=1),
               "x_m and y_m need tvec_x_m and tvec_y_m")
-    for name in POSITIVE:
-        _each_row(~(values[name] <= 0), f"{name}: expected numbers above 0")
-    lengths = np.nan_to_num(np.concatenate([said, position, values["tape_m"][:, None]], axis=1))
-    _each_row((np.abs(lengths) < LENGTHS_M[1]).all(axis=1) & (said[:, 2] > LENGTHS_M[0]),
-              f"expected metres between {LENGTHS_M[0]:g} and {LENGTHS_M[1]:g}")
-    if not np.isfinite([values["tape_sd_m"], values["position_sd_m"]]).any():
+    measured = table[MEASURED].to_numpy()
+    deviations = table[["position_sd_m"] * 3 + ["tape_sd_m"]].to_numpy()
+    if not np.isfinite(deviations).any():
         notes.append("no uncertainty of the tape is given: 2 mm or 0.5 % are assumed")
-
-    def filled(name: str, default: Any) -> Floats:
-        return np.where(np.isfinite(values[name]), values[name], default)
-
-    tape_sd, position_sd = (
-        filled(name, np.maximum(TAPE_SD_M, TAPE_SHARE * np.nan_to_num(length)))
-        for name, length in (("tape_sd_m", values["tape_m"]),
-                             ("position_sd_m", np.linalg.norm(np.nan_to_num(position), axis=1))))
+    lengths = np.nan_to_num(measured)
+    lengths[:, :3] = np.linalg.norm(lengths[:, :3], axis=1)[:, None]
     rotation = rotation_of_vector(rvec)
+    # The turn of both solutions' normals about the vertical, in degrees.
+    turns = [np.degrees(np.arctan2(each[:, 0, 2], -each[:, 2, 2]))
+             for each in (rotation, mirrored(rotation, said))]
     rows = Observations(
-        said, lateral, bool(np.isfinite(position).any()), values["tape_m"], tape_sd, position,
-        position_sd, values["yaw_deg"], _yaw(rotation), _yaw(mirrored(rotation, said)),
-        filled("yaw_sd_deg", YAW_SD_DEG), values["speed_m_s"], believed,
-        math.nan if size_m is None else size_m, dictionary, refinement, zero_sd_m, compared, ())
-    if believed is None or size_m is None:
+        said, lateral, bool(np.isfinite(measured[:, :3]).any()), measured,
+        np.where(np.isfinite(deviations), deviations, tape_sd(lengths)),
+        table[["yaw_deg"]].to_numpy() - np.stack(turns, axis=-1),
+        table["yaw_sd_deg"].fillna(YAW_SD_DEG).to_numpy(), table["speed_m_s"].to_numpy(),
+        believed, **settings)
+    if not rows.known_square:
         notes.append("camera or size_m unknown: the expected bias and noise are a guess for a "
                      f"square of {UNKNOWN_SIDE_PX:g} px")
     elif (small := rows.side_px < READABLE_PX).any():
         row = int(np.argmax(small))
         notes.append(
-            f"row {row + 1}: {said[row, 2]:g} m for a square of {size_m:g} m is a side of "
+            f"row {row + 1}: {said[row, 2]:g} m for a square of {rows.size_m:g} m is a side of "
             f"{rows.side_px[row]:.2g} px, which no detector reads: units of tvec or size_m differ")
-    return dataclasses.replace(rows, notes=tuple(notes))
+    return replace(rows, notes=tuple(notes))
+
+
+def tape_sd(length: Floats) -> Floats:
+    """Return the standard deviations of tapes of which none is given, m."""
+    return np.maximum(TAPE_SD_M, TAPE_SHARE * length)
 
 
 def _fault(text: str) -> ArgumentError:
@@ -249,120 +277,85 @@ def _each_row(right: ArrayLike, expected: str) -> None:
         raise _fault(f"row {int(np.argmin(right)) + 1}: {expected}")
 
 
-def _check_complete(values: Mapping[str, Floats]) -> None:
-    """Raise ArgumentError where a row has a part of a vector, or a number without its companion."""
-    for names in WHOLE:
-        there = np.isfinite([values[name] for name in names])
-        for name, own in zip(names, there, strict=True):
-            _each_row(own | ~there.any(axis=0),
-                      f"{name} is missing: give all of {names[0]} ... {names[-1]}, or none")
-    for name, others in NEEDED.items():
-        beside = np.isfinite([values[other] for other in others]).any(axis=0)
-        _each_row(beside | ~np.isfinite(values[name]),
-                  f"{name} needs {' or '.join(others)} beside it")
-
-
-SETTINGS: dict[str, type] = {
-    "size_m": float, "dictionary": str, "refinement": str, "zero_sd_m": float, "compared": str}
-"""Settings of `sweep diagnose`, and their types."""
-
-
-def settings_of(texts: Sequence[str]) -> dict[str, Any]:
-    """Return the values of settings, as ``--set`` takes them.
-
-    >>> settings_of(["size_m=0.153", "dictionary=DICT_4X4_50"])
-    {'size_m': 0.153, 'dictionary': 'DICT_4X4_50'}
-    """
-    found: dict[str, Any] = {}
-    for text in texts:
-        name, equals, written = (part.strip().strip("'\"") for part in text.partition("="))
-        if not equals or name not in SETTINGS:
-            raise ArgumentError("settings", plain(text), "expected one of "
-                                f"{', '.join(SETTINGS)}, such as size_m=0.153"
-                                + nearest(name, list(SETTINGS)))
-        try:
-            found[name] = SETTINGS[name](written)
-        except ValueError:
-            raise ArgumentError("settings", plain(text), "expected a number") from None
-    return found
-
-
-def _read_csv(path: str) -> dict[str, list[str]]:
+def _cells(source: str | os.PathLike[str] | Mapping[str, Sequence[Any]]) -> pd.DataFrame:
+    """Return the cells of columns, or of a CSV file's, as text."""
     try:
-        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
+        if isinstance(source, Mapping):
+            return pd.DataFrame(dict(source))
+        text = read_regular(os.fspath(source), MAX_BYTES).decode("utf-8-sig")
+        lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+        cells = pd.read_csv(io.StringIO("\n".join(lines)), header=None, dtype=str,
+                            keep_default_na=False).map(str.strip, na_action="ignore")
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise ArgumentError("observations", plain(path), reason) from None
-    lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
-    header, *rows = [[cell.strip() for cell in row] for row in lines if any(row)] or [[]]
-    if len(header) == 1 and {*";\t"} & {*header[0]}:
-        raise ArgumentError("observations", plain(path), "expected commas between columns, and "
-                            "points in numbers")
-    if twice := {name for name in header if header.count(name) > 1}:
-        raise ArgumentError("observations", plain(path), f"column {plain(min(twice))} is there "
-                            "twice")
-    for number, row in enumerate(rows, 1):
-        if len(row) != len(header):
-            raise ArgumentError("observations", plain(path), f"row {number} has {len(row)} cells, "
-                                f"the header {len(header)}")
-    return {name: [row[k] for row in rows] for k, name in enumerate(header)}
+        given = "" if isinstance(source, Mapping) else plain(source)
+        problem = getattr(error, "strerror", None) or (
+            f"expected columns as long as each other, and commas between them ({error})")
+        raise ArgumentError("observations", given, plain(problem)) from None
+    cells = cells.iloc[1:].set_axis(cells.iloc[0], axis="columns").reset_index(drop=True)
+    faults = [f"column {plain(name)} is there twice"
+              for name in cells.columns[cells.columns.duplicated()]]
+    faults += [f"row {row + 1} has fewer cells than the header"
+               for row in np.flatnonzero(cells.isna().any(axis=1))]
+    if faults:
+        raise ArgumentError("observations", plain(source), faults[0])
+    return cells
 
 
-def _numbers(name: str, cells: Sequence[Any], count: int) -> Floats:
-    """Return a column's numbers (count,); empty cells are NaN, written NaN is refused."""
-    numbers = np.full(count, np.nan)
-    if len(cells) != count:
-        raise _fault(f"column {name} has {len(cells)} rows of {count}")
-    for row, cell in enumerate(cells):
-        if cell is None or cell == "":
-            continue
-        with contextlib.suppress(TypeError, ValueError):
-            numbers[row] = float(cell)
-        if not math.isfinite(numbers[row]):
-            raise _fault(f"row {row + 1}, {name} = {plain(cell)}: expected a number; leave the "
-                         "cell empty if it is unknown")
+def _numbers(cells: pd.DataFrame) -> pd.DataFrame:
+    """Return all columns of numbers; empty cells are NaN, other words are refused."""
+    for name in cells:
+        if name not in {*COLUMNS, IMAGE}:
+            raise _fault(f"column {plain(name)} is not known{nearest(str(name), COLUMNS)}; "
+                         f"expected {', '.join(COLUMNS[:-7])} ..., or {IMAGE}, with commas between "
+                         "them")
+    if not 0 < len(cells) <= MAX_ROWS:
+        raise _fault(f"{len(cells) or 'no'} rows: expected 1 to {MAX_ROWS} below the header")
+    table = cells.reindex(columns=COLUMNS).replace("", None)
+    numbers = table.apply(pd.to_numeric, errors="coerce").astype(np.float64)
+    for name in cells.columns.intersection(COLUMNS):
+        low, high = RANGES.get(name, (-sys.float_info.max, sys.float_info.max))
+        wrong = table[name].notna() & ~numbers[name].between(low, high)
+        if wrong.any():
+            row = int(wrong.argmax())
+            extent = f" between {low:g} and {high:g}" if name in RANGES else ""
+            raise _fault(f"row {row + 1}, {name} = {plain(cells[name][row])}: expected a number"
+                         f"{extent}; leave the cell empty if it is unknown")
     return numbers
 
 
-def _detect(
-    values: dict[str, Floats], images: Sequence[Path], dictionary: str, refinement: str
-) -> None:
-    """Write the corners of a marker in each image (n,) into the columns of corners."""
+def _detected(
+    table: pd.DataFrame, images: Sequence[Path], dictionary: str, refinement: str
+) -> Floats:
+    """Return the corners (n, 8) of a marker in each image (n,)."""
     if not dictionary:
         raise _fault(f"{IMAGE} needs --set dictionary=...")
-    if np.isfinite(values[CORNERS[0]]).any():
+    if table[CORNERS].notna().any(axis=None):
         raise _fault(f"{IMAGE} or corners: give one of them")
     find = make_detector(DetectorSetting(cornerRefinementMethod=refinement or "none"))
-    for row, image in enumerate(images):
+    corners = []
+    for row, (image, wanted) in enumerate(zip(images, table["marker_id"], strict=True)):
         try:
             ids, quads = detect_markers(find, decode_grey(str(image)), dictionary)
         except (OSError, ValueError) as error:
             raise ArgumentError("observations", plain(image), str(error)) from None
-        wanted = values["marker_id"][row]
         chosen = quads if np.isnan(wanted) else quads[ids == wanted]
         if len(chosen) != 1:
             raise _fault(f"row {row + 1}: {plain(image)} shows {len(ids)} markers of {dictionary}"
                          f" (IDs {', '.join(map(str, ids.tolist())) or 'none'}): expected one, or "
                          "marker_id of one of them")
-        for name, number in zip(CORNERS, chosen.ravel(), strict=True):
-            values[name][row] = number
+        corners.append(chosen.reshape(8))
+    return np.array(corners, dtype=np.float64)
 
 
-def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) -> tuple[
-        Floats, Floats]:
-    """Return positions and rotation vectors (n, 3) of corners, TL, TR, BR, BL, by guarded IPPE."""
-    corners = np.stack([values[name] for name in CORNERS], axis=-1).reshape(-1, 4, 2)
+def _solved(corners: Floats, camera: Calibration, size_m: float) -> tuple[Floats, Floats]:
+    """Return positions and rotation vectors (n, 3) of corners (n, 8), by guarded IPPE."""
+    quads = corners.reshape(-1, 4, 2)
     frame = (camera.width_px, camera.height_px)
-    if all(frame) and (corners > np.array(frame, dtype=np.float64)).any():
+    if all(frame) and (quads > np.array(frame, dtype=np.float64)).any():
         raise _fault("corners lie beyond the camera file's image of "
                      f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
-    cameras = cameras_of(lens_of(camera), len(corners))
-    rotation, position = both_planar_solutions(corners, cameras, np.full(len(corners), size_m))
+    cameras = cameras_of(lens_of(camera), len(quads))
+    rotation, position = both_planar_solutions(quads, cameras, np.full(len(quads), size_m))
     _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "
               "left, top right, bottom right, bottom left")
     return position[:, 0], vector_of_rotation(rotation[:, 0])
-
-
-def _yaw(rotation: Floats) -> Floats:
-    """Return the turn (n,) in degrees of normals of rotations (n, 3, 3) about the vertical."""
-    return np.degrees(np.arctan2(rotation[:, 0, 2], -rotation[:, 2, 2]))

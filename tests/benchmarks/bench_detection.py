@@ -44,10 +44,9 @@ class Sample:
 
     def __init__(self, results, half):
         self.results = results.isel(trial=slice(half, None, 2)).load()
-        errors, self.rvec, self.tvec, self.ratio, self.flipped, _ = estimated(self.results)
+        self.errors, self.rvec, self.tvec, self.ratio, self.flipped, _ = estimated(self.results)
         self.distance = np.linalg.norm(self.tvec, axis=1)
         self.angle = np.minimum(viewing_angle_of(self.rvec, self.tvec), 89.0)
-        self.errors = errors * np.repeat([self.distance, np.ones(len(errors))], 3, axis=0).T
 
 
 def divergence(w):

@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 
 from sweep.analysis.intervals import clopper_pearson
-from sweep.diagnosis.causes import CAUSES, FLIPS, size_ratios
-from sweep.diagnosis.inference import CLEAR_ODDS, PAIRED, rank
+from sweep.diagnosis.inference import (
+    CAUSES,
+    CLEAR_ODDS,
+    FLIPS,
+    STRAIGHT,
+    rank,
+    rivals,
+    size_ratios,
+)
 from sweep.diagnosis.observations import REFINEMENTS, Observations
 from sweep.model.calibration import Calibration
-
-SINGLE = [cause.name for cause in CAUSES]
 
 TOLD, OPEN = 20.0, 1.0
 """Squared distance in standard deviations between the prediction of the true cause and the best of
@@ -32,16 +37,15 @@ def scene(rng):
     truth = distance[:, None] * np.column_stack([bearing, np.ones(n)])
     straight = np.linalg.norm(truth, axis=1)
     known = rng.random() < 0.6  # the position, not the straight distance alone
-    sd = np.maximum(0.002, 0.005 * straight)
-    none = np.full(n, np.nan)
-    yaw, bearing_deg = rng.uniform(-50, 50, n), np.degrees(bearing[:, 0])
+    yaw = rng.uniform(-50, 50, n)
+    off = np.stack([0 * yaw, 2 * (yaw - np.degrees(bearing[:, 0]))], axis=-1)
     return Observations(
-        truth, True, known, straight, sd, truth if known else np.full((n, 3), np.nan), sd,
-        yaw if known else none, yaw, 2 * bearing_deg - yaw, np.full(n, 4.0),
-        rng.uniform(-1, 1, n) if rng.random() < 0.5 else none,
+        truth, True, known, np.column_stack([truth if known else truth * np.nan, straight]),
+        np.tile(np.maximum(0.002, 0.005 * straight), (4, 1)).T, off if known else off * np.nan,
+        np.full(n, 4.0), rng.uniform(-1, 1, n) if rng.random() < 0.5 else np.full(n, np.nan),
         Calibration(width, height, f, f, (width - 1) / 2, (height - 1) / 2, (), (), ()), size,
-        "DICT_APRILTAG_36h11", str(rng.choice(list(REFINEMENTS))), 0.01,
-        "z" if rng.random() < 0.3 else "range", ())
+        "DICT_APRILTAG_36h11", str(rng.choice([*REFINEMENTS])), 0.01,
+        "z" if rng.random() < 0.3 else "range")
 
 
 def spoil(rows, name, rng):
@@ -56,8 +60,7 @@ def spoil(rows, name, rng):
     elif name == "units":
         said = said * rng.choice([10, 100, 1000, 25.4, 0.3048, 0.1, 0.01])
     elif name == "offset":
-        said = said - rng.normal(0, 0.1, 3) * [1, 1, 1] if np.isfinite(
-            rows.position).any() else said - rng.normal(0, 0.1) * sight
+        said = said - (rng.normal(0, 0.1, 3) if rows.spatial else rng.normal(0, 0.1) * sight)
     elif name == "axes":
         if rng.random() < 0.5:
             said = said @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]) * 1.0
@@ -70,14 +73,11 @@ def spoil(rows, name, rng):
         said = said * (1 + rng.normal(0, 1.5) / rows.side_px)[:, None]
     elif name == "motion":
         said = said - rng.normal(0, 0.1) * np.nan_to_num(rows.speed)[:, None] * sight
-    yaw = rows.yaw_said
-    if name == FLIPS:
-        flipped = rng.random(len(yaw)) < 0.5
-        yaw = np.where(flipped, rows.yaw_mirrored, yaw)
-        other = np.where(flipped, rows.yaw_said, rows.yaw_mirrored)
-        return replace(rows, yaw_said=yaw, yaw_mirrored=other)
-    compared = "z" if name == "z_for_range" else rows.compared
-    return replace(rows, said=said, compared=compared)
+    elif name == FLIPS:
+        flipped = rng.random(len(said)) < 0.5
+        return replace(rows, yaw_off=np.where(
+            flipped[:, None], rows.yaw_off[:, ::-1], rows.yaw_off))
+    return replace(rows, said=said, compared="z" if name == STRAIGHT else rows.compared)
 
 
 def with_noise(rows, side, rng):
@@ -86,11 +86,10 @@ def with_noise(rows, side, rng):
     n, range_px = len(side), bias + rng.normal(0, spread) + rng.normal(0, noise, len(side))
     said = rows.said * (1 + range_px / side)[:, None]
     said[:, :2] += rng.normal(0, lateral, (n, 2)) * said[:, 2:] / rows.camera.fx_px
-    zeros = rng.normal(0, rows.zero_sd_m, 4)
+    tape = rng.normal(0, rows.zero_sd_m, 4) + rng.normal(0, rows.measured_sd)
+    yaw = rng.normal(0, rows.yaw_sd) + rng.normal(0, 3.0, n)
     return replace(
-        rows, said=said, tape=rows.tape + zeros[3] + rng.normal(0, rows.tape_sd),
-        position=rows.position + zeros[:3] + rng.normal(0, 1, (n, 3)) * rows.position_sd[:, None],
-        yaw=rows.yaw + rng.normal(0, rows.yaw_sd) + rng.normal(0, 3.0, n))
+        rows, said=said, measured=rows.measured + tape, yaw_off=rows.yaw_off + yaw[:, None])
 
 
 def observation(seed, pairs):
@@ -100,21 +99,21 @@ def observation(seed, pairs):
         rows = scene(rng)
         looked_for = [cause.name for cause in CAUSES if not cause.lacks(rows)]
         if pairs:
-            names = rng.choice([name for name in looked_for if name in PAIRED], 2, replace=False)
+            names = rng.choice([
+                name for name in looked_for if name not in {"agree", "units"}], 2, replace=False)
         else:
             names = rng.choice([*looked_for, *["agree"] * len(looked_for)], 1)
         # Sound rows are those of a reader who compares like with like.
-        if "z_for_range" not in names:
+        if STRAIGHT not in names:
             rows = replace(rows, compared="range")
         side = rows.side_px
-        for name in sorted(names, key=SINGLE.index):
+        for name in sorted(names, key=[cause.name for cause in CAUSES].index):
             rows = spoil(rows, name, rng)
             if name == "size":
                 side = rows.side_px  # of the marker as it is, which the image shows
         if (rows.said[:, 2] > 0).all():
             break
-    bias = rows.expected[0]
-    clean = replace(rows, said=rows.said * (1 + bias / side)[:, None])
+    clean = replace(rows, said=rows.said * (1 + rows.expected[0] / side)[:, None])
     return frozenset(map(str, names)) - {"agree"}, with_noise(rows, side, rng), clean
 
 
@@ -124,22 +123,20 @@ def separation(clean, truth):
     The squared distance in standard deviations, and the logarithm of the posterior odds, which also
     knows that a ratio of exactly 10/8 has a name.
     """
-    found = [each for each in rank(clean).explanations
-             if each.names == truth or not truth <= each.names]
+    found = [each for each in rank(clean) if each.names == truth or not truth <= each.names]
     if len(truth) < 2:
         found = [each for each in found if len(each.names) < 2]
     misfit = {each.names: float(each.misfit.min()) - 2 * each.yaw_evidence for each in found}
-    odds = {each.names: each.log_evidence for each in found}
-    return tuple(min((sign * (values[names] - values[truth]) for names in values
-                      if names != truth), default=math.inf)
-                 for values, sign in ((misfit, 1), (odds, -1)))
+    odds = {each.names: -each.log_evidence for each in found}
+    return tuple(min((values[names] - values[truth] for names in values if names != truth),
+                     default=math.inf) for values in (misfit, odds))
 
 
 def judged(seed, *, pairs=False):
     """Return what was put in, the causes named, and whether they can be told (None: between)."""
     truth, rows, clean = observation(seed, pairs)
-    found = rank(rows)
-    named = [each.names for each in (found.explanations[0], *found.rivals)]
+    ranked = rank(rows)
+    named = [each.names for each in (ranked[0], *rivals(ranked))]
     if not truth:
         return truth, named, None
     distance, log_odds = separation(clean, truth)

@@ -1,52 +1,105 @@
 """Judge the covariance of one detection on photographs: errors that no simulation has made.
 
-    python pipelines/diagnose/photographs.py PHOTOGRAPHS.zarr SCENE.toml [REPEATS]
+    python pipelines/diagnose/photographs.py PHOTOGRAPHS.zarr SCENE.toml|TWINS.zarr [REPEATS]
 
 PHOTOGRAPHS.zarr is a store of `sweep photos` with one refinement, SCENE.toml the scene that
-`sweep fit` found for them. The photographs' markers are simulated at their poses, REPEATS times,
-the model is made of these and judged on the photographs. Squared errors are divided by the
-covariance of the detection and of the photographs' own truth (`truth_std`).
+`sweep fit` found for them, TWINS.zarr a store of `sweep.twins`. The photographs' markers are
+simulated at their poses, REPEATS times, and the model is made of these. It judges the photographs
+as it is, and each photograph widened by all others. Errors are divided by the covariance of the
+detection and of the photographs' own truth (`truth_std`).
 """
 
 import itertools
 import sys
 
 import numpy as np
+import xarray as xr
 
 import sweep
 from sweep.analysis.intervals import clopper_pearson
-from sweep.diagnosis.detection import judged
+from sweep.analysis.poses import viewing_angle_of
+from sweep.diagnosis.detection import judged, widened
 
 CHANCES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 1.0)
+LIMIT = 0.1
+OFF = 1.276
+"""Factor of all six variances of which the divergence is `LIMIT`: 3 (f - 1 - ln f)."""
+
+DRAWS = 1000
 
 
-def mean_of(squares):
-    """Return squared errors in words."""
-    squares = squares[np.isfinite(squares)]
-    return (f"mean d2 {squares.mean():.2f} of 6, median {np.median(squares):.2f} of 5.35, "
-            f"{np.mean(squares > 16.81):.1%} above the 99 % quantile")
+def divergence(whitened):
+    """Return the KL divergence of whitened errors (..., n, 6) from the expected distribution."""
+    mean = whitened.mean(axis=-2)
+    left = whitened - mean[..., None, :]
+    s = left.swapaxes(-1, -2) @ left / (left.shape[-2] - 1)
+    return 0.5 * (np.trace(s, axis1=-2, axis2=-1) - 6 - np.linalg.slogdet(s)[1]
+                  + (mean**2).sum(axis=-1))
+
+
+def shared_part(whitened, photograph):
+    """Return the correlation of errors (n, 6) within a photograph."""
+    sums, pairs = 0.0, 0
+    for one in np.unique(photograph):
+        own = whitened[photograph == one] / whitened.std(axis=0)
+        sums += (own.sum(axis=0) ** 2 - (own**2).sum(axis=0)).sum()
+        pairs += 6 * len(own) * (len(own) - 1)
+    return max(sums / pairs, 0.0)
+
+
+def by_chance(whitened, photograph):
+    """Return divergences (draws,) that a perfect covariance gives at the same photographs."""
+    rng = np.random.default_rng(0)
+    _, photograph = np.unique(photograph, return_inverse=True)
+    part = shared_part(whitened, photograph)
+    shared = rng.normal(size=(DRAWS, photograph.max() + 1, 6))[:, photograph]
+    draws = np.sqrt(part) * shared + np.sqrt(1 - part) * rng.normal(size=shared.shape)
+    return divergence(draws), divergence(np.sqrt(OFF) * draws)
+
+
+def print_divergences(found):
+    """Print the divergence of all errors and of halves by distance and angle, and the verdict."""
+    found = found.isel(pose=np.isfinite(found["squared_error"].values))
+    distance = np.linalg.norm(found["tvec_m"], axis=1)
+    angle = viewing_angle_of(found["rvec"].values, found["tvec_m"].values)
+    bins = {"all": np.ones(len(distance), bool)}
+    for name, values, unit in (("distance", distance, "m"), ("angle", angle, "degrees")):
+        middle = np.median(values)
+        bins[f"{name} to {middle:.3g} {unit}"] = values <= middle
+        bins[f"{name} beyond"] = values > middle
+    for name, inside in bins.items():
+        whitened, photograph = (found[each].values[inside] for each in ("whitened", "photograph"))
+        kl, (perfect, off) = divergence(whitened), by_chance(whitened, photograph)
+        low, high = np.quantile(off, [0.05, 0.95])
+        verdict = "within" if kl < low else "beyond" if kl > high else "not decided"
+        print(f"    {name}: {len(whitened)} poses in {len(np.unique(photograph))} photographs, "
+              f"mean d2 {(whitened**2).sum(axis=1).mean():.2f}, KL {kl:.3f}; of a perfect "
+              f"covariance {np.median(perfect):.3f} (95 %: to {np.quantile(perfect, 0.95):.3f}), "
+              f"of one {LIMIT} off {low:.3f} to {high:.3f}: {verdict} {LIMIT}")
 
 
 def main(path, scene, repeats="8"):
-    """Print squared errors over variances, and flips expected and seen."""
+    """Print squared errors over variances, divergences, and flips expected and seen."""
     results = sweep.open(path).squeeze(drop=True).load()
-    simulated = sweep.twins(path, scene, repeats=int(repeats)).squeeze(drop=True).load()
-    found = judged(sweep.error_model(simulated), results)
-    known, flipped = found["known"].values, found["flipped"].values
-    print(f"{len(known)} solved poses in photographs, {known.sum()} known, {flipped.sum()} "
-          f"flipped: {mean_of(found.squared_error.values)}")
-    used = known & ~flipped
-    variance = (found.covariance.values[:, range(6), range(6)] + found.truth_std.values**2)[used]
-    for at, name in enumerate(("x", "y", "z", "about x", "about y", "about z")):
-        ratio = found.error.values[used][:, at] ** 2 / variance[:, at]
-        print(f"  {name}: mean squared error / variance {ratio.mean():.2f}, median "
-              f"{np.median(ratio):.2f} of 0.45")
-    for first in (0, 1):
-        halves = [results.isel(trial=slice(k, None, 2)) for k in (first, 1 - first)]
-        wider = sweep.error_model(simulated, photographs=halves[0])
-        print(f"  times the factor of one half of the photographs, on the other: "
-              f"{mean_of(judged(wider, halves[1]).squared_error.values)}")
-    chance = found["flip_probability"].values
+    simulated = sweep.open(scene) if scene.endswith(".zarr") else sweep.twins(
+        path, scene, repeats=int(repeats))
+    model = sweep.error_model(simulated.squeeze(drop=True).load())
+    count = results.sizes["trial"]
+    parts = {"as simulated": [], "widened by the other photographs": []}
+    for k in range(count):
+        others = results.isel(trial=[j for j in range(count) if j != k])
+        for of, each in zip((model, widened(model, others)), parts.values(), strict=True):
+            said = judged(of, results.isel(trial=[k]))
+            each.append(said.assign(photograph=("pose", np.full(said.sizes["pose"], k))))
+    for name, part in parts.items():
+        found = xr.concat(part, "pose")
+        squares = found["whitened"].values[np.isfinite(found["squared_error"].values)] ** 2
+        print(f"{name}: of {found.sizes['pose']} solved poses {found.known.values.sum()} known, "
+              f"{found.flipped.values.sum()} flipped; mean squared errors along and about the tilt,"
+              f" across and the line of sight {np.round(squares.mean(axis=0), 2)} of 1")
+        print_divergences(found)
+    chance, known, flipped = (
+        found[name].values for name in ("flip_probability", "known", "flipped"))
     for low, high in itertools.pairwise(CHANCES):
         part = known & (chance >= low) & (chance < high)
         if part.any():

@@ -30,26 +30,26 @@ from sweep.typing import Floats, Masks
 # such as apriltag's corners, which are half a pixel off, moves and turns the pose as a turn of the
 # camera would.
 
+# Knots of ln(side) and of the viewing angle.
 KNOTS = (7, 6)
-"""Knots of ln(side) and of the viewing angle."""
 
+# Shares of the poses below the knots of the ambiguity: flips are where it is near 1.
 AMBIGUITY_SHARES = (0.02, 0.4, 0.7, 0.85, 0.93, 0.98, 0.998)
-"""Shares of the poses below the knots of the ambiguity: flips are where it is near 1."""
 
+# Solved poses from which on a model is made.
 MIN_POSES = 2000
-"""Solved poses from which on a model is made."""
 
+# Poses in photographs from which on a factor of the covariance is known.
 MIN_PHOTOGRAPHED = 50
-"""Poses in photographs from which on a factor of the covariance is known."""
 
+# Poses (sum of hat functions) at each knot that is used, below which nothing is known there.
 MIN_AT_KNOT = 25.0
-"""Poses (sum of hat functions) at each knot that is used, below which nothing is known there."""
 
+# Rounds in which covariances at knots are fitted to what the last ones leave unexplained.
 ROUNDS = 6
-"""Rounds in which covariances at knots are fitted to what the last ones leave unexplained."""
 
+# Penalty on differences between neighbouring knots of the flips, in poses.
 RIDGE = 0.05
-"""Penalty on differences between neighbouring knots of the flips, in poses."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,7 @@ class DetectionModel:
     def from_json(cls, text: str) -> DetectionModel:
         """Return the model of `to_json`."""
         values: dict[str, Any] = {
-            name: np.array(value) if isinstance(value, list) else value
-            for name, value in json.loads(text).items()}
+            name: np.array(value)[()] for name, value in json.loads(text).items()}
         return cls(**values)
 
 

@@ -29,17 +29,17 @@ from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
 from sweep.report.table import UNDECIDED, Column, Findings, Table, Value, number
 
+# Causes in the table and in the figure.
 SHOWN = 6
-"""Causes in the table and in the figure."""
 
+# Posterior probability from which on a cause is shown.
 LEAST_SHARE = 0.001
-"""Posterior probability from which on a cause is shown."""
 
 COMPONENTS = ("x", "y", "z", "tape")
 
+# Squared misfit beyond the number of rows, in units of its standard deviation sqrt(2 d), at which
+# even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d.
 SURPRISING = 16.0
-"""Squared misfit beyond the number of rows, in units of its standard deviation sqrt(2 d), at which
-even the likeliest cause does not explain the rows: (misfit - d)² > 16 * 2 d."""
 
 
 def diagnose(

@@ -22,23 +22,23 @@ from sweep.typing import Floats
 # know stays the tape's, however wrong the program is. A scale that may be anything is a row of
 # narrow ones, each linear about its middle.
 
+# Relative standard deviation of a named ratio: by how much prints and rulers are off.
 NAMED_SD = 0.01
-"""Relative standard deviation of a named ratio: by how much prints and rulers are off."""
 
+# Standard deviations of ln(ratio): of a print or a calibration that is a little off, and of one
+# that is wrong altogether.
 SMALL_SD, FREE_SD = 0.03, 0.35
-"""Standard deviations of ln(ratio): of a print or a calibration that is a little off, and of one
-that is wrong altogether."""
 
+# Distance of the middles of ln(ratio) from one another.
 STEP = 0.06
-"""Distance of the middles of ln(ratio) from one another."""
 
+# Middles of ln(ratio) of sizes left at a default, and their spread.
 FAR = np.arange(1.6, 3.7, 0.4)
 FAR_SD = 0.25
-"""Middles of ln(ratio) of sizes left at a default, and their spread."""
 
+# Ratios of units that are taken for one another: mm, cm, m; inch and mm, cm; foot, inch and m.
 INCH = 25.4
 UNITS = (10.0, 100.0, 1000.0, INCH, INCH / 10.0, 1.0 / 0.3048, 1000.0 / INCH)
-"""Ratios of units that are taken for one another: mm, cm, m; inch and mm, cm; foot, inch and m."""
 
 FOCAL_RATIOS = {
     2.0: "calibrated at twice the resolution, or without binning",
@@ -52,14 +52,14 @@ FOCAL_RATIOS = {
 }
 
 
+# A way in which a cause is undone: logarithm of its prior probability; said position to true one,
+# at the middle of the prior; how many times too large what was said is, there; standard deviation
+# of ln(ratio) about it, 0 if there is no ratio; how many times larger the square is in the image
+# than f size / z of what was said; its name, empty if the ratio may be anything.
 Ways = NDArray[np.void]
 WAY = np.dtype([
     ("log_weight", np.float64), ("matrix", np.float64, (3, 3)), ("ratio", np.float64),
     ("spread", np.float64), ("square", np.float64), ("label", np.str_, 80)])
-"""A way in which a cause is undone: logarithm of its prior probability; said position to true one,
-at the middle of the prior; how many times too large what was said is, there; standard deviation of
-ln(ratio) about it, 0 if there is no ratio; how many times larger the square is in the image than
-f size / z of what was said; its name, empty if the ratio may be anything."""
 
 
 def ways_of(
@@ -78,10 +78,6 @@ def ways_of(
 def undone(ways: Sequence[Ways]) -> Floats:
     """Return said position to true one (c, 3, 3) by ways (c,) of several causes together."""
     return functools.reduce(np.matmul, (each["matrix"] for each in ways))
-
-
-def _as_it_is(_: Observations) -> Ways:
-    return ways_of(np.eye(3)[None])
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ class Cause:
     title: str
     prior: float
     test: str
-    ways: Callable[[Observations], Ways] = _as_it_is
+    ways: Callable[[Observations], Ways] = lambda _: ways_of(np.eye(3)[None])
     columns: Callable[[Observations, Floats, Floats], Sequence[Floats]] = lambda *_: ()
     lacks: Callable[[Observations], str] = lambda _: ""
     unit: tuple[float, str] = (1.0, "")
@@ -179,9 +175,9 @@ def along_sight(points: Floats) -> Floats:
     return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
 
 
+# Standard deviations of an offset of the lens, a turn of the frame, a bias of corners (pixels of
+# the square's side) and a delay.
 OFFSET_SD_M, TURN_SD_DEG, BIAS_SD_PX, DELAY_SD_S = 0.1, 4.0, 1.5, 0.1
-"""Standard deviations of an offset of the lens, a turn of the frame, a bias of corners (pixels of
-the square's side) and a delay."""
 
 
 def _offset_columns(rows: Observations, points: Floats, _spread: Floats) -> Sequence[Floats]:
@@ -240,6 +236,7 @@ def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]
     return [points * spread]
 
 
+# All causes; prior weights follow how often public questions turned out to be each.
 AGREE = "agree"
 FLIPS = "flips"
 UNITS_TAKEN = "units"
@@ -282,26 +279,25 @@ CAUSES = (
           lacks=lambda rows: "" if np.isfinite(rows.yaw_off).any()
           else "yaw_deg and rvec_x, rvec_y, ..."),
 )
-"""All causes; prior weights follow how often public questions turned out to be each."""
 
+# Prior weight of two causes at once, relative to one.
 PAIRS_PRIOR = 0.05
-"""Prior weight of two causes at once, relative to one."""
 
 
 # --------------------------------------------------------------------------------------------------
 # Evidence of each cause, or of two, and their posterior probabilities.
 
+# Posterior odds from which on one explanation is told from another: 0.95 to 0.05.
 CLEAR_ODDS = 20.0
-"""Posterior odds from which on one explanation is told from another: 0.95 to 0.05."""
 
+# Sides between which the refinement's bias and noise are expected.
 SIDE_LIMITS_PX = (8.0, 2000.0)
-"""Sides between which the refinement's bias and noise are expected."""
 
+# Prior share of rows that are flipped, where flips are the cause.
 FLIP_SHARE = 0.5
-"""Prior share of rows that are flipped, where flips are the cause."""
 
+# Standard deviation of an estimated yaw.
 ROTATION_SD_DEG = 3.0
-"""Standard deviation of an estimated yaw."""
 
 
 @dataclass(frozen=True)
@@ -439,13 +435,11 @@ def rank(rows: Observations) -> list[Explanation]:
     """Return all explanations of observations, by posterior probability."""
     found = [cause for cause in CAUSES if not cause.lacks(rows)]
     total = sum(cause.prior for cause in found)
-    chosen: list[tuple[tuple[Cause, ...], float]] = [
-        ((cause,), cause.prior / total) for cause in found]
-    chosen += [
-        ((a, b), PAIRS_PRIOR * a.prior * b.prior / total**2)
-        for a, b in itertools.combinations(
-            [cause for cause in found if cause.name not in {AGREE, UNITS_TAKEN}], 2)]
-    explanations = [explain(rows, causes, math.log(prior)) for causes, prior in chosen]
+    paired = [cause for cause in found if cause.name not in {AGREE, UNITS_TAKEN}]
+    explanations = [
+        explain(rows, causes, math.log(
+            PAIRS_PRIOR ** (len(causes) - 1) * math.prod(cause.prior / total for cause in causes)))
+        for causes in [*((cause,) for cause in found), *itertools.combinations(paired, 2)]]
     evidence = np.array([each.log_evidence for each in explanations])
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     return [dataclasses.replace(explanations[k], probability=float(share[k]))
@@ -462,14 +456,14 @@ def rivals(ranked: Sequence[Explanation]) -> list[Explanation]:
 # --------------------------------------------------------------------------------------------------
 # The next measurement: where two explanations differ most, in standard deviations.
 
+# Angles of a new marker to the optical axis.
 DIRECTIONS_DEG = (0.0, 20.0)
-"""Angles of a new marker to the optical axis."""
 
+# Sides of the square, in pixels and as a share of the frame's height, at which it is measured.
 FEWEST_PX, MOST_SHARE = 20.0, 0.6
-"""Sides of the square, in pixels and as a share of the frame's height, at which it is measured."""
 
+# Difference in standard deviations from which on one more row is worth taking.
 DECIDES = 2.0
-"""Difference in standard deviations from which on one more row is worth taking."""
 
 
 class Measurement(NamedTuple):
@@ -532,4 +526,4 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Meas
     k = int(np.argmin(np.where(enough, effort, np.inf)))
     return Measurement(
         float(distance[row[k]]), float(np.degrees(bearing[row[k]])),
-        {0: "x", 2: "z", 3: "distance"}[int(which[k])], float(difference[k]))
+        ("x", "y", "z", "distance")[which[k]], float(difference[k]))

@@ -29,61 +29,62 @@ from sweep.photographs.folder import detect_markers
 from sweep.photographs.truth import camera_of_file, cameras_of, lens_of
 from sweep.typing import Floats, Integers
 
+# Columns of numbers; further ones are refused, empty cells are unknown.
 MEASURED = ["x_m", "y_m", "z_m", "tape_m"]
 TVEC, RVEC = ["tvec_x_m", "tvec_y_m", "tvec_z_m"], ["rvec_x", "rvec_y", "rvec_z"]
 CORNERS = [f"corner{k}_{axis}_px" for k in range(4) for axis in "xy"]
 COLUMNS = [*TVEC, "range_m", *RVEC, *MEASURED, "tape_sd_m", "position_sd_m", "yaw_deg",
            "yaw_sd_deg", "speed_m_s", "marker_id", *CORNERS]
-"""Columns of numbers; further ones are refused, empty cells are unknown."""
 
+# Column of image files in which the corners are detected, from the CSV file's folder.
 IMAGE = "image"
-"""Column of image files in which the corners are detected, from the CSV file's folder."""
 
+# Column -> columns of which a row needs one beside it: of a vector it has all or none.
 NEEDED = {
     "tape_sd_m": ["tape_m"], "position_sd_m": MEASURED[:3], "yaw_sd_deg": ["yaw_deg"],
     "yaw_deg": [RVEC[0], CORNERS[0]],
     **{name: [other] for vector in (TVEC[:2], RVEC, CORNERS)
        for name, other in zip(vector, [*vector[1:], vector[0]], strict=True)}}
-"""Column -> columns of which a row needs one beside it: of a vector it has all or none."""
 
+# Column -> numbers between which it can be, in whatever unit.
 MOST_M = 1e7
 RANGES = {
     **dict.fromkeys((*TVEC[:2], *MEASURED), (-MOST_M, MOST_M)),
     **dict.fromkeys(("tvec_z_m", "range_m", "tape_m"), (1e-5, MOST_M)),
     **dict.fromkeys(("tape_sd_m", "position_sd_m", "yaw_sd_deg"), (1e-9, MOST_M))}
-"""Column -> numbers between which it can be, in whatever unit."""
 
+# Standard deviation of a tape if none is given: the larger of 2 mm and 0.5 %.
 TAPE_SD_M, TAPE_SHARE = 0.002, 0.005
-"""Standard deviation of a tape if none is given: the larger of 2 mm and 0.5 %."""
 
+# Standard deviation of the tape's zero point: where the lens' centre lies in its housing.
 ZERO_SD_M = 0.01
-"""Standard deviation of the tape's zero point: where the lens' centre lies in its housing."""
 
+# Standard deviation of a marker's yaw measured by eye and of one that was estimated.
 YAW_SD_DEG = 5.0
-"""Standard deviation of a marker's yaw measured by eye and of one that was estimated."""
 
+# Refinement -> bias of the range, its spread, its noise, and the centre's noise, in pixels: the
+# range is off by these pixels / side of the square. Medians of
+# `pipelines/diagnose/refinements.toml` (36h11 and 4X4_50, sides 25 to 220 px, tilts to 60 degrees);
+# the spread is what photographs differ from it by (light, sharpening, tone).
 REFINEMENTS: dict[str, tuple[float, float, float, float]] = {
     "none": (0.80, 0.30, 0.31, 0.19),
     "subpix": (0.35, 0.30, 0.12, 0.03),
     "contour": (1.07, 0.30, 0.17, 0.04),
     "apriltag": (0.02, 0.30, 0.06, 0.03),
 }
-"""Refinement -> bias of the range, its spread, its noise, and the centre's noise, in pixels: the
-range is off by these pixels / side of the square. Medians of `pipelines/diagnose/refinements.toml`
-(36h11 and 4X4_50, sides 25 to 220 px, tilts to 60 degrees); the spread is what photographs differ
-from it by (light, sharpening, tone)."""
 
+# Side of the square where neither camera nor size are known.
 UNKNOWN_REFINEMENT = (0.4, 0.6, 0.6, 0.3)
 UNKNOWN_SIDE_PX = 80.0
-"""Side of the square where neither camera nor size are known."""
 
+# Rows that are judged within half a minute.
 MAX_ROWS = 1000
-"""Rows that are judged within half a minute."""
 
+# Sides below this cannot be read: the numbers are in other units than the size.
 READABLE_PX = 4.0
-"""Sides below this cannot be read: the numbers are in other units than the size."""
 
 
+# Settings of `sweep diagnose`.
 BELIEFS = {each.name: each for each in (
     replace(PARAMETERS["size_m"], default=math.nan),
     replace(PARAMETERS["dictionary"], default=""),
@@ -91,7 +92,6 @@ BELIEFS = {each.name: each for each in (
     replace(PARAMETERS["size_m"], name="zero_sd_m", default=ZERO_SD_M),
     replace(PARAMETERS["cornerRefinementMethod"], name="compared", default="z",
             choices=("z", "range")))}
-"""Settings of `sweep diagnose`."""
 
 
 def beliefs(given: Mapping[str, Any]) -> dict[str, Any]:

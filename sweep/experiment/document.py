@@ -24,10 +24,10 @@ from sweep.experiment.grid import (
     TRIAL,
     Axis,
     Grid,
-    parse_axis,
+    axis_along,
+    axis_values,
     parse_distribution,
-    parse_trial,
-    zipped_axis,
+    trial_numbers,
 )
 from sweep.experiment.parameters import (
     EFFECTS_KEY,
@@ -409,62 +409,53 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
 def _read_axes(reading: Reading) -> None:
     quota = MAX_LISTED
     for key, value in reading.table("axes").items():
-        if key not in reading.parameters and key != TRIAL and is_zip(value):
-            axis = _read_zip(reading, key, value["zip"], quota)
-        else:
-            axis = _read_axis(reading, key, value, quota)
+        together = is_zip(value) and key not in (*reading.parameters, TRIAL)
+        axis = _read_axis(reading, key, value["zip"] if together else {key: value}, quota,
+                          together=together)
         if axis is not None:
             reading.axes.append(axis)
             listed = [v for v in axis.columns.values() if not isinstance(v, range)]
             quota -= len(axis) * len(listed)
 
 
-def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = "") -> Axis | None:
-    """Return the axis of one parameter, or note why there is none.
-
-    Of a parameter that goes together with others, ``table`` is the name of their axis.
-    """
-    path = f"axes.{table}.{key}" if table else f"axes.{key}"
-    with reading.noting(path, key, value):
-        if key == TRIAL and not table:
-            return parse_trial(value)
-        if key == TRIAL:
-            raise ValueError("it as an axis of its own: every cell has the same trials")
-        if key in reading.given:
-            other, _ = reading.written[key]
-            raise ValueError(f"it once: {other} is given too; delete one of them")
-        if key in reading.parameters:
-            reading.written[key] = path, value
-            return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
-        if isinstance(value, dict) and not value.keys().isdisjoint(("zip", *reading.parameters)):
-            raise ValueError(
-                "parameters that go together as "
-                "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip")
-        if not reading.unread or key in HEADER:
-            reading.unknown_key(path.removesuffix(f".{key}"), key, [*reading.parameters, TRIAL])
-    return None
-
-
-def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -> Axis | None:
-    """Return the axis of parameters that go together, or note why there is none."""
-    path = f"axes.{key}"
-    if not key.isidentifier():
+def _read_axis(
+    reading: Reading, key: str, members: Mapping[str, Any], quota: int, *, together: bool
+) -> Axis | None:
+    """Return the axis of a parameter, or of several that go together; note why there is none."""
+    path = f"axes.{key}" if together else "axes"
+    if together and not key.isidentifier():
         reading.note(plain(path), "expected a name of letters, digits and underscores")
         return None
     columns: dict[str, Sequence[Any]] = {}
     quota //= max(len(members), 1)
     for name, value in members.items():
-        axis = _read_axis(reading, name, value, quota, key)
-        if axis is not None and len(axis) > quota:
-            reading.fault(f"{path}.{name}", value, "at most 10^6 values, all axes together")
-        elif axis is not None:
-            columns[name] = axis.values
-    if len(members) < 2:
+        with reading.noting(f"{path}.{name}", name, value):
+            if name == TRIAL and together:
+                raise ValueError("it as an axis of its own: every cell has the same trials")
+            if name == TRIAL:
+                columns[name] = trial_numbers(value)
+            elif name in reading.given:
+                other, _ = reading.written[name]
+                raise ValueError(f"it once: {other} is given too; delete one of them")
+            elif name in reading.parameters:
+                reading.written[name] = f"{path}.{name}", value
+                values = axis_values(reading.parameters[name], value, quota, repeats=together)
+                if together and len(values) > quota:
+                    raise ValueError("at most 10^6 values, all axes together")
+                columns[name] = values
+            elif isinstance(value, dict) and not value.keys().isdisjoint((
+                    "zip", *reading.parameters)):
+                raise ValueError(
+                    "parameters that go together as "
+                    "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip")
+            elif not reading.unread or name in HEADER:
+                reading.unknown_key(path, name, [*reading.parameters, TRIAL])
+    if together and len(members) < 2:
         reading.fault(path, {"zip": members}, "at least two parameters that go together")
-    if len(columns) < max(len(members), 2):
+    if len(columns) < max(len(members), 1 + together):
         return None
     try:
-        return zipped_axis(key, columns, reading.parameters)
+        return axis_along(key, columns, reading.parameters, together=together)
     except ValueError as error:
         reading.note(path, f"expected {error}")
         return None

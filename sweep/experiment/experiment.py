@@ -26,7 +26,7 @@ from sweep.experiment.draws import (
     uniform,
 )
 from sweep.experiment.grid import TRIAL, Axis, Block, Grid, combinations
-from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, WORLD, Stage
+from sweep.experiment.parameters import NAMED_BY, PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.detectors import (
@@ -72,13 +72,11 @@ T = TypeVar("T")
 
 def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     """Return a parameter's values along an axis at indices (N,)."""
-    low, high = int(indices.min()), int(indices.max()) + 1
-    part = values[low:high]
-    if isinstance(part, range):
-        return Column.of(part.start + part.step * (indices - low))
-    if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
-        return Column.of(np.asarray(part, dtype=np.float64)[indices - low])
-    return Column.of([part[i] for i in (indices - low).tolist()])
+    if isinstance(values, range):
+        return Column.of(values.start + values.step * indices)
+    part = [values[index] for index in indices.tolist()]
+    numbers = all(type(value) in (int, float) for value in part)
+    return Column.of(np.array(part, dtype=np.float64) if numbers else part)
 
 
 ANY_MARKER = {
@@ -157,42 +155,40 @@ class Experiment:
     @cached_property
     def detectors(self) -> list[AnyDetectorSetting]:
         """The detector settings, in the order of the detection axes."""
-        return [
-            self._plugged("detector", values["detector"], values) or _made(DetectorSetting, values)
-            for values in self._settings("detector", Stage.detection)
-        ]
+        return [own or _made(DetectorSetting, values)
+                for values, own in self._settings("detector", Stage.detection)]
 
     @cached_property
     def board_settings(self) -> list[BoardDetectorSetting]:
         """What the detector settings do with boards, in their order."""
         return [_made(BoardDetectorSetting, values)
-                for values in self._settings("detector", Stage.detection)]
+                for values, _ in self._settings("detector", Stage.detection)]
 
     @cached_property
     def estimators(self) -> list[EstimatorSetting]:
         """The estimators, in the order of the estimation axes."""
         return [
-            _made(EstimatorSetting, values) if own is None
-            else _made(PluggedEstimatorSetting, values | {"own": own})
-            for values in self._settings("estimator", Stage.estimation)
-            for own in [self._plugged("estimator", values["solver"], values)]
+            _made(PluggedEstimatorSetting, values | {"own": own}) if own
+            else _made(EstimatorSetting, values)
+            for values, own in self._settings("estimator", Stage.estimation)
         ]
 
-    def _settings(self, section: str, stage: Stage) -> list[dict[str, Any]]:
-        """Return the values of a section at all combinations of a stage's axes, in their order."""
-        fixed = {
-            p.name: self.grid.fixed.get(p.name, p.default)
-            for p in self.grid.parameters.values() if p.section == section
-        }
-        return [fixed | chosen for chosen in combinations(self.grid.axes_of(stage))]
+    def _settings(
+        self, section: str, stage: Stage
+    ) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
+        """Yield the values of a section at all combinations of a stage's axes, in their order.
 
-    def _plugged(self, kind: str, name: str, values: Mapping[str, Any]) -> PluginSetting | None:
-        """Return the settings of a plug-in; None for what is built in."""
-        plugin = self.grid.plugin(kind, name)
-        if plugin is None:
-            return None
-        own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
-        return PluginSetting(plugin, own, self.grid.folder)
+        Beside them the settings of the plug-in that they name; None for what is built in.
+        """
+        grid, named_by = self.grid, NAMED_BY[section].name
+        fixed = {p.name: grid.fixed.get(p.name, p.default)
+                 for p in grid.parameters.values() if p.section == section}
+        for chosen in combinations(grid.axes_of(stage)):
+            values = fixed | chosen
+            plugin = grid.plugin(section, values[named_by])
+            yield values, plugin and PluginSetting(
+                plugin, tuple((each.name, values[each.name]) for each in plugin.settings),
+                grid.folder)
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
@@ -233,10 +229,8 @@ class Experiment:
     @cached_property
     def cell_shapes(self) -> dict[str, tuple[int, ...]]:
         """Variable -> its configurations, then the lengths of its inner dimensions."""
-        return {
-            variable.name: (variable.configurations(self.grid), *variable.inner_shape)
-            for variable in self.variables
-        }
+        return {variable.name: (variable.configurations(self.grid), *variable.inner_shape)
+                for variable in self.variables}
 
     def bytes_of(self, scenes: int) -> int:
         """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
@@ -248,19 +242,13 @@ class Experiment:
         self, indices: Sequence[NDArray[np.intp]]
     ) -> tuple[dict[str, Column], NDArray[np.int64]]:
         """Return the scene parameters as they are given at ``indices``, and the trials (N,)."""
-        values = dict(self._constants)
+        parameters = self.grid.parameters
+        values = {name: Column(value, constant=True) for name, value in self.grid.fixed.items()
+                  if parameters[name].stage is Stage.scene}
         for axis, index in zip(self.scene_axes, indices, strict=True):
             values |= {name: _column(along, index) for name, along in axis.columns.items()}
         count = len(indices[0]) if self.scene_axes else 1
         return values, values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
-
-    @cached_property
-    def _constants(self) -> dict[str, Column]:
-        """The scene's parameters that are fixed."""
-        return {
-            name: Column(value, constant=True) for name, value in self.grid.fixed.items()
-            if self.grid.parameters[name].stage is Stage.scene
-        }
 
     def scene_values(self, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
         """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
@@ -278,24 +266,21 @@ class Experiment:
         if "background" not in drawn:
             values["background"] = values["background"].map(partial(_absolute, grid.folder))
         jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
-        values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
-        noisy = any(
-            effect.switch in drawn or values[effect.switch].differs_from(effect.off)
-            for effect in self.effects if effect.random
-        )
+        values |= dict.fromkeys(SHIFTS, Column.of(0.0))
+        noisy = any(effect.switch in drawn or values[effect.switch].differs_from(effect.off)
+                    for effect in self.effects if effect.random)
         poses = {} if values[PHOTOGRAPHS].missing else recorded_poses(
             values, trials, grid.folder, simulated=grid.is_simulated)
         if grid.shows_photographs:
             return values | poses
-        given = dict(values)
+        given, calibration = dict(values), grid.calibration
         keys = cache(partial(geometry_keys, given, drawn, count))
         # What is drawn for a photograph is the same for all its markers; their noise is not.
         shared = cache(partial(geometry_keys, given | ANY_MARKER, drawn, count)) if poses else keys
         # Quantities that are drawn together: the jitter comes after the distributions, so that
         # whether there is any changes nothing for them.
-        calibration = grid.calibration
-        calibrated = () if calibration is None else calibration.names
-        together = [*sorted(drawn), *SHIFTS, *(CALIBRATED + name for name in calibrated)]
+        together = [*sorted(drawn), *SHIFTS, *(
+            CALIBRATED + name for name in (calibration.names if calibration else ()))]
 
         def draw(quantity: str, keys: Callable[[], NDArray[np.uint64]] = keys) -> Floats:
             dimension = together.index(quantity) if grid.sampling == "sobol" else None
@@ -306,7 +291,7 @@ class Experiment:
         if (jitter > 0).any():
             for name in SHIFTS:
                 values[name] = Column.of(jitter * (2 * draw(name) - 1))
-        if calibration is not None:
+        if calibration:
             values |= calibrated_columns(calibration, values, count, draw)
         if noisy:
             values["noise_key"] = Column.of(bits(grid.seed, "noise", keys(), trials))
@@ -327,15 +312,11 @@ class Experiment:
         if "background" in values:  # an image is known by its content
             values["background"] = values["background"].map(
                 lambda value: grid.files.get(value) or value)
-        texts = [
-            key_texts(name, values[name], grid.parameters[name].default)
-            for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())
-        ]
-        texts += [
-            Column.of(f"{name}={distribution}")
-            for name, distribution in sorted(grid.distributions.items())
-            if grid.parameters[name].stage is Stage.scene
-        ]
+        texts = [key_texts(name, values[name], grid.parameters[name].default)
+                 for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())]
+        texts += [Column.of(f"{name}={distribution}")
+                  for name, distribution in sorted(grid.distributions.items())
+                  if grid.parameters[name].stage is Stage.scene]
         return bits(grid.seed, f"image {grid.sampling}", hashed(texts, len(trials)), trials)
 
 
@@ -363,32 +344,25 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     >>> used_settings(pipeline, {"solver": "ippe", "estimate_blur": True})
     {'solver': 'ippe'}
     """
-    chosen = {
-        name: several[0] for name in ("detector", "solver")
-        if len(several := list(set(pipeline.values_of(name)))) == 1
-    }
+    # Each setting that some detectors or solvers have and others lack, with its owner.
+    owned = [("detector", OPENCV, {*OPENCV_FIELDS})]
+    owned += [("solver", name, {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded})
+              for name, solver in SOLVERS.items()]
+    owned += [(NAMED_BY[plugin.kind].name, plugin.name, {each.name for each in plugin.settings})
+              for plugin in pipeline.plugins if plugin.kind in NAMED_BY]
     axes = {name: pipeline.axis(name) for name in values}
-    for name, axis in axes.items():
-        if axis is not None and values[name] in list(axis.values):
-            chosen |= axis.at(list(axis.values).index(values[name]))
     unused: set[str] = set()
-    for name, table in _settings_of(pipeline).items():
-        if name in chosen:
-            unused |= set().union(*table.values()) - table.get(chosen[name], set())
+    for named_by in ("detector", "solver"):
+        chosen = set(pipeline.values_of(named_by))
+        for name, axis in axes.items():
+            if axis is not None and named_by in axis.columns and values[name] in axis.values:
+                chosen = {axis.at(axis.values.index(values[name]))[named_by]}
+        if len(chosen) == 1:
+            unused |= {setting for kind, _, own in owned for setting in own if kind == named_by}
+            unused -= {setting for kind, owner, own in owned for setting in own
+                       if kind == named_by and owner in chosen}
     return {name: value for name, value in values.items()
             if (axis := axes[name]) is None or not unused.issuperset(axis.columns)}
-
-
-def _settings_of(pipeline: Grid) -> dict[str, dict[str, set[str]]]:
-    """Return the settings that each detector and each solver has, of those that others lack."""
-    plugged: dict[str, dict[str, set[str]]] = {"detector": {}, "estimator": {}}
-    for plugin in pipeline.plugins:
-        plugged.setdefault(plugin.kind, {})[plugin.name] = {each.name for each in plugin.settings}
-    return {
-        "detector": {OPENCV: {*OPENCV_FIELDS}, **plugged["detector"]},
-        "solver": {name: {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded}
-                   for name, solver in SOLVERS.items()} | plugged["estimator"],
-    }
 
 
 def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -400,18 +374,15 @@ def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[
 
 
 def _truths(grid: Grid) -> dict[str, Any]:
-    """Return the true value of each belief, None where it varies."""
-    fixed = grid.fixed
-    view: Sequence[Any] = (None,) * 4 if any(name not in fixed for name in VIEW_PARAMETERS) else (
-        intrinsics(*(fixed[name] for name in VIEW_PARAMETERS)))
-    lens = fixed.get("distortion")
-    return {
-        **{f"believed_{name}_px": value
-           for name, value in zip(("fx", "fy", "cx", "cy"), view, strict=True)},
-        "believed_focal_scale": 1.0, "believed": "truth",
-        "believed_distortion": None if lens is None else canonical_distortion(lens),
-        **{f"believed_{name}": fixed.get(name) for name in ("size_m", "blur_px", "noise_grey")},
-    }
+    """Return the true value of each belief; none, or None, where it varies."""
+    truths = {name: grid.fixed.get(name) for name in ("size_m", "blur_px", "noise_grey")}
+    if "distortion" in grid.fixed:
+        truths["distortion"] = canonical_distortion(grid.fixed["distortion"])
+    if grid.fixed.keys() >= {*VIEW_PARAMETERS}:
+        view = intrinsics(*(grid.fixed[name] for name in VIEW_PARAMETERS))
+        truths |= zip(("fx_px", "fy_px", "cx_px", "cy_px"), view, strict=True)
+    return {"believed": "truth", "believed_focal_scale": 1.0} | {
+        f"believed_{name}": truth for name, truth in truths.items()}
 
 
 def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
@@ -429,9 +400,8 @@ def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
     """
     truths = _truths(pipeline)
     return tuple(
-        any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
-        for k in range(len(axis))
-    )
+        any(_differs(value, truths.get(name)) for name, value in axis.at(k).items())
+        for k in range(len(axis)))
 
 
 def wrong_configurations(pipeline: Grid, axes: Sequence[Axis]) -> list[bool]:
@@ -448,11 +418,10 @@ def _differs(believed: Any, truth: Any) -> bool:
     """Return whether a belief is known to differ from the truth, beyond rounding."""
     if believed is None or truth is None:
         return False
-    if isinstance(believed, tuple):
-        believed = canonical_distortion(believed)
-    if not isinstance(believed, (int, float)):
-        return bool(believed != truth)
-    return not math.isclose(believed, truth, rel_tol=1e-9)
+    if isinstance(believed, (int, float)):
+        return not math.isclose(believed, truth, rel_tol=1e-9)
+    lens = isinstance(believed, tuple)
+    return bool((canonical_distortion(believed) if lens else believed) != truth)
 
 
 Range = tuple[float, float]
@@ -518,20 +487,16 @@ class Facts:
         Every quantity of a camera is monotonic in each of its parameters, so that the corners of
         the grid have its ends.
         """
-        axes = self.experiment.scene_axes
-        lengths = [len(axis) for axis in axes]
-        if math.prod(lengths) <= MAX_SAMPLE:
-            indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-            return max(math.prod(lengths), 1), self.experiment.scene_values(indices)
+        scenes = self.experiment.all_scenes
+        if len(scenes) <= MAX_SAMPLE:
+            return len(scenes), self.experiment.scene_values(scenes.indices())
         # The bits of a corner's number say at which end of each axis it is.
-        corners = np.arange(min(2 ** len(axes), MAX_CORNERS))
+        corners = np.arange(min(2 ** len(scenes.stops), MAX_CORNERS))
         anywhere = np.random.default_rng(0)
         return MAX_SAMPLE, self.experiment.scene_values([
-            np.concatenate([
-                (corners >> k & 1) * (length - 1),
-                anywhere.integers(0, length, MAX_SAMPLE - len(corners)),
-            ]).astype(np.intp) for k, length in enumerate(lengths)
-        ])
+            np.concatenate([(corners >> k & 1) * (length - 1),
+                            anywhere.integers(0, length, MAX_SAMPLE - len(corners))])
+            for k, length in enumerate(scenes.stops)])
 
     # The camera.
 
@@ -549,11 +514,10 @@ class Facts:
         """
         count, values = self._sample
         fx, fy, cx, cy = build_cameras(values, count).view.T
-        width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
-        given = values["side_px"]
+        width, height, side, size, distance = (values[name].broadcast(count) for name in (
+            "width_px", "height_px", "side_px", "size_m", "distance_m"))
         with np.errstate(divide="ignore"):
-            sides = given.broadcast(count) if not given.missing else (
-                fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
+            sides = fx * size / distance if values["side_px"].missing else side
         sides = sides[sides > 0]  # before the camera
         numbers = {
             "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
@@ -564,9 +528,8 @@ class Facts:
         }
         return {name: _ends(each) for name, each in numbers.items()} | {
             "square": bool(np.all(are_square(fx, fy))),
-            "side_px": None if not len(sides) else tuple(
-                end * scale for end, scale in zip(
-                    _ends(sides), self.grid.relative_sizes, strict=True)),
+            "side_px": tuple(np.multiply(_ends(sides), self.grid.relative_sizes).tolist())
+            if len(sides) else None,
             "boards": self.grid.shows_boards,
         }
 
@@ -582,36 +545,30 @@ class Facts:
         focal = f"fx = fy = {_text(camera['fx_px'])} px" if camera["square"] else (
             f"fx = {_text(camera['fx_px'])} px, fy = {_text(camera['fy_px'])} px "
             f"(pixels are not square: fy/fx = {_text(camera['aspect'], 4)})")
-        sides = camera["side_px"] and f", {self._whose} {_text(camera['side_px'], 4)} px"
+        whose = "the markers' sides are" if camera["boards"] else "the marker's side is"
+        sides = camera["side_px"] and f", {whose} {_text(camera['side_px'], 4)} px"
         return (f"{self._frame}, {focal}, HFOV {_text(camera['hfov_deg'], 4)}°, "
                 f"VFOV {_text(camera['vfov_deg'], 4)}°{sides or ''}")
 
     @property
-    def _whose(self) -> str:
-        """Whose sides the camera sees, in words."""
-        return "the markers' sides are" if self.camera["boards"] else "the marker's side is"
-
-    @property
     def camera_attributes(self) -> dict[str, Any]:
         """The dataset's attributes of the camera: a number, or the least and the largest one."""
-        return {
-            f"camera_{name}": low if low == high else [low, high]
-            for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")
-            for low, high in [self.camera[name]]
-        } | dict(zip(("farthest_side_px", "nearest_side_px"), self.camera["side_px"] or (),
-                     strict=False))
+        ends = {name: self.camera[name] for name in ("fx_px", "fy_px", "hfov_deg", "vfov_deg")}
+        sides = zip(("farthest_side_px", "nearest_side_px"), self.camera["side_px"] or (),
+                    strict=False)
+        return {f"camera_{name}": low if low == high else [low, high]
+                for name, (low, high) in ends.items()} | dict(sides)
 
     @property
     def camera_notes(self) -> Iterator[str]:
         """A line for each property of the camera that may surprise."""
         for axis in "xy":
-            centre = f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}"
             off = max(map(abs, self.camera[f"off_centre_{axis}"]))
-            if off > 0.5:
-                yield f"{centre}: outside the frame of {self._frame}"
-            elif off > OFF_CENTRE:
-                yield (f"{centre}: far from the centre of the frame of {self._frame}; is it that "
-                       "of another frame size?")
+            where = "outside" if off > 0.5 else "far from the centre of"
+            doubt = "" if off > 0.5 else "; is it that of another frame size?"
+            if off > OFF_CENTRE:
+                yield (f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}: {where} the frame of "
+                       f"{self._frame}{doubt}")
         x, y = (self.camera[name][0] / 2 for name in ("width_px", "height_px"))
         if (self.camera["cx_px"], self.camera["cy_px"]) == ((x, x), (y, y)):
             yield (f"cx_px = {x:g}, cy_px = {y:g}: half the frame; with pixel (0, 0) at the "
@@ -663,30 +620,26 @@ class Facts:
     @property
     def pose_notes(self) -> Iterator[str]:
         """A line for each reason for which markers are not wholly seen; the first counts."""
-        scenes, target = self._scenes, self.grid.target_word
+        scenes, target, corners = self._scenes, self.grid.target_word, self._scenes.corners_px
         within = f"; frame_x and frame_y place a {target} within it" * (
             self.grid.given.isdisjoint((*WORLD, "frame_x", "frame_y")))
-        left = np.ones(len(scenes), dtype=bool)
-
-        def outside() -> Masks:
-            rows, wholly = np.flatnonzero(left), np.zeros_like(left)
-            wholly[rows] = outside_frame(scenes, rows)
-            return wholly
-
-        corners = scenes.corners_px
-        reasons: tuple[tuple[Callable[[], Any], str], ...] = (
-            (lambda: ~np.isfinite(scenes.outline_px).all(axis=(1, 2)),
-             "have a corner behind the camera: not_visible"),
-            (lambda: hidden(scenes),
+        behind = ~np.isfinite(scenes.outline_px).all(axis=(1, 2))
+        turned, folded = hidden(scenes), not_modelled(scenes)
+        # Of scenes that nothing else keeps from being seen: others have no place in the frame.
+        outside, rows = np.zeros_like(behind), np.flatnonzero(~(behind | turned | folded))
+        outside[rows] = outside_frame(scenes, rows)
+        cut = ((corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)).any((1, 2))
+        left = np.ones_like(behind)
+        for reason, what in (
+            (behind, "have a corner behind the camera: not_visible"),
+            (turned,
              f"show the {target}'s back or edge (a viewing angle of 90° or more): not_visible"),
-            (lambda: not_modelled(scenes),
+            (folded,
              "lie where the lens folds, or bend or move out of what is modelled: not_modelled"),
             (outside, f"are outside the frame: not_visible{within}"),
-            (lambda: ((corners < -0.5) | (corners > scenes.frame[:, None, :] - 0.5)).any((1, 2)),
-             "are cut off by the frame's edge"),
-        )
-        for reason, what in reasons:
-            chosen = np.asarray(left & reason())
+            (cut, "are cut off by the frame's edge"),
+        ):
+            chosen = left & reason
             left &= ~chosen
             if chosen.mean() > MIN_SHARE:
                 yield f"{self._share(chosen)} {what}"
@@ -696,9 +649,9 @@ class Facts:
     @property
     def detector_notes(self) -> Iterator[str]:
         """A line for each property of the detections that may surprise."""
-        squares = "aprilgrid" in self.grid.values_of("kind") or any(
-            self.grid.values_of("corner_squares"))
-        if squares and self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector")):
+        squares = ["aprilgrid" in self.grid.values_of("kind"),
+                   *self.grid.values_of("corner_squares")]
+        if any(squares) and self.grid.given.isdisjoint(("adaptiveThreshConstant", "detector")):
             yield ("board: squares touch its markers' corners, and OpenCV's default threshold "
                    "joins both: it finds a third of sharp markers; adaptiveThreshConstant = 60, "
                    "adaptiveThreshWinSizeMax = 33 and adaptiveThreshWinSizeStep = 4 find four in "
@@ -718,7 +671,7 @@ class Facts:
     @cached_property
     def parts(self) -> list[Part]:
         """Every optional part, active or not."""
-        grid, effects, settings = self.grid, self.experiment.effects, self.experiment.detectors
+        grid, effects = self.grid, self.experiment.effects
         on = [effect for effect in effects
               if effect.switch in grid.distributions
               or grid.any_value(effect.switch, effect.is_on)]
@@ -734,9 +687,9 @@ class Facts:
         coarse = any("noise" in effect.worsens for effect in on)
         around = f" px around the {grid.target_word}'s pixels" + (
             f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
-        windows = {margin_px(each) for each in settings if full_frame_reason(each) is None}
-        if image or "full" in grid.values_of("window"):
-            windows = set()
+        windows = {margin_px(each) for each in self.experiment.detectors
+                   if full_frame_reason(each) is None and not image
+                   and "full" not in grid.values_of("window")}
         assumptions = [
             name for name in PARAMETERS
             if name.startswith("believed_") and grid.fixed.get(name, "varies") is not None

@@ -5,10 +5,11 @@ from __future__ import annotations
 import collections
 import itertools
 import math
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -154,58 +155,14 @@ class Distribution:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
 
-@dataclass(frozen=True, slots=True)
-class Form:
-    """A form in which the values of an axis are generated.
-
-    Attributes
-    ----------
-    expected
-        The numbers of the form, in words.
-    lengths
-        How many there may be.
-    count
-        Returns how many values they make; 0 for numbers that make none.
-    values
-        Returns the values.
-    """
-
-    expected: str
-    lengths: tuple[int, ...]
-    count: Callable[..., int]
-    values: Callable[..., Any]
-
-
-def _range(*ends: int) -> range:
-    sound = 0 not in ends[2:] and all(isinstance(end, int) and abs(end) < 2**62 for end in ends)
-    return range(*ends) if sound else range(0)
-
-
-def _steps(start: float, stop: float, step: float) -> int:
-    steps = (float(stop) - float(start)) / step if step else 0.0
-    # Half-open also if the last step misses the stop only by rounding.
-    return math.ceil(min(max(steps, 0.0), 2.0 * MAX_VALUES) - 1e-9)
-
-
-def _stepped(*ends: float) -> Sequence[float]:
-    if all(isinstance(end, int) for end in ends):
-        return range(*map(int, ends))
-    start, _, step = map(float, ends)
-    return [start + step * i for i in range(_steps(*ends))]
-
-
-def _spaced(_first: float, _last: float, count: float) -> int:
-    return count if isinstance(count, int) else 0
-
-
 AXIS_FORMS = {
-    "range": Form("[start, stop] or [start, stop, step], whole numbers, half-open", (2, 3),
-                  lambda *ends: len(_range(*ends)), _range),
-    "arange": Form("[start, stop, step], half-open", (3,), _steps, _stepped),
-    "linspace": Form("[first, last, count], both inclusive", (3,), _spaced, np.linspace),
-    "geom": Form("[first, last, count], both inclusive, above 0", (3,),
-                 lambda *ends: _spaced(*ends) if min(ends) > 0 else 0, np.geomspace),
+    "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
+    "arange": "[start, stop, step], half-open",
+    "linspace": "[first, last, count], both inclusive",
+    "geom": "[first, last, count], both inclusive, above 0",
 }
+"""Forms in which the values of an axis are generated -> their numbers, in words."""
+
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
 
 
@@ -227,8 +184,7 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if not parameter.drawable:
         drawable = ", ".join(p.name for p in PARAMETERS.values() if p.drawable)
         raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
-    sound = isinstance(ends, list) and len(ends) == 2 and _are_numbers(ends)
-    if not sound or not ends[1] > (ends[0] if kind == "uniform" else 0):
+    if not _are_numbers(ends, 2) or not ends[1] > (ends[0] if kind == "uniform" else 0):
         raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
     a, b = map(float, ends)
     if kind == "uniform":
@@ -240,22 +196,23 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     return Distribution(kind, a, b)
 
 
-def _are_numbers(values: Sequence[Any]) -> bool:
-    return all(isinstance(value, (int, float)) and not isinstance(value, bool)
-               and abs(value) < 1e300 for value in values)
+def _are_numbers(values: Any, *lengths: int) -> bool:
+    """Return whether a value of the document is a list of numbers of one of some lengths."""
+    return isinstance(values, list) and len(values) in lengths and all(
+        type(value) in (int, float) and abs(value) < 1e300 for value in values)
 
 
-def parse_trial(value: Any) -> Axis:
-    """Return the axis of ``trial = N``; ValueError with the expectation if N is not a count."""
-    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_VALUES:
+def trial_numbers(value: Any) -> range:
+    """Return the values of ``trial = N``; ValueError with the expectation if N is not a count."""
+    if type(value) is not int or not 1 <= value <= MAX_VALUES:
         raise ValueError(f"a whole number from 1 to {MAX_VALUES:,}: how many draws")
-    return Axis(TRIAL, {TRIAL: range(value)})
+    return range(value)
 
 
-def parse_axis(
+def axis_values(
     parameter: Parameter, given: Any, quota: int = MAX_LISTED, *, repeats: bool = False
-) -> Axis:
-    """Return the axis of a list or of a table such as ``{ geom = [0.05, 1, 40] }``.
+) -> Sequence[Any]:
+    """Return the values of a list or of a table such as ``{ geom = [0.05, 1, 40] }``.
 
     Parameters
     ----------
@@ -275,7 +232,7 @@ def parse_axis(
 
     Examples
     --------
-    >>> parse_axis(PARAMETERS["tilt_deg"], {"linspace": [0, 60, 3]}).values
+    >>> axis_values(PARAMETERS["tilt_deg"], {"linspace": [0, 60, 3]})
     (0.0, 30.0, 60.0)
     """
     table = {"values": given} if isinstance(given, list) else given
@@ -293,8 +250,7 @@ def parse_axis(
     if form not in known or len(table) != 1:
         raise ValueError(f"a list, or a table with one of {', '.join(known)}{nearest(form, known)}")
     if form in AXIS_FORMS:
-        return Axis(parameter.name, {parameter.name: _generated(parameter, form, ends, quota)},
-                    (parameter,))
+        return _generated(parameter, form, ends, quota)
     if not isinstance(ends, list):
         raise ValueError(f"{form} = a list")  # noqa: TRY004  (a fault of the file)
     if len(ends) > quota:
@@ -305,34 +261,50 @@ def parse_axis(
     value, count = collections.Counter(values).most_common(1)[0]
     if count > 1 and not repeats:
         raise ValueError(f"each value once ({shown(value)} is repeated)")
-    return Axis(parameter.name, {parameter.name: values}, (parameter,))
+    return values
 
 
-def _generated(parameter: Parameter, name: str, ends: Any, quota: int) -> Sequence[Any]:
-    """Return the values of a form that generates them."""
-    form = AXIS_FORMS[name]
-    sound = isinstance(ends, list) and len(ends) in form.lengths and _are_numbers(ends)
-    count = form.count(*ends) if sound else 0
+def _generated(parameter: Parameter, form: str, ends: Any, quota: int) -> Sequence[Any]:
+    """Return the values of a form that generates them; a ``range`` is not written out."""
+    integers = isinstance(ends, list) and all(type(e) is int and abs(e) < 2**62 for e in ends)
+    count = 0
+    if not _are_numbers(ends, *((2, 3) if form == "range" else (3,))):
+        pass
+    elif form in ("linspace", "geom"):
+        count = ends[2] if type(ends[2]) is int and (form == "linspace" or min(ends) > 0) else 0
+    elif form == "range":
+        count = len(range(*ends)) if integers and 0 not in ends[2:] else 0
+    elif ends[2]:
+        steps = (float(ends[1]) - float(ends[0])) / ends[2]
+        # Half-open also if the last step misses the stop only by rounding.
+        count = math.ceil(min(max(steps, 0.0), 2.0 * MAX_VALUES) - 1e-9)
     if count < 1:
-        raise ValueError(f"{name} = {form.expected}, at least one value")
-    is_whole = parameter.types == (int,)
-    if count > (MAX_VALUES if is_whole and name == "range" else quota):
-        raise ValueError(f"at most {MAX_VALUES:,} values" if name == "range" else TOO_MANY)
-    values: Sequence[Any] = form.values(*ends)
+        raise ValueError(f"{form} = {AXIS_FORMS[form]}, at least one value")
+    whole = parameter.types == (int,)
+    if count > (MAX_VALUES if whole and form == "range" else quota):
+        raise ValueError(f"at most {MAX_VALUES:,} values" if form == "range" else TOO_MANY)
+    values: Any
+    if form in ("linspace", "geom"):
+        values = (np.linspace if form == "linspace" else np.geomspace)(*ends)
+    elif integers:
+        values = range(*ends)
+    else:
+        start, _, step = map(float, ends)
+        values = [start + step * i for i in range(count)]
     # All are numbers: if the least and the largest are admitted, all are.
     for end in (values[0], values[-1]):
         _checked(parameter, end)
-    return values if is_whole else tuple(map(float, values))
+    return values if whole else tuple(map(float, values))
 
 
 TOO_MANY = f"at most {MAX_LISTED:,} values, all axes together"
 
 
-def zipped_axis(
+def axis_along(
     name: str, columns: Mapping[str, Sequence[Any]],
-    parameters: Mapping[str, Parameter] = PARAMETERS,
+    parameters: Mapping[str, Parameter] = PARAMETERS, *, together: bool = True,
 ) -> Axis:
-    """Return the axis along which parameters go together, of ``parameters`` by their names.
+    """Return the axis of the values of one parameter, or of several that go together.
 
     Raises
     ------
@@ -342,15 +314,17 @@ def zipped_axis(
 
     Examples
     --------
-    >>> zipped_axis("lens", {"fx_px": (600.0, 800.0), "fy_px": (600.0, 802.5)}).values
+    >>> axis_along("lens", {"fx_px": (600.0, 800.0), "fy_px": (600.0, 802.5)}).values
     ('600, 600', '800, 802.5')
     """
-    together = tuple(parameters[key] for key in columns)
+    members = tuple(parameters[key] for key in columns if key != TRIAL)
+    if not together:
+        return Axis(name, columns, members)
     if len({len(values) for values in columns.values()}) > 1:
         counts = ", ".join(f"{key} has {len(values):,}" for key, values in columns.items())
         raise ValueError(f"equally many values of each parameter: {counts}")
-    if len({each.stage for each in together}) > 1:
-        listed = ", ".join(f"{each.name} is of the {each.stage.name}" for each in together)
+    if len({each.stage for each in members}) > 1:
+        listed = ", ".join(f"{each.name} is of the {each.stage.name}" for each in members)
         raise ValueError(f"parameters of one stage: {listed}")
     rows = list(zip(*columns.values(), strict=True))
     labels = tuple(", ".join(map(_short, row)) for row in rows)
@@ -359,7 +333,7 @@ def zipped_axis(
         raise ValueError(f"each combination once ({plain(labels[rows.index(row)])} is repeated)")
     if len(set(labels)) < len(labels):
         labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
-    return Axis(name, {key: tuple(values) for key, values in columns.items()}, together, labels)
+    return Axis(name, {key: tuple(values) for key, values in columns.items()}, members, labels)
 
 
 def _short(value: Any) -> str:
@@ -379,10 +353,7 @@ def _checked(parameter: Parameter, value: Any) -> Any:
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
     """Return the parameters' values at all combinations of axes, the last axis fastest."""
     rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
-    return [
-        {name: value for row in chosen for name, value in row.items()}
-        for chosen in itertools.product(*rows)
-    ]
+    return [reduce(operator.or_, chosen, {}) for chosen in itertools.product(*rows)]
 
 
 # --------------------------------------------------------------------------------------------------

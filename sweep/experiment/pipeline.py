@@ -265,34 +265,31 @@ def read_camera_file(reading: Reading) -> None:
     folder = Path(reading.folder)
     path, camera = file_and_camera(written, lambda path: (folder / path).is_file())
     try:
-        content = read_regular(folder / path, MAX_BYTES)
-        calibration = calibration_of(read_tree(content), camera)
+        calibration = calibration_of(read_tree(read_regular(folder / path, MAX_BYTES)), camera)
     except (OSError, ValueError) as error:
         reason = error.strerror or "unreadable" if isinstance(error, OSError) else error
         reading.refuse("camera_file", f"a camera file ({reason})")
         return
     name = plain(Path(path).name)
-    values = {key: getattr(calibration, key) for key in FILE_VALUES} | {
-        key: numbers for key, numbers in zip(
-            STATED, (calibration.sd, calibration.covariance), strict=True) if numbers}
+    values = {key: getattr(calibration, key) for key in FILE_VALUES}
     missing = [key for key in values if values[key] is None and key not in reading.given]
     if missing:
         reading.refuse("camera_file", f"{' and '.join(missing)} beside it: {name} does not say "
                        "which frame size it holds for")
+    values |= zip(STATED, (calibration.sd or None, calibration.covariance or None), strict=True)
     for key, value in values.items():
-        if value is None:
-            continue
-        if key not in reading.given:
+        if value is not None and key in reading.given:
+            if reading.fixed.get(key) != value:
+                reading.refuse(key, f"{shown(value)}, which {name} has; delete it, or camera_file")
+        elif value is not None:
+            reading.written[key] = f"camera.{key}", value
+            reading.stated[key] = value
             try:
                 reading.fixed[key] = PARAMETERS[key].check(value)
             except ValueError as error:
                 reading.refuse(
                     "camera_file", f"a camera file ({key} = {shown(value)}: expected {error})")
                 del reading.fixed[key]
-            reading.written[key] = f"camera.{key}", value
-            reading.stated[key] = value
-        elif reading.fixed.get(key) != value:
-            reading.refuse(key, f"{shown(value)}, which {name} has; delete it, or camera_file")
     del reading.written["camera_file"]
     reading.fixed["camera_file"] = None
 
@@ -301,16 +298,15 @@ def beliefs_in_one_way(reading: Reading) -> None:
     """Demand the error of a calibration in one way, and one where a calibration is believed."""
     if not reading.fixed.keys() >= {*STATED}:
         return
-    sd, covariance = STATED
-    given = [name for name in STATED if reading.fixed[name]]
-    if len(given) == 2:
-        reading.refuse(sd, f"{sd} or {covariance}, not both; delete one of them")
-    elif given:
+    sd, covariance = (reading.fixed[name] for name in STATED)
+    if sd and covariance:
+        reading.refuse(STATED[0], f"{' or '.join(STATED)}, not both; delete one of them")
+    elif sd or covariance:
         try:
             for count in {len(lens) for lens in reading.values_of("distortion")}:
-                CalibrationError.of(reading.fixed[sd], reading.fixed[covariance], count)
+                CalibrationError.of(sd, covariance, count)
         except ValueError as error:
-            reading.refuse(given[0], str(error))
+            reading.refuse(STATED[0] if sd else STATED[1], str(error))
     elif _is_calibrated(reading):
         where = "camera_file has none" if reading.stated else "or a camera_file"
         reading.refuse("believed", "a calibration's standard deviations: give calibration_sd under "
@@ -600,8 +596,7 @@ def parse_settings(
     """
     def read(key: str, written: str) -> dict[str, Any]:
         section, _, name = key.rpartition(".")
-        value = read_value(written)
-        home = section_of(name, parameters)
+        value, home = read_value(written), section_of(name, parameters)
         if section in (REQUIRE, SEARCH):
             return {key: value}
         if home and section not in ("", home, "axes"):
@@ -680,13 +675,12 @@ def apply_settings(
         if name in HEADER:
             document[name] = value
             continue
-        if "." in name:  # a key of a section that has no parameters
-            home, _, key = name.partition(".")
-            other = home
-        else:
-            section, key = section_of(name, parameters) or "axes", name
-            home, other = (
-                ("axes", section) if _is_axis(name, value, parameters) else (section, "axes"))
+        home, _, key = name.rpartition(".")  # of a key of a section that has no parameters
+        other = home
+        if not home:
+            home, other = section_of(name, parameters) or "axes", "axes"
+            if name in parameters and _is_axis(value, parameters[name]):
+                home, other = other, home
         if all(isinstance(document.get(table, {}), dict) for table in (home, other)):
             if other != home and key in document.get(other, {}):
                 del document[other][key]
@@ -695,17 +689,12 @@ def apply_settings(
         # Otherwise a section is no table, which reading the document reports.
 
 
-def _is_axis(name: str, value: Any, parameters: Mapping[str, Parameter]) -> bool:
-    """Return whether a value of ``--set`` makes an axis."""
-    if name not in parameters:
-        return True
-    if isinstance(value, dict):
-        return not DISTRIBUTION_FORMS.keys() & value.keys()
-    if not isinstance(value, list):
-        return False
-    if tuple in parameters[name].types:
+def _is_axis(value: Any, parameter: Parameter) -> bool:
+    """Return whether a value of ``--set`` makes an axis of a parameter."""
+    if isinstance(value, list) and tuple in parameter.types:
         return bool(value) and all(isinstance(item, list) for item in value)
-    return True
+    return isinstance(value, list) or (
+        isinstance(value, dict) and DISTRIBUTION_FORMS.keys().isdisjoint(value))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -933,12 +922,11 @@ def _checked(
         raise refusal([*reading.faults])
     if chosen or reading.stated:
         # Comments stay. A text that is refused never comes here: tomlkit is slow.
-        written = tomlkit.parse(text)
+        written: Any = tomlkit.parse(text)
         apply_settings(written, chosen or {}, reading.parameters)
         if reading.stated:
-            camera: Any = written["camera"]
-            del camera["camera_file"]
-            camera.update({key: toml_item(value) for key, value in reading.stated.items()})
+            del written["camera"]["camera_file"]
+            apply_settings(written, reading.stated, reading.parameters)
         text = tomlkit.dumps(written)
     grid = {each.name: getattr(reading, each.name) for each in fields(Grid)}
     return Pipeline(**grid | {

@@ -14,7 +14,7 @@ from typing import Any
 from sweep.declaration import Declared, TablesError, check_table
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.grid import TRIAL, Axis, parse_trial
+from sweep.experiment.grid import TRIAL, Axis, trial_numbers
 from sweep.experiment.parameters import Stage
 from sweep.messages import nearest, shown
 
@@ -265,16 +265,16 @@ SEARCH_KEYS = {
     **{name: Declared(name, (str,), None, "an axis") for name in ("along", "smallest", "largest")},
     "cheapest": Declared("cheapest", (bool,), None, "whether the cheapest is chosen"),
     **_keys(precision=_precision, per=_texts('["distance_m"]'),
-            among=_texts('["dictionary", "solver"]'), max_trials=parse_trial),
+            among=_texts('["dictionary", "solver"]'), max_trials=trial_numbers),
 }
 
 
 def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) -> dict[str, Any]:
     """Return the values of a section's keys; those at fault are noted and left out."""
-    table = reading.document.get(section, {})
-    if not isinstance(table, dict):
-        reading.fault(section, table, f"a table: [{section}]")
-        return {}
+    given = reading.document.get(section, {})
+    table = reading.table(section)
+    if given is not table and section in reading.document:
+        reading.fault(section, given, f"a table: [{section}]")
     for key in table:
         if key not in keys:
             reading.unknown_key(section, key, [*keys], f"; expected {', '.join(keys)}")
@@ -300,17 +300,6 @@ def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> A
         reading.note(path, f"{name}: no such axis{hint}; expected one under [axes] of the "
                      f"{'scene' if scene else 'grid'}: {', '.join(axes) or 'there is none'}")
     return axes.get(name)
-
-
-def _ordered_axis(reading: Reading, path: str, name: str) -> str:
-    """Return the name of a scene axis of several numbers; "" with a fault noted if it is none."""
-    axis = _axis_at(reading, path, name)
-    if axis is None:
-        return ""
-    if not axis.is_numeric or len(axis) < 2:
-        reading.fault(path, name, "an axis of several numbers, from easy to hard")
-        return ""
-    return name
 
 
 # --------------------------------------------------------------------------------------------------
@@ -399,45 +388,39 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
         return None
     kind, = kinds
     value = table.get(kind)
-    along = _ordered_axis(reading, f"{SEARCH}.{kind}", value) if isinstance(value, str) else ""
+    axis = _axis_at(reading, f"{SEARCH}.{kind}", value) if isinstance(value, str) else None
+    if axis is not None and (not axis.is_numeric or len(axis) < 2):
+        reading.fault(f"{SEARCH}.{kind}", value, "an axis of several numbers, from easy to hard")
+        axis = None
     if kind != "precision" and not required["requirements"]:
         reading.note(SEARCH, f'expected what must be met: [{REQUIRE}] all = ["detection >= 0.99"]')
-    _check_names(reading, table, kind)
+    listed, misplaced, elsewhere = (
+        "among", "per", f"conditions under [{REQUIRE}] per, where something is chosen"
+    ) if kind in CHOICES else ("per", "among", f"it beside {', '.join(CHOICES)} alone")
+    if misplaced in given:
+        reading.fault(f"{SEARCH}.{misplaced}", given[misplaced], elsewhere)
+    for name in dict.fromkeys(table.get(listed, ())):
+        # A fixed parameter is a condition of one value.
+        if listed == "among" or name not in reading.fixed or not _is_of_scene(reading, name):
+            _axis_at(reading, f"{SEARCH}.{listed}", name, scene=listed == "per")
+    along = "" if axis is None else axis.name
     conditions = required["require_per"] if "per" in reading.table(REQUIRE) else None
     roles = _roles(reading, table, kind, along, conditions)
-    among = roles["among"]
-    for name in {along, *among}.intersection(conditions or ()) if kind in CHOICES else ():
+    chosen = {along, *roles["among"]} if listed == "among" else set[str]()
+    for name in chosen.intersection(conditions or ()):
         reading.fault(f"{REQUIRE}.per", list(conditions or ()),
                       f"conditions; {name} is what [{SEARCH}] chooses")
     trial = reading.axis(TRIAL)
     if len(reading.faults) > faults or trial is None:
         return None
+    named = {along, TRIAL}.union(*roles.values())
     pooled = math.prod(
-        len(axis) for axis in reading.axes_of(Stage.scene)
-        if not any(axis.name in names for names in ((along, TRIAL), *roles.values())))
+        len(axis) for axis in reading.axes_of(Stage.scene) if axis.name not in named)
     draws = COARSE_DRAWS if kind == "along" else FIRST_DRAWS
     return StoppingRule(
         kind, len(trial), min(max(2, math.ceil(draws / pooled)), len(trial)), along, **roles,
         requirements=required["requirements"] if kind != "precision" else (),
         precision=value if kind == "precision" and value else ())
-
-
-def _check_names(reading: Reading, table: Mapping[str, Any], kind: str) -> None:
-    """Note the faults of the axes that ``per`` and ``among`` list.
-
-    A fixed parameter is a condition of one value.
-    """
-    given = reading.table(SEARCH)
-    if "per" in given and kind in CHOICES:
-        reading.fault(f"{SEARCH}.per", given["per"],
-                      f"conditions under [{REQUIRE}] per, where something is chosen")
-    if "among" in given and kind not in CHOICES:
-        reading.fault(
-            f"{SEARCH}.among", given["among"], f"it beside {', '.join(CHOICES)} alone")
-    key = "among" if kind in CHOICES else "per"
-    for name in dict.fromkeys(table.get(key, ())):
-        if key == "among" or name not in reading.fixed or not _is_of_scene(reading, name):
-            _axis_at(reading, f"{SEARCH}.{key}", name, scene=key == "per")
 
 
 def _roles(
@@ -453,37 +436,32 @@ def _roles(
     scene = {axis.name for axis in reading.axes_of(Stage.scene)} - {TRIAL, along}
     among, per, at_all = set[str](), set[str](), scene.intersection(conditions or ())
     if kind in CHOICES:
-        among = {axis.name for axis in reading.axes if axis.stage is not Stage.scene}
-        among |= {*table.get("among", ())} - {along}
+        settings = {axis.name for axis in reading.axes_of(Stage.detection, Stage.estimation)}
+        among = settings | {*table.get("among", ())} - {along}
         at_all = (scene if conditions is None else at_all) - among
     else:
         at_all = at_all if kind == "along" else set()
         per = scene.intersection(table.get("per", scene - at_all))
-        at_all = at_all - per
-    return {
-        role: tuple(axis.name for axis in reading.axes if axis.name in names)
-        for role, names in (("among", among), ("per", per), ("at_all", at_all))
-    }
+        at_all -= per
+    return {role: tuple(axis.name for axis in reading.axes if axis.name in names)
+            for role, names in (("among", among), ("per", per), ("at_all", at_all))}
 
 
 def _make_trials(reading: Reading, table: Mapping[str, Any]) -> None:
     """Make the axis of trials from ``max_trials``, or take the one that is given."""
-    path = f"{SEARCH}.{MAX_TRIALS}"
-    wanted: Axis | None = table.get(MAX_TRIALS)
-    axis = reading.axis(TRIAL)
-    if axis is None and wanted is not None:
-        axis = wanted
-        reading.axes.append(wanted)
-    elif axis is not None and wanted is not None:
-        reading.fault(path, len(wanted), "it or axes.trial, not both; delete one of them")
+    wanted: range | None = table.get(MAX_TRIALS)
+    if wanted is not None and reading.axis(TRIAL) is None:
+        reading.axes.append(Axis(TRIAL, {TRIAL: wanted}))
+    elif wanted is not None:
+        reading.fault(f"{SEARCH}.{MAX_TRIALS}", len(wanted),
+                      "it or axes.trial, not both; delete one of them")
     if MAX_TRIALS not in reading.table(SEARCH) and TRIAL not in reading.table("axes"):
         reading.fault(SEARCH, reading.table(SEARCH), NO_TRIALS)
     if reading.sampling != SAMPLINGS[0]:
         reading.fault(
             "sampling", reading.sampling,
             f"{SAMPLINGS[0]} beside [{SEARCH}]: points that are spread evenly over all trials say "
-            "nothing of the first ones",
-        )
+            "nothing of the first ones")
 
 
 def search_settings(

@@ -39,7 +39,7 @@ from sweep.experiment.parameters import (
     read_plugins,
     section_of_settings,
 )
-from sweep.messages import MAX_FAULTS, plain, shown, similar
+from sweep.messages import MAX_FAULTS, plain, refusal, shown, similar
 from sweep.model.image_file import read_regular
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -61,17 +61,24 @@ _BARE = re.compile(
 )
 
 
+@contextlib.contextmanager
+def refusing(source: str) -> Iterator[None]:
+    """Raise the PipelineError of a ValueError: its lines, each beginning with ``source``."""
+    try:
+        yield
+    except ValueError as error:
+        raise refusal([f"{source}: {line}" for line in str(error).split("\n")]) from None
+
+
 def file_text(path: str | Path) -> str:
     """Return the text of a TOML file; ValueError says why it cannot be read."""
     try:
-        encoded = read_regular(Path(path), MAX_BYTES)
+        return read_regular(Path(path), MAX_BYTES).decode().removeprefix("\ufeff")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"expected UTF-8: byte {error.start} is not") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ValueError(f"cannot be read: {reason}") from None
-    try:
-        return encoded.decode().removeprefix("\ufeff")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"expected UTF-8: byte {error.start} is not") from None
 
 
 def read_document(text: str) -> dict[str, Any]:
@@ -109,10 +116,9 @@ def read_value(written: str) -> Any:
     """
     if written in ("True", "False"):
         return written == "True"
-    try:
+    document = {"value": written} if _BARE.fullmatch(written) else {}
+    with contextlib.suppress(ValueError):
         document = read_document(f"value = {written}")
-    except ValueError:
-        document = {"value": written} if _BARE.fullmatch(written) else {}
     if len(document) != 1:
         raise ValueError("a TOML value, such as [0, 45] or 'text'")
     return document["value"]
@@ -138,15 +144,14 @@ def document_text(mapping: Mapping[str, Any]) -> str:
     document = tomlkit.document()
     tables = {key: value for key, value in mapping.items() if isinstance(value, Mapping)}
     above = {key: value for key, value in mapping.items() if key not in tables}
-    for home, items in [(None, above), *tables.items()]:
-        table = document if home is None else document.setdefault(home, tomlkit.table())
+    for path, items in [("", above), *((f"{home}.", items) for home, items in tables.items())]:
+        table = document.setdefault(path[:-1], tomlkit.table()) if path else document
         for key, value in items.items():
             try:
                 table[key] = toml_item(value)
             except (TypeError, ValueError, RecursionError):
-                path = key if home is None else f"{home}.{key}"
-                faults.append(f"{plain(path)} = {plain(repr(value))}: expected a string, a number, "
-                              "true, false, a list or a table")
+                faults.append(f"{plain(f'{path}{key}')} = {plain(repr(value))}: expected a string, "
+                              "a number, true, false, a list or a table")
     if faults:
         raise ValueError("\n".join(faults))
     return tomlkit.dumps(document)
@@ -192,12 +197,10 @@ def _title(value: Any) -> str:
 
 
 def _effects(value: Any) -> list[str]:
-    if (
-        not isinstance(value, list) or len({*map(str, value)}) < len(value)
-        or not all(isinstance(name, str) and name for name in value)
-    ):
+    named = isinstance(value, list) and all(isinstance(name, str) and name for name in value)
+    if not named or len(set(value)) < len(value):
         raise ValueError('a list of plug-ins, each once, such as ["haze"]')
-    return value
+    return [*value]
 
 
 HEADER = {
@@ -268,15 +271,12 @@ class Reading(Grid):
         """Note a fault of a key's value."""
         self.note(f"{plain(key)} = {shown(value)}", f"expected {expected}")
 
-    def refuse(self, name: str, expected: str) -> None:
-        """Note a fault of a parameter as the document has it."""
+    def refuse(self, name: str, expected: str, *value: Any) -> None:
+        """Note a fault of a parameter as the document has it, or of one ``value`` of it."""
         path = f"{self.parameters[name].section}.{name}"
-        path, value = self.written.get(name, (path, self.fixed.get(name)))
-        self.fault(path, value, expected)
-
-    def refuse_value(self, name: str, value: Any, expected: str) -> None:
-        """Note a fault of one of a parameter's values."""
-        self.fault(f"{self.parameters[name].section}.{name}", value, expected)
+        written = self.written.get(name, (path, self.fixed.get(name)))
+        path, own = (path, value[0]) if value else written
+        self.fault(path, own, expected)
 
     @contextlib.contextmanager
     def noting(self, path: str, key: str, value: Any) -> Iterator[None]:
@@ -372,7 +372,7 @@ def read_keys(
         if key not in known:
             kind = "a section" if isinstance(value, dict) else "a key"
             reading.unknown_key("", key, known, f"; expected {kind} of {', '.join(known)}")
-        elif (key == "axes" or key in SECTIONS) and not isinstance(value, dict):
+        elif key not in HEADER and not isinstance(value, dict):
             reading.fault(key, value, f"a table: [{key}]")
     for section in SECTIONS:
         for key, value in reading.table(section).items():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.grid import Distribution
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
+from sweep.model import pose
 from sweep.model.board import along_sides
 from sweep.model.calibration import CalibrationError
 from sweep.model.camera import (
@@ -26,15 +27,6 @@ from sweep.model.camera import (
 )
 from sweep.model.coverage import mixed
 from sweep.model.marker import marker_corners, module_count, overhang
-from sweep.model.pose import (
-    angles_of_rotation,
-    orientation,
-    pose_in_camera,
-    rotation_of_angles,
-    rotation_of_view_angle,
-    rotation_of_yaw_pitch_roll,
-    transform_points,
-)
 from sweep.model.scene import build_cameras
 from sweep.typing import Floats, Integers
 
@@ -156,6 +148,11 @@ def distance_of_side(values: Mapping[str, Any]) -> Any:
     return fx * values["size_m"] / values["side_px"]
 
 
+def _view(values: Mapping[str, Column]) -> tuple[Any, Any, Any, Any]:
+    """Return fx, fy, cx, cy in pixels of scenes: numbers, or arrays (n,)."""
+    return intrinsics(*(values[name].values for name in VIEW_PARAMETERS))
+
+
 def resolve_pose(values: Columns) -> None:
     """Add the parameters that scenes are made from to values, of which none is to be drawn yet.
 
@@ -178,22 +175,15 @@ def canonical_pose(values: Mapping[str, Column], drawn: Collection[str]) -> Colu
     canonical: Columns = {**values, **dict.fromkeys(SHIFTS, Column.of(0.0))}
     unknown = set(drawn)
     for step in (*STEPS, _TO_BEARINGS):
-        if unknown.intersection(step.given):
+        given = step.is_given(canonical)
+        if unknown.intersection(step.given) or (given and unknown.intersection(step.others)):
             unknown.update(step.makes)
-        elif step.is_given(canonical):
-            if unknown.intersection(step.others):
-                unknown.update(step.makes)
-                continue
+        elif given:
             made = step.take(canonical)
             canonical |= dict.fromkeys(step.given, Column.of(None))
-            canonical |= {name: _rounded(name, column) for name, column in made.items()}
+            canonical |= {name: Column(np.round(column.values, KEY_DECIMALS) + 0.0, column.constant)
+                          if name.endswith("_deg") else column for name, column in made.items()}
     return canonical
-
-
-def _rounded(name: str, column: Column) -> Column:
-    if not name.endswith("_deg"):
-        return column
-    return Column(np.round(column.values, KEY_DECIMALS) + 0.0, column.constant)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,26 +216,21 @@ class Step:
         read = [values[name] for name in (*self.given, *self.others) if name in values]
         each = [len(column.values) for column in read if not column.constant]
         made = self.resolve(values, each[0] if each else 1)
-        return {
-            name: Column.of(array) if each else Column.of(float(array[0]))
-            for name, array in zip(self.makes, made, strict=True)
-        }
+        return {name: Column.of(array if each else float(array[0]))
+                for name, array in zip(self.makes, made, strict=True)}
 
 
 def _numbers(
     values: Mapping[str, Column], names: Collection[str], count: int, missing: float = 0.0
 ) -> list[Floats]:
     """Return parameters as arrays (count,); ``missing`` stands for one that is not given."""
-    columns = [values.get(name, Column.of(None)) for name in names]
-    return [
-        np.full(count, missing) if column.missing else column.broadcast(count)
-        for column in columns
-    ]
+    return [np.full(count, missing) if values.get(name, Column.of(None)).missing
+            else values[name].broadcast(count) for name in names]
 
 
 def _from_side(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
-    numbers = {name: values[name].values for name in DISTANCE_PARAMETERS}
-    return (Column.of(distance_of_side(numbers)).broadcast(count),)
+    distance = distance_of_side({name: values[name].values for name in DISTANCE_PARAMETERS})
+    return (Column.of(distance).broadcast(count),)
 
 
 def _from_world(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
@@ -255,18 +240,18 @@ def _from_world(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     for whose in ("camera", "marker"):
         angles = (np.radians(numbers[f"{whose}_{name}_deg"]) for name in ("yaw", "pitch", "roll"))
         origin = np.stack([numbers[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
-        located += [origin, orientation(*angles)]
-    rotation, position = pose_in_camera(*located)
+        located += [origin, pose.orientation(*angles)]
+    rotation, position = pose.pose_in_camera(*located)
     return (*_angles(rotation), *position.T)
 
 
 def _from_yaw_and_pitch(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     angles = _numbers(values, ("yaw_deg", "pitch_deg", "roll_deg"), count)
-    return _angles(rotation_of_yaw_pitch_roll(*map(np.radians, angles)))
+    return _angles(pose.rotation_of_yaw_pitch_roll(*map(np.radians, angles)))
 
 
 def _angles(rotation: Floats) -> tuple[Floats, ...]:
-    return tuple(np.degrees(angle) for angle in angles_of_rotation(rotation))
+    return tuple(np.degrees(angle) for angle in pose.angles_of_rotation(rotation))
 
 
 def _from_view_angle(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
@@ -282,10 +267,10 @@ def _facing(
     """Return the function of rows (n,) and positions (n, 3) that returns the rotations there."""
     tilt, azimuth, roll = map(np.radians, _numbers(values, ANGLES, count))
     if values["view_angle_deg"].missing:
-        rotation = rotation_of_angles(tilt, azimuth, roll)
+        rotation = pose.rotation_of_angles(tilt, azimuth, roll)
         return lambda rows, _: rotation[rows]
     view = np.radians(values["view_angle_deg"].broadcast(count))
-    return lambda rows, position: rotation_of_view_angle(
+    return lambda rows, position: pose.rotation_of_view_angle(
         view[rows], azimuth[rows], roll[rows], position
     )
 
@@ -296,19 +281,14 @@ def _centres(values: Mapping[str, Column], count: int) -> Floats:
     return np.stack([
         depth * np.tan(np.radians(values[bearing].broadcast(count)))
         if values[metres].missing else values[metres].broadcast(count)
-        for metres, bearing in zip(CENTRE, BEARINGS, strict=True)
-    ], axis=1)
+        for metres, bearing in zip(CENTRE, BEARINGS, strict=True)], axis=1)
 
 
-def _shifts(
-    values: Mapping[str, Column], count: int, names: tuple[str, str] = SHIFTS
-) -> Floats:
+def _shifts(values: Mapping[str, Column], count: int, names: Sequence[str] = SHIFTS) -> Floats:
     """Return what the jitter's pixels are at the centre's depth, along x and y, (count, 2) m."""
-    focal = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))[:2]
     depth, pixels = values["distance_m"].broadcast(count), _numbers(values, names, count)
-    return np.stack(
-        [depth * (pixel / length) for pixel, length in zip(pixels, focal, strict=True)], axis=1
-    )
+    return np.stack([depth * (pixel / length)
+                     for pixel, length in zip(pixels, _view(values)[:2], strict=True)], axis=1)
 
 
 def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
@@ -336,7 +316,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
         ) -> Floats:
             position = np.column_stack([centre_xy, depth[rows[part]]])
             rotation = facing(rows[part], position)
-            return transform_points(points[part], rotation, np.zeros_like(position))
+            return pose.transform_points(points[part], rotation, np.zeros_like(position))
 
         centres[rows] = Framing(
             cameras.take(rows), frame[rows], depth[rows], offsets, share[rows], given[rows],
@@ -415,7 +395,7 @@ def geometry_keys(
     ``values`` has every parameter of camera, marker and pose that is not drawn.
     """
     values = canonical_pose(values, distributions)
-    fx, fy, cx, cy = map(Column.of, intrinsics(*(values[name].values for name in VIEW_PARAMETERS)))
+    fx, fy, cx, cy = map(Column.of, _view(values))
     columns = {
         "fx_px": key_texts("fx_px", fx, _DEFAULT_FOCAL_PX[0]),
         "fy_px": key_texts("fy_px", fy, _DEFAULT_FOCAL_PX[1]),
@@ -426,14 +406,13 @@ def geometry_keys(
             middle = Column.of((values[length].values - 1) / 2)
             columns[name] = map_columns(
                 lambda text, default: "" if text == default else text,
-                [key_texts(name, centre, None), key_texts(name, middle, None)],
-            )
-    for name in _PLAIN:
-        if name not in distributions and name in values and not values[name].missing:
-            columns[name] = key_texts(name, values[name], PARAMETERS[name].default)
-    for name, distribution in distributions.items():
-        if name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS:
-            columns[name] = Column.of(f"{name}={distribution}")
+                [key_texts(name, centre, None), key_texts(name, middle, None)])
+    columns |= {
+        name: key_texts(name, values[name], PARAMETERS[name].default) for name in _PLAIN
+        if name not in distributions and name in values and not values[name].missing}
+    columns |= {name: Column.of(f"{name}={distribution}")
+                for name, distribution in distributions.items()
+                if name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS}
     return hashed([columns[name] for name in sorted(columns)], count)
 
 
@@ -503,14 +482,11 @@ def calibrated_columns(
     draw
         Name of a quantity -> uniform numbers (count,) in (0, 1).
     """
-    view = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))
-    lenses = np.zeros((count, len(error.names) - len(view)))
+    truth = [Column.of(number).broadcast(count) for number in _view(values)]
+    lenses = np.zeros((count, len(error.names) - len(truth)))
     for row, lens in enumerate(values["distortion"].listed(count) if lenses.size else ()):
         lenses[row, : len(lens)] = lens
-    truth = [np.array(np.broadcast_to(number, (count,)), dtype=np.float64) for number in view]
     normals = [NORMAL.at(draw(CALIBRATED + name)) for name in error.names]
     numbers = error.believed([*truth, *lenses.T], normals)
-    return {
-        CALIBRATED + name: Column.of(number)
-        for name, number in zip(error.names, numbers, strict=True)
-    }
+    return {CALIBRATED + name: Column.of(number)
+            for name, number in zip(error.names, numbers, strict=True)}

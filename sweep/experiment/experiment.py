@@ -14,17 +14,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.draws import (
-    CALIBRATED,
-    SHIFTS,
-    bits,
-    calibrated_columns,
-    geometry_keys,
-    hashed,
-    key_texts,
-    resolve_pose,
-    uniform,
-)
+from sweep.experiment import draws
 from sweep.experiment.grid import TRIAL, Axis, Block, Grid, combinations
 from sweep.experiment.parameters import NAMED_BY, PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
@@ -186,7 +176,7 @@ class Experiment:
         for chosen in combinations(grid.axes_of(stage)):
             values = fixed | chosen
             plugin = grid.plugin(section, values[named_by])
-            yield values, plugin and PluginSetting(
+            yield values, None if plugin is None else PluginSetting(
                 plugin, tuple((each.name, values[each.name]) for each in plugin.settings),
                 grid.folder)
 
@@ -266,7 +256,7 @@ class Experiment:
         if "background" not in drawn:
             values["background"] = values["background"].map(partial(_absolute, grid.folder))
         jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
-        values |= dict.fromkeys(SHIFTS, Column.of(0.0))
+        values |= dict.fromkeys(draws.SHIFTS, Column.of(0.0))
         noisy = any(effect.switch in drawn or values[effect.switch].differs_from(effect.off)
                     for effect in self.effects if effect.random)
         poses = {} if values[PHOTOGRAPHS].missing else recorded_poses(
@@ -274,28 +264,29 @@ class Experiment:
         if grid.shows_photographs:
             return values | poses
         given, calibration = dict(values), grid.calibration
-        keys = cache(partial(geometry_keys, given, drawn, count))
+        keys = cache(partial(draws.geometry_keys, given, drawn, count))
         # What is drawn for a photograph is the same for all its markers; their noise is not.
-        shared = cache(partial(geometry_keys, given | ANY_MARKER, drawn, count)) if poses else keys
+        shared = keys if not poses else cache(
+            partial(draws.geometry_keys, given | ANY_MARKER, drawn, count))
         # Quantities that are drawn together: the jitter comes after the distributions, so that
         # whether there is any changes nothing for them.
-        together = [*sorted(drawn), *SHIFTS, *(
-            CALIBRATED + name for name in (calibration.names if calibration else ()))]
+        together = [*sorted(drawn), *draws.SHIFTS, *(
+            draws.CALIBRATED + name for name in (calibration.names if calibration else ()))]
 
         def draw(quantity: str, keys: Callable[[], NDArray[np.uint64]] = keys) -> Floats:
             dimension = together.index(quantity) if grid.sampling == "sobol" else None
-            return uniform(grid.seed, quantity, keys(), trials, dimension)
+            return draws.uniform(grid.seed, quantity, keys(), trials, dimension)
 
         for name, distribution in drawn.items():
             values[name] = Column.of(distribution.at(draw(name, shared)))
         if (jitter > 0).any():
-            for name in SHIFTS:
+            for name in draws.SHIFTS:
                 values[name] = Column.of(jitter * (2 * draw(name) - 1))
         if calibration:
-            values |= calibrated_columns(calibration, values, count, draw)
+            values |= draws.calibrated_columns(calibration, values, count, draw)
         if noisy:
-            values["noise_key"] = Column.of(bits(grid.seed, "noise", keys(), trials))
-        resolve_pose(values)
+            values["noise_key"] = Column.of(draws.bits(grid.seed, "noise", keys(), trials))
+        draws.resolve_pose(values)
         return values | poses
 
     # A key of each image: a function of its scene's own parameters and draws, not of the grid.
@@ -312,12 +303,13 @@ class Experiment:
         if "background" in values:  # an image is known by its content
             values["background"] = values["background"].map(
                 lambda value: grid.files.get(value) or value)
-        texts = [key_texts(name, values[name], grid.parameters[name].default)
+        texts = [draws.key_texts(name, values[name], grid.parameters[name].default)
                  for name in sorted(values.keys() - NOT_IN_IMAGE - grid.distributions.keys())]
         texts += [Column.of(f"{name}={distribution}")
                   for name, distribution in sorted(grid.distributions.items())
                   if grid.parameters[name].stage is Stage.scene]
-        return bits(grid.seed, f"image {grid.sampling}", hashed(texts, len(trials)), trials)
+        keys = draws.hashed(texts, len(trials))
+        return draws.bits(grid.seed, f"image {grid.sampling}", keys, trials)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -676,14 +668,14 @@ class Facts:
               if effect.switch in grid.distributions
               or grid.any_value(effect.switch, effect.is_on)]
         calibrated = grid.calibration is not None
-        draws = dict.fromkeys([
+        random = dict.fromkeys([
             *grid.distributions, *["jitter_px"] * grid.any_value("jitter_px", bool),
             *(each.switch for each in on if each.random),
             *["the believed calibration"] * calibrated,
         ])
         lens = any(map(canonical_distortion, grid.values_of("distortion")))
         image = grid.any_value("background", lambda value: isinstance(value, str))
-        noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
+        noisy = any(effect.switch in random for effect in effects if effect.widens == "noise")
         coarse = any("noise" in effect.worsens for effect in on)
         around = f" px around the {grid.target_word}'s pixels" + (
             f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
@@ -700,7 +692,7 @@ class Facts:
         reasons: dict[str, tuple[Iterable[str], str]] = {
             "lens distortion": (["distortion is given"] * lens, "distortion is empty"),
             "random draws": (
-                [*draws, *["Sobol' points"] * (grid.sampling == "sobol")], "nothing is random"),
+                [*random, *["Sobol' points"] * (grid.sampling == "sobol")], "nothing is random"),
             "background image": (["background names a file"] * image, "a level"),
             "window": ([", ".join(map(str, sorted(windows))) + around] * bool(windows),
                        "the full frame"),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 from sweep.declaration import Declared, converted, declared_fields
@@ -58,17 +57,11 @@ class Parameter(Declared):
     stage: Stage = Stage.scene
 
 
-def _gather() -> dict[str, Parameter]:
-    gathered: dict[str, Parameter] = {}
-    for section, (declaring, stage) in SECTIONS.items():
-        for each in itertools.chain(*(declared_fields(group).values() for group in declaring)):
-            if each.name in gathered:
-                raise TypeError(f"parameter {each.name} is declared twice")
-            gathered[each.name] = converted(each, Parameter, section=section, stage=stage)
-    return gathered
-
-
-PARAMETERS: dict[str, Parameter] = _gather()
+PARAMETERS: dict[str, Parameter] = {
+    name: converted(each, Parameter, section=section, stage=stage)
+    for section, (declaring, stage) in SECTIONS.items() for group in declaring
+    for name, each in declared_fields(group).items()
+}
 """Every parameter by its name; names are unique over all sections."""
 
 
@@ -160,6 +153,9 @@ NAMED_BY: dict[str, Parameter] = {
 EFFECTS_KEY = "effects"
 """The key above the sections that names effects."""
 
+NAMING = (EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values()))
+"""The keys whose values name plug-ins."""
+
 
 def section_of_settings(kind: str) -> str:
     """Return the section that the settings of a kind of plug-in belong under."""
@@ -168,29 +164,29 @@ def section_of_settings(kind: str) -> str:
 
 def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name and key of each plug-in that a document names, or means to, in its order."""
-    installed = cache(installed_names)
-    axes = document.get("axes")
-    zips = {f"axes.{key}": value["zip"] for key, value in axes.items() if is_zip(value)
-            } if isinstance(axes, dict) else {}
+    tables = {path: table for path, table in document.items() if isinstance(table, dict)}
+    tables |= {f"axes.{key}": value["zip"]
+               for key, value in tables.get("axes", {}).items() if is_zip(value)}
     for kind, parameter in NAMED_BY.items():
         # Where there are several choices, another word is more likely one of them, misspelt.
         few = len(parameter.choices) == 1
-        tables = {parameter.section: document.get(parameter.section), "axes": axes, **zips}
         for path, table in tables.items():
-            value = table.get(parameter.name) if isinstance(table, dict) else None
-            listed = value.get("values") if isinstance(value, dict) else value
-            for name in listed if isinstance(listed, list) else [listed]:
-                if not isinstance(name, str):
-                    continue
+            known = path.partition(".")[0] in (parameter.section, "axes")
+            for name in _words(table.get(parameter.name)) if known else ():
                 try:
                     parameter.check(name)
                 except ValueError:
-                    if few or ":" in name or name in installed(kind):
+                    if few or ":" in name or name in installed_names(kind):
                         yield kind, name, f"{path}.{parameter.name}"
-    effects = document.get(EFFECTS_KEY)
-    for name in effects if isinstance(effects, list) else ():
-        if isinstance(name, str):
-            yield "effect", name, EFFECTS_KEY
+    for name in _words(document.get(EFFECTS_KEY), single=False):
+        yield "effect", name, EFFECTS_KEY
+
+
+def _words(value: Any, *, single: bool = True) -> list[str]:
+    """Return the texts of a list, of ``{ values = [...] }``, or a ``single`` one."""
+    listed = value.get("values") if isinstance(value, dict) else value
+    whole = listed if isinstance(listed, list) else [listed] * single
+    return [word for word in whole if isinstance(word, str)]
 
 
 def read_plugins(
@@ -205,18 +201,16 @@ def read_plugins(
     declared = {(plugin.kind, plugin.name) for plugin in plugins}
     faults: list[tuple[str, str, str, str]] = []
     for kind, name, key in _named(document):
-        if (kind, name) in declared:
-            continue
-        declared.add((kind, name))
-        try:
-            if known is not None:
-                raise PluginError("a plug-in that the store has recorded")
-            plugin = declare(kind, name, folder)
-            parameters_with((*plugins, plugin))
-        except PluginError as error:
-            faults.append((kind, key, name, str(error)))
-        else:
-            plugins.append(plugin)
+        if (kind, name) not in declared:
+            declared.add((kind, name))
+            try:
+                if known is not None:
+                    raise PluginError("a plug-in that the store has recorded")
+                plugin = declare(kind, name, folder)
+                parameters_with((*plugins, plugin))
+                plugins.append(plugin)
+            except PluginError as error:
+                faults.append((kind, key, name, str(error)))
     return plugins, faults
 
 
@@ -243,17 +237,15 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
     gathered = dict(PARAMETERS)
     for plugin in plugins:
         section = section_of_settings(plugin.kind)
+        stage = SECTIONS[section][1]
         if plugin.kind in NAMED_BY:
             by = gathered[NAMED_BY[plugin.kind].name]
-            gathered[by.name] = dataclasses.replace(
-                by, choices=(*by.choices, plugin.name))
+            gathered[by.name] = dataclasses.replace(by, choices=(*by.choices, plugin.name))
         for setting in plugin.settings:
-            name = setting.name
-            parameter = converted(
-                setting, Parameter, section=section, stage=SECTIONS[section][1])
+            name, own = setting.name, converted(setting, Parameter, section=section, stage=stage)
             if name in PARAMETERS:
                 raise PluginError(f"another name for its setting {name}: the pipeline has this one")
-            if gathered.setdefault(name, parameter) != parameter:
+            if gathered.setdefault(name, own) != own:
                 raise PluginError(f"its setting {name} to be declared as that of another plug-in, "
                                   "or another name")
     return gathered

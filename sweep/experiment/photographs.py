@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
-from sweep.experiment.document import file_text, read_document
+from sweep.experiment.document import file_text, read_document, refusing
 from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
@@ -62,10 +62,8 @@ def read_board(path: str | Path) -> Board:
 
 def board_document(path: str | Path) -> dict[str, Any]:
     """Return the tables and values of a board's file, unchecked; as :func:`read_board`."""
-    try:
+    with refusing(plain(path)):
         return read_document(file_text(path))
-    except ValueError as error:
-        raise refusal([f"{plain(path)}: {error}"]) from None
 
 
 _KIND = {"kind": Declared(
@@ -74,23 +72,22 @@ _KIND = {"kind": Declared(
 
 def board_of(document: Mapping[str, Any], source: str) -> Board:
     """Return the board of a document; as :func:`read_board`, lines beginning with ``source``."""
-    tables = [{key: value for key, value in document.items() if (key == "kind") is is_kind}
-              for is_kind in (True, False)]
-    kind, faults = check_table(_KIND, tables[0], "a board")
+    others = {key: value for key, value in document.items() if key != "kind"}
+    known, faults = check_table(
+        _KIND, {key: document[key] for key in document.keys() - others}, "a board")
     if not faults:
-        declaring = KINDS[kind["kind"]]
+        kind = known["kind"]
         values, faults = check_table(
-            declared_fields(declaring), tables[1], f"a board of kind {kind['kind']}")
+            declared_fields(KINDS[kind]), others, f"a board of kind {kind}")
     if not faults:
-        made = declaring(**values)
+        made = KINDS[kind](**values)
         faults = [f"{key} = {shown(value)}: expected {expected}"
                   for key, value, expected in made.faults()]
-    if not faults:
-        board = made.board()
-        if board.is_flat:
-            return board
+    if not faults and not made.board().is_flat:
         faults = ["markers: expected one plane, for photographs: no z_m, no tilt_deg"]
-    raise refusal([f"{source}: {fault}" for fault in faults])
+    if faults:
+        raise refusal([f"{source}: {fault}" for fault in faults])
+    return made.board()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -163,9 +160,9 @@ def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
     width_px, height_px = arrays["size"].tolist()
     record = PhotographRecord(
         tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
-        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"], arrays["rotation"],
-        arrays["translation"], arrays["std"], arrays["source"], str(arrays["board"]),
-    )
+        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"],
+        *(arrays[name] for name in ("rotation", "translation", "std", "source")),
+        str(arrays["board"]))
     try:
         record.on_board(record.marker_id)
     except (SweepError, AttributeError, KeyError, TypeError, ValueError):
@@ -247,29 +244,23 @@ def recorded_poses(
             raise PluginError(f"{plain(name)}: it has {length} photographs; trial {number} of "
                               f"marker_id {marker_id} is not among them")
         places.append((name, number, ids[name].index(marker_id)))
-
-    def recorded(field: str) -> NDArray[Any]:
-        return np.array([getattr(records[name], field)[number, marker]
-                         for name, number, marker in places])
-
-    rotation, translation = recorded("rotation"), recorded("translation")
+    rotation, translation, source, std = (
+        np.array([getattr(records[name], field)[number, marker] for name, number, marker in places])
+        for field in ("rotation", "translation", "source", "std"))
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
-    on_board = [boards[name][marker] for name, _, marker in places]
-    columns: dict[str, Any]
+    columns: dict[str, Any] = {
+        "on_board": [boards[name][marker] for name, _, marker in places],
+        "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
+        "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
+        "truth": source, "truth_std": std,
+    }
     if simulated:
-        columns = {"neighbourhood": [_around(each) for each in on_board]}
+        columns["neighbourhood"] = [_around(each) for each in columns["on_board"]]
     else:
         images = {
             (name, number): reference((Path(folder) / name).parent / records[name].paths[number],
                                       records[name].digests[number], records[name].part)
-            for name, number in {place[:2] for place in places}
-        }
-        columns = {"renderer": PHOTOGRAPH, "background": [images[place[:2]] for place in places]}
-    columns |= {
-        "on_board": on_board,
-        "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
-        "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
-        "truth": recorded("source"), "truth_std": recorded("std"),
-    }
+            for name, number, _ in places}
+        columns |= {"renderer": PHOTOGRAPH, "background": [images[place[:2]] for place in places]}
     return {name: Column.of(column) for name, column in columns.items()}

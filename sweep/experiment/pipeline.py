@@ -27,6 +27,7 @@ from sweep.experiment.document import (
     read_document,
     read_keys,
     read_value,
+    refusing,
     section_of,
     toml_item,
 )
@@ -35,11 +36,10 @@ from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
 from sweep.experiment.parameters import (
     CHOICES,
-    EFFECTS_KEY,
     FIELDS_OF_VIEW,
     IN_CAMERA,
     IN_MM,
-    NAMED_BY,
+    NAMING,
     PARAMETERS,
     PHOTOGRAPHS,
     RIVALS,
@@ -113,8 +113,8 @@ def apart(
     def check(reading: Reading) -> None:
         for values in reading.meeting(*names):
             if wrong(*values):
-                reading.refuse_value(names[0], values[0], expected if isinstance(
-                    expected, str) else expected(*values))
+                text = expected if isinstance(expected, str) else expected(*values)
+                reading.refuse(names[0], text, values[0])
 
     return check
 
@@ -327,7 +327,7 @@ def check_backgrounds(reading: Reading) -> None:
             sizes[value] = decode_grey(path).shape[::-1]
             reading.files[value] = file_digest(Path(path)) or ""
         except ValueError as error:
-            reading.refuse_value("background", value, f"a level or an image file ({error})")
+            reading.refuse("background", f"a level or an image file ({error})", value)
     _have_the_frames_size(reading, "background", sizes)
 
 
@@ -338,9 +338,9 @@ def _have_the_frames_size(
     for side, key in enumerate(("width_px", "height_px")):
         for file, length in reading.meeting(name, key):
             if file in sizes and sizes[file][side] != length:
-                reading.refuse_value(
-                    name, file, "images of exactly the frame's size: it is "
-                    f"{' x '.join(map(str, sizes[file]))}, but {key} = {length}")
+                reading.refuse(
+                    name, "images of exactly the frame's size: it is "
+                    f"{' x '.join(map(str, sizes[file]))}, but {key} = {length}", file)
 
 
 def file_digest(path: Path) -> str | None:
@@ -374,7 +374,7 @@ def photographs_alone(reading: Reading) -> None:
         try:
             record, reading.files[name] = PHOTOGRAPH_RECORDS.read(path)
         except PluginError as error:
-            reading.refuse_value(PHOTOGRAPHS, name, str(error))
+            reading.refuse(PHOTOGRAPHS, str(error), name)
             continue
         sizes[name] = record.width_px, record.height_px
         for relative, known in zip(record.paths, record.digests, strict=True):
@@ -431,8 +431,8 @@ def targets_are_solved(reading: Reading) -> None:
         return
     if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & {
             *reading.values_of("kind")}:
-        reading.refuse_value(
-            "points", "chessboard", "kind = charuco or diamond, which have a chessboard")
+        reading.refuse(
+            "points", "kind = charuco or diamond, which have a chessboard", "chessboard")
 
     def is_of_boards(solver: str, points: str) -> bool:
         known = SOLVERS.get(solver)
@@ -472,7 +472,7 @@ def what_is_installed(reading: Reading) -> None:
     """
     for dictionary in reading.values_of("dictionary") if reading.recorded is None else ():
         if (missing := missing_package(dictionary)) is not None:
-            reading.refuse_value("dictionary", dictionary, missing)
+            reading.refuse("dictionary", missing, dictionary)
     known: dict[str, tuple[str, ...]] = {
         OPENCV: opencv_dictionary_names(),
         **{plugin.name: plugin.dictionaries for plugin in reading.plugins
@@ -781,13 +781,10 @@ class Pipeline(Grid):
         """
         path = Path(path)
         source = plain(path, MAX_SHOWN_PATH_LENGTH)
-        try:
+        with refusing(source):
             text = file_text(path)
-        except ValueError as error:
-            raise refusal([f"{source}: {error}"]) from None
         return Pipeline.from_text(
-            text, settings, name=path.stem, source=source, folder=path.parent
-        )
+            text, settings, name=path.stem, source=source, folder=path.parent)
 
     @staticmethod
     def from_text(
@@ -825,10 +822,16 @@ class Pipeline(Grid):
         PipelineError
             One line for each fault of the text or of the settings.
         """
-        document = _document(text, source)
+        with refusing(source):
+            document = read_document(text)
         chosen = {}
         if settings:
-            parameters = _parameters(document, settings, str(folder), plugins)
+            # Other settings may be of plug-ins that settings name.
+            named = copy.deepcopy(document)
+            apply_settings(named, parse_settings([
+                each for each in settings
+                if each.partition("=")[0].strip().rpartition(".")[2] in NAMING]))
+            parameters = parameters_with(tuple(read_plugins(named, str(folder), plugins)[0]))
             chosen = parse_settings(settings, parameters)
             apply_settings(document, chosen, parameters)
         reading = read_keys(document, source, str(folder), files, plugins)
@@ -869,10 +872,8 @@ class Pipeline(Grid):
         distance_m = 0.3
         <BLANKLINE>
         """
-        try:
+        with refusing(source):
             text = document_text(mapping)
-        except ValueError as error:
-            raise refusal([f"{source}: {line}" for line in str(error).split("\n")]) from None
         return Pipeline.from_text(text, settings, name=name, source=source, folder=folder)
 
     def to_toml(self) -> str:
@@ -882,28 +883,6 @@ class Pipeline(Grid):
         """
         return self.text
 
-
-
-def _document(text: str, source: str) -> dict[str, Any]:
-    try:
-        return read_document(text)
-    except ValueError as error:
-        raise refusal([f"{source}: {error}"]) from None
-
-
-def _parameters(
-    document: Mapping[str, Any], settings: Sequence[str], folder: str,
-    known: Sequence[DeclaredPlugin] | None,
-) -> Mapping[str, Parameter]:
-    """Return the parameters of a document once the settings that name plug-ins are applied."""
-    naming = {EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values())}
-    changed = copy.deepcopy(document)
-    apply_settings(changed, parse_settings(
-        [each for each in settings
-         if each.partition("=")[0].strip().rpartition(".")[2] in naming]
-    ))
-    # Faults are told when it is checked.
-    return parameters_with(tuple(read_plugins(changed, folder, known)[0]))
 
 
 def _checked(
@@ -974,7 +953,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     trial = chosen.pop(TRIAL, 0)
     for other in displaced_by(named, pipeline.parameters):
         chosen.pop(other, None)
-    document = _document(pipeline.text, "--at")
+    document = read_document(pipeline.text)
     for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
         document.pop(section, None)
     axes = document.get("axes", {})

@@ -271,10 +271,7 @@ SEARCH_KEYS = {
 
 def _read_section(reading: Reading, section: str, keys: Mapping[str, Declared]) -> dict[str, Any]:
     """Return the values of a section's keys; those at fault are noted and left out."""
-    given = reading.document.get(section, {})
     table = reading.table(section)
-    if given is not table and section in reading.document:
-        reading.fault(section, given, f"a table: [{section}]")
     for key in table:
         if key not in keys:
             reading.unknown_key(section, key, [*keys], f"; expected {', '.join(keys)}")
@@ -374,12 +371,10 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
     ``required`` is what :func:`read_required` returned. None without the section, or with faults
     in it, which are noted.
     """
-    if SEARCH not in reading.document:
+    if not isinstance(reading.document.get(SEARCH), dict):
         return None
     faults, given = len(reading.faults), reading.table(SEARCH)
     table = _read_section(reading, SEARCH, SEARCH_KEYS)
-    if reading.document[SEARCH] is not given:
-        return None  # it is no table
     _make_trials(reading, table)
     kinds = [kind for kind in KINDS if given.get(kind, False) is not False]
     if len(kinds) != 1:

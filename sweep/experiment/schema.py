@@ -131,13 +131,10 @@ def cf_attributes(
 
     `sweep.experiment.schema.with_description` gives it a short ``long_name`` for readers.
     """
-    attributes: dict[str, Any] = {"long_name": meaning}
-    if units:
-        attributes["units"] = units
-    if flags is not None:
-        attributes["flag_values"] = [int(flag) for flag in flags]
-        attributes["flag_meanings"] = " ".join(flag.name for flag in flags)
-    return attributes
+    known = {} if flags is None else {
+        "flag_values": [int(flag) for flag in flags],
+        "flag_meanings": " ".join(flag.name for flag in flags)}
+    return {"long_name": meaning, **({"units": units} if units else {}), **known}
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,9 +260,8 @@ class Variable:
     @property
     def not_needed(self) -> float | int:
         """The value of cells that were not needed: NaN, or the flag ``not_needed``."""
-        if self.flags is None:
-            return self.fill
-        return int(getattr(self.flags, "not_needed", self.fill))
+        return self.fill if self.flags is None else int(
+            getattr(self.flags, "not_needed", self.fill))
 
     @property
     def inner_shape(self) -> tuple[int, ...]:
@@ -280,15 +276,13 @@ class Variable:
         lies beyond the boards of the cells that two grids share.
         """
         lengths = self.inner_shape
-        cut: list[Any] = [..., *(slice(length) for length in lengths)]
+        cut: list[Any] = [..., *map(slice, lengths)]
         kept: NDArray[Any] = values[tuple(cut)]
         outer = kept.ndim - len(lengths)
-        missing = [a - b for a, b in zip(lengths, kept.shape[outer:], strict=True)]
-        if not any(missing):
-            return kept
+        widths = [(0, 0)] * outer + [
+            (0, length - own) for length, own in zip(lengths, kept.shape[outer:], strict=True)]
         beyond = DetectionStatus.not_on_board if self.flags is DetectionStatus else math.nan
-        widths = [(0, 0)] * outer + [(0, each) for each in missing]
-        return np.pad(kept, widths, constant_values=beyond)
+        return np.pad(kept, widths, constant_values=beyond) if np.any(widths) else kept
 
     def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return its axes in the pipeline's order: those of its stage and of the stages before."""
@@ -469,25 +463,19 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
     scales = {name: drawn.largest for name, drawn in pipeline.distributions.items()}
     if "side_px" in scales:
         scales["distance_m"] = 0.0
-    parameters = {name: pipeline.parameters[name] for name in scales}
     variables = [
-        _drawn(name, parameter.meaning, parameter.unit, scales[name])
-        for name, parameter in parameters.items()
-    ]
+        _drawn(name, pipeline.parameters[name].meaning, pipeline.parameters[name].unit, scale)
+        for name, scale in scales.items()]
     if jitter := max(map(float, pipeline.values_of("jitter_px")), default=0.0):
-        variables += [
-            _drawn(f"jitter_{axis}_px", f"shift of the centre's undistorted projection along "
-                   f"{axis}", "px", jitter, f"shift_{axis}_px")
-            for axis in ("u", "v")
-        ]
+        variables += [_drawn(f"jitter_{axis}_px", "shift of the centre's undistorted projection "
+                             f"along {axis}", "px", jitter, f"shift_{axis}_px") for axis in "uv"]
     if (error := pipeline.calibration) is not None:
         variables += [
             _drawn(f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, "
                    "for estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
                    CALIBRATED + name)
             for name in error.names
-            for unit, scale in [("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)]
-        ]
+            for unit, scale in [("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)]]
     return tuple(variables)
 
 
@@ -503,11 +491,9 @@ def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     """
     common = SCHEMA
     if pipeline.shows_boards:
-        markers, corners = pipeline.largest_board
-        lengths = (("marker", markers), ("chessboard_corner", corners))
+        lengths = dict(zip(("marker", "chessboard_corner"), pipeline.largest_board, strict=True))
         common = tuple(each for each in SCHEMA if each.name not in NOT_OF_BOARDS) + tuple(
-            dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
-            if corners or "chessboard_corner" not in variable.inner
-        )
+            dataclasses.replace(variable, lengths=tuple(lengths.items())) for variable in BOARD_SCHEMA
+            if all(lengths.get(name, 1) for name in variable.inner))
     photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
     return common + drawn_variables(pipeline) + photographed

@@ -2,7 +2,8 @@
 
 import sweep.analysis
 from support.example_results import example_results
-from sweep.experiment.parameters import PARAMETERS
+from sweep.declaration import declared_fields
+from sweep.experiment.parameters import PARAMETERS, SECTIONS
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, short_name
 from sweep.store.files import RECEIPTS
@@ -35,6 +36,9 @@ def test_names_of_variables_and_parameters_are_short_and_distinct():
     assert max(map(len, short.values())) <= 40
     labels = [f"{short[name]} [{units}]" for name, units in names.items()]
     assert len(set(labels)) == len(labels)
+    declared = [name for groups, _ in SECTIONS.values() for each in groups
+                for name in declared_fields(each)]
+    assert len(declared) == len(PARAMETERS)
 
 
 def test_results_of_analyses_have_them_too():

@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import itertools
+import operator
 import os
 import re
 import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -322,15 +324,14 @@ class Reading(Grid):
 
         Of numbers that vary by themselves the least and the largest.
         """
-        axes = [axis for axis in self.axes if not axis.columns.keys().isdisjoint(names)]
         fixed = {name: self.fixed[name] for name in names if name in self.fixed}
-        for chosen in itertools.product(*(_rows(axis, names) for axis in axes)):
-            row = fixed | dict(itertools.chain(*chosen))
+        for chosen in itertools.product(*(_rows(axis, names) for axis in self.axes_with(names))):
+            row = reduce(operator.or_, chosen, fixed)
             if len(row) == len(names):
                 yield tuple(row[name] for name in names)
 
 
-def _rows(axis: Axis, names: Collection[str]) -> Iterable[Sequence[tuple[str, Any]]]:
+def _rows(axis: Axis, names: Collection[str]) -> list[dict[str, Any]]:
     """Return the values of some parameters along an axis, each combination once."""
     columns = {name: values for name, values in axis.columns.items() if name in names}
     numbers, *others = columns.values()
@@ -338,7 +339,7 @@ def _rows(axis: Axis, names: Collection[str]) -> Iterable[Sequence[tuple[str, An
             numbers[:1] if isinstance(numbers, range) else numbers)):
         columns = dict.fromkeys(columns, sorted({min(numbers), max(numbers)}))
     rows = dict.fromkeys(zip(*columns.values(), strict=True))
-    return [list(zip(columns, row, strict=True)) for row in rows]
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def read_keys(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.experiment import draws
-from sweep.experiment.grid import TRIAL, Axis, Block, Grid, combinations
+from sweep.experiment.grid import TRIAL, Axis, Block, Grid
 from sweep.experiment.parameters import NAMED_BY, PARAMETERS, PHOTOGRAPHS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
@@ -146,13 +146,13 @@ class Experiment:
     def detectors(self) -> list[AnyDetectorSetting]:
         """The detector settings, in the order of the detection axes."""
         return [own or _made(DetectorSetting, values)
-                for values, own in self._settings("detector", Stage.detection)]
+                for values, own in self._settings("detector")]
 
     @cached_property
     def board_settings(self) -> list[BoardDetectorSetting]:
         """What the detector settings do with boards, in their order."""
         return [_made(BoardDetectorSetting, values)
-                for values, _ in self._settings("detector", Stage.detection)]
+                for values, _ in self._settings("detector")]
 
     @cached_property
     def estimators(self) -> list[EstimatorSetting]:
@@ -160,22 +160,17 @@ class Experiment:
         return [
             _made(PluggedEstimatorSetting, values | {"own": own}) if own
             else _made(EstimatorSetting, values)
-            for values, own in self._settings("estimator", Stage.estimation)
+            for values, own in self._settings("estimator")
         ]
 
-    def _settings(
-        self, section: str, stage: Stage
-    ) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
-        """Yield the values of a section at all combinations of a stage's axes, in their order.
+    def _settings(self, section: str) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
+        """Yield the values of a section at all combinations of its axes, in their order.
 
         Beside them the settings of the plug-in that they name; None for what is built in.
         """
-        grid, named_by = self.grid, NAMED_BY[section].name
-        fixed = {p.name: grid.fixed.get(p.name, p.default)
-                 for p in grid.parameters.values() if p.section == section}
-        for chosen in combinations(grid.axes_of(stage)):
-            values = fixed | chosen
-            plugin = grid.plugin(section, values[named_by])
+        grid = self.grid
+        for values in grid.rows([p.name for p in grid.parameters.values() if p.section == section]):
+            plugin = grid.plugin(section, values[NAMED_BY[section].name])
             yield values, None if plugin is None else PluginSetting(
                 plugin, tuple((each.name, values[each.name]) for each in plugin.settings),
                 grid.folder)

@@ -6,7 +6,7 @@ import collections
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
@@ -409,7 +409,17 @@ class Grid:
 
     def axis_of(self, parameter: str) -> Axis | None:
         """Return the axis along which a parameter varies, alone or together with others."""
-        return next((axis for axis in self.axes if parameter in axis.columns), None)
+        return next(iter(self.axes_with([parameter])), None)
+
+    def axes_with(self, parameters: Iterable[str]) -> list[Axis]:
+        """Return the axes along which some parameters vary, in the document's order."""
+        return [axis for axis in self.axes if not axis.columns.keys().isdisjoint(parameters)]
+
+    def rows(self, parameters: Collection[str]) -> Iterator[dict[str, Any]]:
+        """Yield the values of some parameters at all combinations of their axes."""
+        fixed = {name: self.fixed[name] for name in parameters if name in self.fixed}
+        for chosen in combinations(self.axes_with(parameters)):
+            yield fixed | {name: chosen[name] for name in parameters if name in chosen}
 
     def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
         """Return the axes that bind to the given stages, in the document's order."""
@@ -421,8 +431,7 @@ class Grid:
 
     def values_of(self, name: str) -> Sequence[Any]:
         """Return the values of a parameter on the grid; empty if it is drawn, or at fault."""
-        axis = self.axis_of(name)
-        if axis is not None:
+        if (axis := self.axis_of(name)) is not None:
             return axis.columns[name]
         return (self.fixed[name],) if name in self.fixed else ()
 
@@ -441,9 +450,8 @@ class Grid:
 
     def arrangements(self) -> Iterator[tuple[Any, ...]]:
         """Yield the values of `ARRANGING` of each combination of their axes."""
-        axes = [axis for axis in self.axes if not axis.columns.keys().isdisjoint(ARRANGING)]
-        for chosen in combinations(axes):
-            yield tuple({**self.fixed, **chosen}[name] for name in ARRANGING)
+        for row in self.rows(ARRANGING):
+            yield tuple(row[name] for name in ARRANGING)
 
     @property
     def shows_boards(self) -> bool:
@@ -461,11 +469,9 @@ class Grid:
     @cached_property
     def largest_board(self) -> tuple[int, int]:
         """The most markers and the most chessboard corners of a target."""
-        if not self.shows_boards:
-            return 1, 0
-        markers, corners = zip(
-            *(arranged(values).counts for values in self.arrangements()), strict=True)
-        return max(markers), max(corners)
+        counts = [arranged(values).counts for values in self.arrangements()
+                  ] if self.shows_boards else [(1, 0)]
+        return max(markers for markers, _ in counts), max(corners for _, corners in counts)
 
     @property
     def relative_sizes(self) -> tuple[float, float]:

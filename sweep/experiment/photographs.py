@@ -160,9 +160,8 @@ def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
     width_px, height_px = arrays["size"].tolist()
     record = PhotographRecord(
         tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
-        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"],
-        *(arrays[name] for name in ("rotation", "translation", "std", "source")),
-        str(arrays["board"]))
+        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"], arrays["rotation"],
+        arrays["translation"], arrays["std"], arrays["source"], str(arrays["board"]))
     try:
         record.on_board(record.marker_id)
     except (SweepError, AttributeError, KeyError, TypeError, ValueError):

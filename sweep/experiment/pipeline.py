@@ -319,9 +319,8 @@ def beliefs_in_one_way(reading: Reading) -> None:
 def check_backgrounds(reading: Reading) -> None:
     """Demand background images that can be read and have the frame's size."""
     sizes = {}
-    for value in reading.values_of("background"):
-        if not isinstance(value, str) or reading.recorded is not None:
-            continue
+    images = [value for value in reading.values_of("background") if isinstance(value, str)]
+    for value in images if reading.recorded is None else ():
         path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
         try:
             sizes[value] = decode_grey(path).shape[::-1]
@@ -407,8 +406,7 @@ def boards_can_be_printed(reading: Reading) -> None:
                            "not: delete it")
     if not reading.shows_boards or needed or not all(map(reading.values_of, ARRANGING)):
         return
-    count = math.prod(
-        len(axis) for axis in reading.axes if not axis.columns.keys().isdisjoint(ARRANGING))
+    count = math.prod(map(len, reading.axes_with(ARRANGING)))
     if count > MAX_BOARDS:
         reading.note("axes", f"{count:,} different boards: expected at most {MAX_BOARDS:,}")
         return
@@ -419,9 +417,6 @@ def boards_can_be_printed(reading: Reading) -> None:
 
 
 
-BOARD_SOLVERS = ", ".join(name for name, each in SOLVERS.items() if each.of_boards)
-
-
 def targets_are_solved(reading: Reading) -> None:
     """Demand solvers that can do boards, or single markers."""
     plugged = [each.name for each in reading.plugins if each.of_boards]
@@ -429,19 +424,17 @@ def targets_are_solved(reading: Reading) -> None:
         apart(("solver",), lambda solver: solver in plugged,
               "a solver of single markers, or a board: give kind under [board]")(reading)
         return
-    if "chessboard" in reading.values_of("points") and not {"charuco", "diamond"} & {
-            *reading.values_of("kind")}:
+    if "chessboard" in reading.values_of("points") and {"charuco", "diamond"}.isdisjoint(
+            reading.values_of("kind")):
         reading.refuse(
             "points", "kind = charuco or diamond, which have a chessboard", "chessboard")
-
-    def is_of_boards(solver: str, points: str) -> bool:
-        known = SOLVERS.get(solver)
-        return solver in plugged if known is None else (
-            known.of_boards or (points == "largest_marker" and known.method is not None))
-
-    apart(("solver", "points"), lambda *chosen: not is_of_boards(*chosen),
-          f"one of {BOARD_SOLVERS} for boards; others with points = largest_marker if they take "
-          "corners alone; plug-ins with of_boards=True")(reading)
+    of_boards = [name for name, each in SOLVERS.items() if each.of_boards]
+    of_corners = [name for name, each in SOLVERS.items() if each.method is not None]
+    apart(("solver", "points"),
+          lambda solver, points: solver not in (*of_boards, *plugged) and not (
+              points == "largest_marker" and solver in of_corners),
+          f"one of {', '.join(of_boards)} for boards; others with points = largest_marker if they "
+          "take corners alone; plug-ins with of_boards=True")(reading)
     for name, whole in (("points", "markers"), ("refine", "none")):
         apart((name, "solver"), lambda chosen, solver, whole=whole: (
                   chosen != whole and solver in ("photometric", *plugged)),
@@ -455,7 +448,7 @@ def targets_are_solved(reading: Reading) -> None:
 def each_in_one_way(reading: Reading) -> None:
     """Demand a distance, and each quantity of pose, camera and beliefs in one way."""
     has_poses = PHOTOGRAPHS in reading.given
-    given = reading.given - reading.stated.keys() - (set(IN_CAMERA) if has_poses else set())
+    given = reading.given - reading.stated.keys() - {*(IN_CAMERA if has_poses else ())}
     for choice in (*CHOICES, () if has_poses else (IN_CAMERA, WORLD)):
         ways = [names for way in choice if (names := [name for name in way if name in given])]
         for other in ways[1:]:
@@ -496,11 +489,11 @@ def something_random_to_repeat(reading: Reading) -> None:
     # A distribution that is at fault is one, too.
     drawn = any(isinstance(value, Mapping) and reading.axis_of(name) is None
                 for name, (_, value) in reading.written.items())
-    drawn = drawn or reading.is_active("jitter_px") or _is_calibrated(reading)
-    noisy = map(reading.is_active, (*RANDOM, *(
+    random = ["jitter_px", *RANDOM, *(
         plugin.settings[0].name for plugin in reading.plugins
-        if plugin.kind == "effect" and plugin.random)))
-    if trials > 1 and not drawn and not any(noisy) and PHOTOGRAPHS not in reading.given:
+        if plugin.kind == "effect" and plugin.random)]
+    if trials > 1 and not drawn and PHOTOGRAPHS not in reading.given and not (
+            _is_calibrated(reading) or any(map(reading.is_active, random))):
         reading.fault("axes.trial", trials, "something random to repeat: jitter_px above 0, noise, "
                       "or a distribution")
     if reading.sampling != "sobol" or reading.axis(TRIAL) is None or SEARCH in reading.document:
@@ -524,12 +517,12 @@ RESERVED = {
 
 def names_are_free(reading: Reading) -> None:
     """Demand names that nothing else of the dataset has for plug-ins' settings and joint axes."""
-    names = [(plugin.name, f"name for its setting {setting.name}", setting.name)
+    names = [(plugin.name, f" for its setting {setting.name}", setting.name)
              for plugin in reading.plugins for setting in plugin.settings]
-    names += [(f"axes.{axis.name}", "name", axis.name) for axis in reading.axes if axis.zipped]
-    for start, what, name in names:
+    names += [(f"axes.{axis.name}", "", axis.name) for axis in reading.axes if axis.zipped]
+    for owner, of, name in names:
         if name in RESERVED or name.startswith("_"):
-            reading.note(start, f"expected another {what}: the dataset or its analyses have this "
+            reading.note(owner, f"expected another name{of}: the dataset or its analyses have this "
                          "one")
 
 
@@ -947,8 +940,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     chosen: dict[str, Any] = {}
     for axis in pipeline.axes:
         # Values that are not on the grid replace those of its first cell.
-        index = axis.index_of(named) if axis.columns.keys() & named.keys() else 0
-        chosen |= axis.at(index or 0)
+        chosen |= axis.at(axis.index_of(named) or 0)
     chosen |= named
     trial = chosen.pop(TRIAL, 0)
     for other in displaced_by(named, pipeline.parameters):

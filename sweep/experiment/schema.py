@@ -491,9 +491,10 @@ def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     """
     common = SCHEMA
     if pipeline.shows_boards:
-        lengths = dict(zip(("marker", "chessboard_corner"), pipeline.largest_board, strict=True))
+        markers, corners = pipeline.largest_board
+        lengths = (("marker", markers), ("chessboard_corner", corners))
         common = tuple(each for each in SCHEMA if each.name not in NOT_OF_BOARDS) + tuple(
-            dataclasses.replace(variable, lengths=tuple(lengths.items())) for variable in BOARD_SCHEMA
-            if all(lengths.get(name, 1) for name in variable.inner))
+            dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
+            if corners or "chessboard_corner" not in variable.inner)
     photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
     return common + drawn_variables(pipeline) + photographed

@@ -47,11 +47,11 @@ def pipeline(*settings, seed=1, folder="."):
 
 
 def run(trials, *settings, seed=1, folder="."):
-    """Return a number of trials, or those of an array, of the issue's scene with some settings."""
+    """Return the columns of a number of trials, or those of an array, of the issue's scene."""
     rows = np.arange(trials) if isinstance(trials, int) else trials
     result = run_cells(pipeline(*settings, seed=seed, folder=folder), [rows])
     assert not result.failures, result.failures[0].text
-    return result
+    return result.columns
 
 
 class Cell:
@@ -59,7 +59,7 @@ class Cell:
 
     def __init__(self, trials, *settings, seed=1):
         self.columns = columns = {
-            name: parts[0] for name, parts in run(trials, *settings, seed=seed).columns.items()
+            name: parts[0] for name, parts in run(trials, *settings, seed=seed).items()
         }
         self.detected = columns["detection"] == DetectionStatus.detected
         self.estimate = columns["estimate"][self.detected]
@@ -115,13 +115,8 @@ CELLS = (
 )
 
 
-@pytest.fixture(scope="module")
-def regular():
-    """Return 100 trials of a few regular cells."""
-    return [Cell(100, *settings, seed=3) for settings in CELLS]
-
-
-def test_fits_converge_attain_the_bound_and_explain_the_pixels(regular):
+def test_fits_converge_attain_the_bound_and_explain_the_pixels():
+    regular = [Cell(60, *settings, seed=3) for settings in CELLS]
     assert_gaussian(regular)
     assert_converged(regular)
     # Five standard deviations: 6e-7 a Gaussian, 1e-4 with the skewness of small images' variance.
@@ -129,11 +124,8 @@ def test_fits_converge_attain_the_bound_and_explain_the_pixels(regular):
     assert np.count_nonzero(estimate == EstimateStatus.not_explained) <= binom.isf(
         ALARM, len(estimate), 1e-4
     )
-    assert not any(cell.grossly_wrong.any() for cell in regular)
-
-
-def test_predicted_deviations_are_the_bound_s(regular):
     for cell in regular:
+        assert not cell.grossly_wrong.any()
         ratio = (cell.columns["predicted_std"] / cell.columns["bound_std"])[cell.solved]
         # The curvature is that at the estimate: it scatters by a few per cent with the pose.
         assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.03)
@@ -141,7 +133,7 @@ def test_predicted_deviations_are_the_bound_s(regular):
 
 @pytest.mark.parametrize(("trials", "settings"), [
     # The square has 3 px to the frame, which ends at 639.5 px; the quiet zone goes to 644 px.
-    (100, ("bearing_x_deg=28.2", "roll_deg=0", "azimuth_deg=0", "tilt_deg=20")),
+    (60, ("bearing_x_deg=28.2", "roll_deg=0", "azimuth_deg=0", "tilt_deg=20")),
     (60, (*BLUR_UNKNOWN, "side_px=20", "tilt_deg=30")),
     pytest.param(100, ("distortion=[-0.3, 0.1, 0.001, -0.002]", "side_px=30", "bearing_x_deg=22",
                        "bearing_y_deg=-12"), marks=pytest.mark.long),
@@ -180,25 +172,16 @@ def test_the_alternative_is_the_mirrored_minimum():
 
 # Where its model does not hold.
 
-@pytest.mark.parametrize(("side", "noise"), [(15, 8), (80, 1)])
-def test_blur_that_is_not_believed_is_always_flagged(side, noise):
-    cell = Cell(
-        12, f"side_px={side}", f"noise_grey={noise}", "tilt_deg=15", "blur_px=0.5",
-        "believed_blur_px=0", seed=12,
-    )
-    assert len(cell.estimate) >= 4
-    assert not cell.solved.any()
-
-
 @pytest.mark.parametrize("effect", first_of([
-    ("occlusion=0.02", "occluder=220"), ("illumination_gradient=0.5",), ("background=ground.png",),
+    ("occlusion=0.02", "occluder=220"), ("blur_px=0.5", "believed_blur_px=0"),
+    ("background=ground.png",), ("illumination_gradient=0.5",),
     ("exposure_s=0.01", "velocity_x_m_s=0.2"),  # 2 mm: 2 px
     ("full_well_e=5000",), ("renderer=warp",),
 ], 3), ids=str)
 def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path):
     ground = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "ground.png"), cv2.GaussianBlur(ground, (0, 0), 2))
-    columns = run(25, *effect, seed=13, folder=tmp_path).columns
+    columns = run(25, *effect, seed=13, folder=tmp_path)
     found = columns["detection"][0] == DetectionStatus.detected
     estimate = columns["estimate"][0][found]
     assert len(estimate) >= 20
@@ -211,9 +194,9 @@ def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path
 
 
 def test_a_wrong_belief_of_noise_is_flagged_and_costs_no_pose():
-    columns = run(60, "believed_noise_grey=[2, 1, 4]", seed=14).columns
+    columns = run(40, "believed_noise_grey=[2, 1, 4]", seed=14)
     right, low, high = columns["estimate"]
-    assert (right == EstimateStatus.solved).sum() > 57
+    assert (right == EstimateStatus.solved).sum() > 37
     assert (low == EstimateStatus.not_explained).all()
     assert (high == EstimateStatus.not_explained).all()
     # (2² + 1/12) over (1² + 1/12) and over (4² + 1/12), but for where the fit stops.
@@ -228,8 +211,7 @@ def test_a_wrong_belief_of_noise_is_flagged_and_costs_no_pose():
 
 # One scene, and its neighbours.
 
-@pytest.mark.parametrize("kept_px", [1 << 26, 5 * 640 * 480])
-def test_scenes_do_not_depend_on_which_others_are_needed(kept_px, monkeypatch):
+def test_scenes_do_not_depend_on_which_others_are_needed_or_kept(monkeypatch):
     chosen = pipeline(
         "estimator.solver=['ippe', 'photometric']", "detector.adaptiveThreshWinSizeMax=[23, 53]",
         "pose.side_px=25", seed=17,
@@ -237,7 +219,7 @@ def test_scenes_do_not_depend_on_which_others_are_needed(kept_px, monkeypatch):
     need = np.random.default_rng(18).random((20, 2, 2)) < 0.4
     need[10:16] = False
     whole = run_cells(chosen, [np.arange(20)]).columns
-    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", kept_px)
+    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", 5 * 640 * 480)
     columns = run_cells(chosen, [np.arange(20)], need).columns
     for number, (k, j) in enumerate(np.ndindex(2, 2)):
         asked = need[:, k, j]
@@ -381,12 +363,3 @@ def assert_flips(cell):
     expected = norm.sf(cell.distance[rows].astype(np.float64) / 2)
     flips, deviation = cell.flipped[rows].sum(), math.sqrt((expected * (1 - expected)).sum())
     assert abs(flips - expected.sum()) <= 5 * max(deviation, 1.0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("cell", [(15, 5, 4), (15, 8, 8), (20, 6, 8)], ids=str)
-def test_solutions_flip_as_often_as_noise_makes_the_mirror_likelier(cell):
-    side, tilt, noise = cell
-    assert_flips(Cell(
-        1000, f"side_px={side}", f"tilt_deg={tilt}", f"noise_grey={noise}", seed=101
-    ))

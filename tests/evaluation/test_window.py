@@ -98,30 +98,38 @@ def test_window_finds_what_the_frame_holds(count, width, height, refinement, cla
         assert high < DetectorSetting().cornerRefinementMinAccuracy
 
 
-OTHER_SETTINGS = [
+SETTINGS = [
     {"adaptiveThreshWinSizeMax": 61},
     {"adaptiveThreshWinSizeMin": 4, "adaptiveThreshWinSizeMax": 24,
      "adaptiveThreshWinSizeStep": 4},
     *({"adaptiveThreshConstant": constant} for constant in (0.5, 0.0, -5.0)),
     {"minMarkerPerimeterRate": 0.05, "maxMarkerPerimeterRate": 0.125},
-    {"polygonalApproxAccuracyRate": 0.1},
-    {"minDistanceToBorder": 10},
-    {"minMarkerDistanceRate": 0.0},
-    {"markerBorderBits": 2},
+    {"polygonalApproxAccuracyRate": 0.1}, {"minDistanceToBorder": 10},
+    {"minMarkerDistanceRate": 0.0}, {"markerBorderBits": 2},
     {"perspectiveRemovePixelPerCell": 10, "validBitIdThreshold": 0.2},
-    {"detectInvertedMarker": True},
-    {"useAruco3Detection": True},
+    {"detectInvertedMarker": True}, {"useAruco3Detection": True},
     *({"cornerRefinementMethod": "apriltag", name: value} for name, value in {
         "aprilTagQuadSigma": 2.0, "aprilTagQuadDecimate": 2.0, "aprilTagMinWhiteBlackDiff": 100,
         "aprilTagMinClusterPixels": 100, "minDistanceToBorder": 0,
     }.items()),
 ]
+PROCESSING = [
+    ["quiet_zone_modules=0"], ["distortion=[-0.3, 0.1, 0.001, -0.002]"], ["noise_grey=8"],
+    ["noise_grey=16", "noise_correlation=0.99"],
+    ["noise_grey=4", "jpeg_quality=1", "noise_correlation=0.7"],
+    ["noise_grey=4", "bayer=RGGB", "bayer_red=0.8", "demosaic=edge_aware"],
+    ["noise_grey=4", "sharpening=2", "sharpening_px=3", "blur_px=0.5"],
+    ["bloom=1", "illumination_gradient=2", "illumination_deg=30"],
+    ["noise_table=[0, 20, 255, 2]", "sharpening=1", "sharpening_px=20"],
+]
 
 
-@pytest.mark.parametrize("setting", OTHER_SETTINGS, ids=str)
+@pytest.mark.parametrize(("setting", "scene"), [
+    *((setting, []) for setting in SETTINGS), *(({}, scene) for scene in PROCESSING),
+], ids=str)
 @lengths(10, 100)
-def test_window_finds_what_the_frame_holds_under_other_settings(count, setting):
-    compared(visible_scenes(count), DetectorSetting(**setting))
+def test_window_finds_what_the_frame_holds_under_any_setting_and_processing(count, setting, scene):
+    compared(visible_scenes(count, settings=scene), DetectorSetting(**setting))
 
 
 def test_window_leaves_room_for_a_wide_refinement():
@@ -131,25 +139,6 @@ def test_window_leaves_room_for_a_wide_refinement():
         cornerRefinementMethod="subpix", cornerRefinementWinSize=40,
         relativeCornerRefinmentWinSize=100.0,
     ))
-
-
-PROCESSING = {
-    "no quiet zone": ["quiet_zone_modules=0"],
-    "lens": ["distortion=[-0.3, 0.1, 0.001, -0.002]"],
-    "noise": ["noise_grey=8"],
-    "far correlated noise": ["noise_grey=16", "noise_correlation=0.99"],
-    "coarse JPEG": ["noise_grey=4", "jpeg_quality=1", "noise_correlation=0.7"],
-    "demosaiced": ["noise_grey=4", "bayer=RGGB", "bayer_red=0.8", "demosaic=edge_aware"],
-    "sharpened": ["noise_grey=4", "sharpening=2", "sharpening_px=3", "blur_px=0.5"],
-    "bloom on a slope of light": ["bloom=1", "illumination_gradient=2", "illumination_deg=30"],
-    "noise by level": ["noise_table=[0, 20, 255, 2]", "sharpening=1", "sharpening_px=20"],
-}
-
-
-@pytest.mark.parametrize("name", PROCESSING)
-@lengths(10, 100)
-def test_window_finds_what_the_frame_holds_of_a_processed_image(count, name):
-    compared(visible_scenes(count, settings=PROCESSING[name]), DetectorSetting())
 
 
 def paired(*settings):

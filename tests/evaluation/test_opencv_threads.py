@@ -1,13 +1,11 @@
 """The caller's number of OpenCV threads is its own again after a call."""
 
-import threading
 
 import cv2
 import pytest
 
 from support.blocks import run_cells
 from sweep.evaluation.inspection import inspect_scene
-from sweep.evaluation.opencv_threads import single_threaded
 from sweep.experiment.pipeline import Pipeline
 
 PIPELINE = Pipeline.from_dict({"pose": {"distance_m": 0.5}, "marker": {"size_m": 0.1}})
@@ -25,24 +23,4 @@ def two_threads():
 @pytest.mark.parametrize("call", [lambda: run_cells(PIPELINE, []), lambda: inspect_scene(PIPELINE)])
 def test_a_call_leaves_the_number_of_threads_as_it_was(call):
     call()
-    assert cv2.getNumThreads() == 2
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_of_overlapping_contexts_the_last_restores_it():
-    entered, leave = threading.Event(), threading.Event()
-
-    def other():
-        with single_threaded():
-            entered.set()
-            leave.wait()
-
-    thread = threading.Thread(target=other)
-    with single_threaded():
-        thread.start()
-        entered.wait()
-    # The other context is still open.
-    assert cv2.getNumThreads() == 1
-    leave.set()
-    thread.join()
     assert cv2.getNumThreads() == 2

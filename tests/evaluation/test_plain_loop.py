@@ -345,7 +345,8 @@ class Sighting:
                           self.lens, METHODS[method], limit_px)
 
 
-@pytest.mark.parametrize("name", first_of(("charuco", *(k for k in KINDS if k != "charuco")), 2))
+@pytest.mark.parametrize("name", first_of(
+    ("charuco", "beside", *(k for k in KINDS if k not in ("charuco", "beside"))), 2))
 def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, request):
     trials = 8 if request.node.get_closest_marker("evidence") else 1
     scenes, got = ran(board_pipeline(name, trials))

@@ -31,9 +31,9 @@ SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0
 RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 
 
-def cameras(count, focal_px=FOCAL_PX, lens=()):
-    view = np.tile([focal_px, focal_px, 319.5, 239.5], (count, 1))
-    return Cameras(view, np.repeat(pack(lens)[None], count, axis=0), np.full(count, bool(lens)))
+def cameras(count, view=(FOCAL_PX, FOCAL_PX, 319.5, 239.5), lens=()):
+    return Cameras(np.tile(view, (count, 1)), np.repeat(pack(lens)[None], count, axis=0),
+                   np.full(count, bool(lens)))
 
 
 def scenes_of(document):
@@ -162,7 +162,7 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens):
 class View:
     """Poses (N,) of markers at ``centre`` (N, 3), and their exact corners without a lens."""
 
-    def __init__(self, angles_deg, centre, size_m, focal_px=FOCAL_PX):
+    def __init__(self, angles_deg, centre, size_m):
         tilt, azimuth, roll = np.radians(angles_deg)
         axis = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * tilt], axis=1)
         rotation = Rotation.from_rotvec(tilt[:, None] * axis) * Rotation.from_euler(
@@ -176,7 +176,7 @@ class View:
         reflection = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
         # Every pose's reflection in the plane across the line of sight.
         self.mirrored = reflection @ self.rotation @ np.diag([1.0, 1.0, -1.0])
-        self.size_m, self.cameras = np.full(count, size_m), cameras(count, focal_px)
+        self.size_m, self.cameras = np.full(count, size_m), cameras(count)
         self.corners = self.cameras.project(
             np.einsum("nij,kj->nki", self.rotation, size_m * SQUARE) + self.translation[:, None])
 
@@ -231,39 +231,6 @@ def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m
         assert failures["sqpnp", False] > 0
 
 
-def far(count, focal_px):
-    """Poses so far away that the perspective across the marker is 1e-3 to 1e-6 px."""
-    rng = np.random.default_rng(3)
-    side_px = np.geomspace(20, 100, count)
-    # To 33 degrees off the axis at the shortest focal length: none is seen from behind.
-    steepest = 85 if focal_px > 1e3 else 50
-    tilt, azimuth, roll = rng.uniform(0, [[steepest], [360], [360]], (3, count))
-    # Every tenth is parallel to the image, or turned about an image axis: where IPPE's rotation
-    # vector has a norm of pi.
-    side_px[-1], tilt[-1] = 100.0, 0.0
-    tilt[::10], azimuth[5::10], roll[5::10] = 0.0, 0.0, 90.0 * rng.integers(0, 4, count // 10)
-    depth = focal_px * 0.05 / side_px
-    centre = np.stack([*(rng.uniform(-200, 200, (2, count)) * depth / focal_px), depth], axis=1)
-    return View((tilt, azimuth, roll), centre, 0.05, focal_px)
-
-
-@pytest.mark.parametrize("focal_px", [3e2, 1e4, 1e6, 1e8])
-@lengths(60, 2000)
-def test_guarded_solvers_are_right_at_any_focal_length(count, focal_px):
-    view = far(count, focal_px)
-    assert len(view.rotation) == count
-    for solver in RELIABLE:
-        estimates = view.estimates(solver)
-        assert (estimates.status == EstimateStatus.solved).all(), solver
-        error = degrees_between(estimates.rotation, view.rotation).max()
-        # Not even the mirror is right: the corners tell them apart. AP3P alone loses digits of
-        # frontal markers before they are far.
-        assert error < (0.2 if (solver, focal_px) == ("ap3p", 1e4) else 0.01), solver
-        relative = np.linalg.norm(estimates.translation - view.translation, axis=1)
-        # ITERATIVE's own stop leaves 4e-6 at short focal lengths.
-        assert (relative / view.translation[:, 2]).max() < 2e-5, solver
-
-
 @pytest.mark.parametrize("solver", OPENCV_SOLVERS)
 def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
     view = all_round(37)  # no multiple of a right angle: the guard needs no fallback
@@ -313,11 +280,15 @@ BOARDS = {
 
 
 def detections(board, points, lens=()):
-    return detected(board, points, Cameras(VIEW[None], pack(lens)[None], np.array([bool(lens)])))
+    return detected(board, points, cameras(1, VIEW, lens))
 
 
 def settings(board, refines):
-    """Each guarded solver that boards have, for all its points and refinements."""
+    """Each guarded solver that boards have, for all its points and refinements.
+
+    Of one marker also those of markers alone.
+    """
+    yield from (PointSolver(solver, True, 0.25) for solver in RELIABLE if len(board) == 1)
     for solver, refine in itertools.product(BOARD_METHODS, refines):
         if board.is_flat or solver != "ippe":
             yield PointSolver(solver, True, 0.25, 0.3, "markers", refine)
@@ -387,8 +358,9 @@ TILTS_DEG = ((0.0, 0.0), (0.0, 60.0), (60.0, 85.0), (85.0, 89.9))
 
 @lengths(1, 12)
 @pytest.mark.parametrize(("name", "lens"), [
-    ("charuco", "none"), ("charuco", "mild"),
-    *(pytest.param(name, "none", marks=pytest.mark.long) for name in BOARDS if name != "charuco"),
+    ("charuco", "none"), ("charuco", "mild"), ("one marker", "none"),
+    *(pytest.param(name, "none", marks=pytest.mark.long)
+      for name in ("millimetre", "kilometre", "folded")),
 ])
 def test_exact_points_give_the_pose_at_any_size_distance_and_tilt(count, name, lens):
     rng = np.random.default_rng(41)
@@ -408,8 +380,9 @@ def test_exact_points_give_the_pose_at_any_size_distance_and_tilt(count, name, l
             if solver.solver != "epnp":  # unreliable, and says so
                 context = solver, span_px, tilts
                 assert found.status[0] == EstimateStatus.solved, context
-                # OpenCV's iterations end at about 0.01 degrees.
-                assert degrees_off(found, rotation) < 0.05, context
+                # OpenCV's iterations end at about 0.01 degrees; AP3P loses digits of far markers.
+                most = 0.3 if solver.solver == "ap3p" else 0.05
+                assert degrees_off(found, rotation) < most, context
     assert seen >= 10 * count
 
 

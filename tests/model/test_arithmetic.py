@@ -251,15 +251,6 @@ def test_fold_is_told_beyond_its_radius_and_not_inside(coefficients):
             assert found[0] == folded, factor
 
 
-def test_fold_by_tangential_terms_is_told():
-    # d(xd)/dx = 1 + 6 p2 x vanishes at x = -1 / (6 p2), where no radial term folds.
-    packed = lens.pack((0.0, 0.0, 0.0, 0.5))
-    square = 0.05 * np.array([[[1.0, 1], [-1, 1], [-1, -1], [1, -1]]])
-    assert packed[23] == np.inf
-    assert not lens.folds(square - [0.2, 0.0], packed[None])[0]
-    assert lens.folds(square - [0.4, 0.0], packed[None])[0]
-
-
 def inside_the_lens(points, packed):
     """Tell for points (N, 2) whether the Jacobian stays well positive from the centre to them."""
     return np.array([

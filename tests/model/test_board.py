@@ -75,14 +75,6 @@ def test_squares_overlap_as_their_clipped_polygons_do():
     assert first_overlap(squares([[0, 0], [1.0, 0]], [1.0, 1.0], [0.0, 0.0])) is None
 
 
-def test_a_board_that_cannot_be_has_every_fault():
-    wrong = Charuco(
-        dictionary="DICT_4X4_50", squares_x=20, squares_y=20, square_m=0.01, marker_m=0.01
-    )
-    assert [fault.key for fault in wrong.faults()] == ["marker_m", "dictionary"]
-    assert "IDs from 0 to 49" in wrong.faults()[1].expected
-
-
 def test_an_april_grid_in_kalibrs_words_is_what_kalibr_prints():
     """IDs from the bottom left, upwards; codes turned by 180 degrees against OpenCV's dictionary.
 

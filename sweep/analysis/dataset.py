@@ -19,7 +19,7 @@ from sweep.experiment.draws import REPLICATES
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
-from sweep.experiment.schema import FIXED, LABELS, SCHEMA, VARIABLES, with_descriptions
+from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import shown
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
@@ -333,24 +333,6 @@ def common_trials(
             [name for name in pooled if name in one.dims])
         common = available if common is None else common & available
     return None if common is None else common.reset_coords(drop=True).compute()
-
-
-def with_common_trials(results: xr.Dataset, kept: Sequence[str]) -> xr.Dataset:
-    """Return a dataset in which only trials that all pooled cells have are run.
-
-    The same dataset unless sampling was stopped in it.
-    """
-    if not is_sampling_stopped(results):
-        return results
-    common = common_trials(results, {"detection": results["detection"]}, kept)
-    if common is None:
-        return results
-    flags = {name: results[name] for name in ("detection", "estimate", "flipped")
-             if name in results}
-    return results.assign({
-        name: array.where(common, VARIABLES[name].not_needed).astype(np.uint8).assign_attrs(
-            array.attrs)
-        for name, array in flags.items()})
 
 
 def computed_scenes(results: xr.Dataset) -> xr.DataArray:

@@ -18,8 +18,10 @@ from sweep.analysis.dataset import (
     computed_scenes,
     configuration_axes,
     describes,
+    each_cell,
     image_sides,
     kept_dimensions,
+    largest_cell,
     parameter_value,
     require_poses,
     stacked,
@@ -30,7 +32,7 @@ from sweep.analysis.estimator import (
     Count,
     Statistic,
     aggregate,
-    draws_of_quantile,
+    draws_to_see,
     stopped_level,
 )
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
@@ -342,9 +344,7 @@ def _cause(
 ) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~keeps & (cell["decision"] != Decision.not_applicable)
-    excess = excess_of(cell).where(failing, -np.inf)
-    index = np.unravel_index(int(np.argmax(excess.to_numpy())), excess.shape)
-    worst = cell.isel(dict(zip(excess.dims, map(int, index), strict=True)))
+    worst = largest_cell(cell, excess_of(cell).where(failing, -np.inf))
     at = {name: worst[name].item() for name in together}
     where = ", ".join(f"{name} = {value:g}" if isinstance(value, float) else f"{name} = {value}"
                       for name, value in at.items())
@@ -572,14 +572,13 @@ def least_draws(requirement: Requirement, share: float) -> int:
     368
     """
     what = requirement.requirable
-    tail = (1.0 - what.level(share)) / 2.0
     if what.is_rate:
         good = requirement.limit if requirement.at_least else 1.0 - requirement.limit
-        return math.ceil(math.log(tail) / math.log(good)) if 0.0 < good < 1.0 else 1
+        return draws_to_see(1.0 - good, what.level(share)) if 0.0 < good < 1.0 else 1
     if what.percent is not None:
-        share_below = what.percent / 100.0
-        return math.ceil(math.log(tail) / math.log(
-            1.0 - share_below if requirement.at_least else share_below))
+        below = what.percent / 100.0
+        return draws_to_see(
+            below if requirement.at_least else 1.0 - below, what.level(share))
     return MIN_DRAWS
 
 
@@ -865,14 +864,15 @@ def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -
 
 def answers(cells: ChoiceCells) -> list[Answer]:
     """Return the answer of each alternative, in the order of the table's dimensions."""
-    return [_answer(cells, k) for k in range(len(cells.decision))]
+    return [_answer(cells, k, *alternative)
+            for k, alternative in enumerate(each_cell(cells.table, cells.rule.among))]
 
 
-def _answer(cells: ChoiceCells, k: int) -> Answer:
-    """Return the answer of alternative number ``k``."""
-    along, among = cells.rule.along, cells.rule.among
-    index = np.unravel_index(k, [cells.table.sizes[name] for name in among])
-    table = cells.table.isel(dict(zip(among, map(int, index), strict=True)))
+def _answer(
+    cells: ChoiceCells, k: int, alternative: Mapping[str, Any], table: xr.Dataset
+) -> Answer:
+    """Return the answer of alternative number ``k``, whose part of the cells is a table."""
+    along = cells.rule.along
     values: list[Any] = table[along].to_numpy().tolist() if along else [None]
 
     def cause(at: int) -> Cause:
@@ -895,7 +895,7 @@ def _answer(cells: ChoiceCells, k: int) -> Answer:
         nearest = Nearest(values[best], float(cells.excess[k, best]), cause(best))
     possible = int(last_steady(value != Decision.not_met, judged))
     return Answer(
-        {name: table[name].item() for name in among}, met, values[came.answer] if met else None,
+        alternative, met, values[came.answer] if met else None,
         cause(came.answer) if met else None, values[came.next] if after else None,
         cause(came.next) if after else None,
         tuple((values[at], cause(at)) for at in came.isolated),
@@ -991,7 +991,7 @@ class WantedPrecision:
             return MIN_OF_RATE
         if (percent := self.requirable.percent) is None:
             return MIN_MEAN_DRAWS
-        return draws_of_quantile(percent, stopped_level(LEVEL))
+        return draws_to_see(1.0 - percent / 100.0, stopped_level(LEVEL))
 
     @property
     def fewest_draws(self) -> int:
@@ -1000,9 +1000,7 @@ class WantedPrecision:
             return self.least_draws
         if self.half_width >= 0.5:
             return 1
-        # Without a success, Clopper and Pearson's end is 1 - tail^(1/n).
-        tail = (1.0 - stopped_level(LEVEL)) / 2.0
-        return math.ceil(math.log(tail) / math.log(1.0 - 2.0 * self.half_width))
+        return draws_to_see(2.0 * self.half_width, stopped_level(LEVEL))
 
     def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
         """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.

@@ -22,7 +22,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import special
+from scipy import special, stats
 
 from sweep.analysis.dataset import (
     DRAWS,
@@ -630,11 +630,10 @@ class Rate(Statistic[ViewT]):
     """Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted."""
     with_jeffreys: bool = False
     exact: bool = False
-    draws_name: str = "draws"
 
     def outputs(self) -> Sequence[Output]:
         """Return the rate, its interval, and the counts that are asked for."""
-        draws = Output(self.draws_name, "random draws that the interval is of", "1", "i8")
+        draws = Output("draws", "random draws that the interval is of", "1", "i8")
         return [
             *(Output(name, meaning, "1", "i8") for name, meaning in self.counts),
             *([draws] if self.counts else []),
@@ -662,7 +661,7 @@ class Rate(Statistic[ViewT]):
             values: Variables = {self.name: hits / n}
         if self.counts:
             names = (name for name, _ in self.counts)
-            values |= dict(zip(names, (n, hits), strict=False)) | {self.draws_name: draws}
+            values |= dict(zip(names, (n, hits), strict=False)) | {"draws": draws}
         kinds = {"": clopper_pearson if self.exact or design.stopped else wilson}
         if self.with_jeffreys:
             kinds["_jeffreys"] = jeffreys
@@ -1136,26 +1135,22 @@ def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int
     >>> interval_ranks(100, 50)
     (40, 61)
     """
-    p = percent / 100.0
-    reach = 10.0 * np.sqrt(n * p * (1.0 - p)) + 10.0
-    below = np.arange(max(0, int(n * p - reach)), min(n, int(n * p + reach)) + 1)
-    chance = special.bdtr(below, n, p)
     tail = (1.0 - level) / 2.0
-    first = below[np.searchsorted(chance, tail)]
-    last = below[np.searchsorted(chance, 1.0 - tail)] + 1
-    return int(first), int(last)
+    first, last = stats.binom.ppf([tail, 1.0 - tail], n, percent / 100.0)
+    return int(first), int(last) + 1
 
 
-@functools.cache
-def draws_of_quantile(percent: int, level: float = LEVEL) -> int:
-    """Return the least number of draws at which the interval of a quantile has an upper end.
+def draws_to_see(share: float, level: float = LEVEL) -> int:
+    """Return the least number of draws that show what has a share of the population.
 
-    From the median on it has a lower one, too.
+    None of them is of that kind with a probability of (1 - level) / 2 at most. So many the interval
+    of a quantile needs for an upper end, ``share`` being what lies above it, and that of a rate
+    without a failure to exclude it.
 
-    >>> draws_of_quantile(95)
+    >>> draws_to_see(1.0 - 0.95)
     72
     """
-    return next(n for n in itertools.count(1) if interval_ranks(n, percent, level)[1] <= n)
+    return math.ceil(math.log((1.0 - level) / 2.0) / math.log1p(-share))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1381,9 +1376,8 @@ class Layout:
         own = [part if set(part) & set(array.dims) else () for part in parts]
         dims = [*itertools.chain(*own), *inner]
         sizes = {**self.sizes, **{name: array.sizes[name] for name in inner}}
-        values = array.variable.transpose(*(name for name in dims if name in array.dims)).to_numpy()
-        values = values.reshape([sizes[name] if name in array.dims else 1 for name in dims])
-        values = np.broadcast_to(values, [sizes[name] for name in dims])
+        variable: Any = xr.Variable(array.dims, array.to_numpy())
+        values = variable.set_dims({name: sizes[name] for name in dims}).to_numpy()
         rest = values.shape[len(dims) - len(inner):]
         values = values.reshape((*(math.prod(sizes[name] for name in part) for part in own), *rest))
         shape = [math.prod(sizes[name] for name in part) for part in parts]

@@ -26,8 +26,10 @@ from sweep.analysis.dataset import (
     axes_of,
     configuration_axes,
     describes,
+    each_cell,
     is_replicated,
     kept_dimensions,
+    largest_cell,
     stacked,
 )
 from sweep.analysis.estimator import (
@@ -41,7 +43,7 @@ from sweep.analysis.estimator import (
     RootMeanSquare,
     Statistic,
     aggregate,
-    draws_of_quantile,
+    draws_to_see,
     guarded,
 )
 from sweep.analysis.intervals import clopper_pearson
@@ -513,23 +515,18 @@ def read_requirements(
     requirements, faults = [], []
     for text in texts:
         try:
-            requirement = _parsed(text)
+            given = read_requirement(text)
+            what = named(given.name)
+            problem = fault_of(what, given)
         except ValueError as error:
-            faults.append((plain(text), str(error)))
+            problem = str(error)
+        if problem:
+            faults.append((plain(text), problem))
         else:
-            requirements.append(requirement)
-    faults += contradictions(requirements)
-    return requirements, faults
-
-
-def _parsed(text: str) -> Requirement:
-    """Return a requirement; ValueError says what is wrong."""
-    parts = read_requirement(text)
-    what = named(parts.name)
-    if problem := fault_of(what, parts):
-        raise ValueError(problem)
-    return Requirement(
-        f"{what.name} {parts.relation} {parts.limit:.12g}", what.name, parts.relation, parts.limit)
+            requirements.append(Requirement(
+                f"{what.name} {given.relation} {given.limit:.12g}", what.name, given.relation,
+                given.limit))
+    return requirements, faults + contradictions(requirements)
 
 
 @describes
@@ -748,7 +745,7 @@ def draws_needed(
         end, gap = low if good == requirement.at_least else high, abs(value - limit)
         least = float(MIN_DRAWS)
         if what.percent is not None:
-            least = float(draws_of_quantile(what.percent, level))
+            least = float(draws_to_see(1.0 - what.percent / 100.0, level))
             if math.inf in (end, value) and draws >= least:
                 return max(least, _of_rate(solved, what.percent / 100.0, level))
         if not math.isfinite(end) or not math.isfinite(value):
@@ -906,30 +903,27 @@ def worst_cell(table: xr.Dataset) -> xr.Dataset:
     """Return the cell of a table of `decide` that fails worst, or is nearest to it."""
     decision = table["decision"]
     worst = next(each for each in WORST_FIRST if (decision == each).any())
-    excess = excess_of(table).where(decision == worst, -np.inf)
-    index = np.unravel_index(int(np.argmax(excess.to_numpy())), excess.shape)
-    return table.isel(dict(zip(excess.dims, map(int, index), strict=True)))
+    return largest_cell(table, excess_of(table).where(decision == worst, -np.inf))
 
 
 def verdicts(table: xr.Dataset) -> list[Verdict]:
     """Return the verdicts of a table of `sweep.analysis.check_requirements`."""
     configuration = [str(name) for name in table.attrs["configuration_dims"]]
-    dims = [str(dim) for dim in table["decision"].dims]
-    conditions = [name for name in dims if name not in (*configuration, "requirement")]
-    table = table.transpose(*configuration, "requirement", *conditions)
+    conditions = [str(dim) for dim in table["decision"].dims
+                  if dim not in (*configuration, "requirement")]
     found = []
-    for at in np.ndindex(*(table.sizes[name] for name in (*configuration, "requirement"))):
-        one = table.isel(dict(zip((*configuration, "requirement"), at, strict=True)))
-        decisions = one["decision"].values
-        needed = one["draws_needed"].values[decisions == Decision.undecided]
+    for at, one in each_cell(
+            table.transpose(*configuration, "requirement", *conditions),
+            (*configuration, "requirement")):
+        counts = {each: int((one["decision"] == each).sum()) for each in Decision}
+        needed = one["draws_needed"].where(one["decision"] == Decision.undecided)
         cell = worst_cell(one)
-        is_open = cell["decision"] == Decision.undecided and not np.isnan(needed).all()
+        is_open = cell["decision"] == Decision.undecided
         found.append(Verdict.at(
             cell, conditions, limit=float(one["limit"]),
-            draws_needed=float(np.nanmax(needed)) if is_open else math.nan,
-            configuration={name: one[name].item() for name in configuration},
-            counts={each: int((decisions == each).sum()) for each in Decision
-                    if (decisions == each).any()}))
+            draws_needed=float(needed.max()) if is_open else math.nan,
+            configuration={name: at[name] for name in configuration},
+            counts={each: count for each, count in counts.items() if count}))
     return found
 
 

@@ -15,13 +15,14 @@ from sweep.analysis.dataset import (
     DRAWS,
     as_names,
     axes_of,
+    common_trials,
     describes,
     is_grid_axis,
     is_replicated,
+    is_sampling_stopped,
     kept_dimensions,
     require_dimension,
     stacked,
-    with_common_trials,
 )
 from sweep.analysis.estimator import (
     INTERVAL,
@@ -44,6 +45,7 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import (
+    COMMON,
     DEPTH,
     DETECTION_INPUTS,
     ERROR_INPUTS,
@@ -334,10 +336,14 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
     cells = [name for name in axes_of(results) if name in results["detection"].dims
              and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
-    results = with_common_trials(results, kept)
-    table = detection_rate(results, kept)[
-        ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
-    counts = detection_rate(results, (*kept, *cells))
+    inputs = pose_arrays(results, DETECTION_INPUTS)
+    if is_sampling_stopped(results) and (
+            common := common_trials(results, inputs, kept)) is not None:
+        inputs[COMMON] = common
+    rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "")))
+    table, counts = (aggregate(results, inputs, names, [rate], Poses)
+                     for names in (kept, (*kept, *cells)))
+    table = table.drop_vars(["detected", "draws"])
     n = counts["draws"].astype(np.float64)
     hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
     strata = [n, n.sum("marker_id"), hits.sum("marker_id")]

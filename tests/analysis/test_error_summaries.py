@@ -11,9 +11,10 @@ from support.lengths import lengths
 from support.small_datasets import (
     assert_agrees,
     degrees,
+    is_detected,
     is_solved,
     is_unflipped,
-    length,
+    lengths_of,
     looked_for,
     percent,
     perfect,
@@ -67,7 +68,7 @@ def with_flags_of_every_kind(rng, results):
 
 
 def rms(values):
-    return math.sqrt(math.fsum(value**2 for value in values) / len(values))
+    return math.sqrt((np.asarray(values) ** 2).mean())
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +134,10 @@ def test_efficiency_is_that_of_plain_loops(mixed):
     per = ["distance_m", "solver"]
     answer = efficiency(mixed, per)
     for index, found in poses(mixed, "estimate", per).items():
-        chosen = [pose for pose in found
-                  if is_unflipped(pose) and not np.isnan(pose["bound_std"]).any()]
-        rotation = rms([rms(p["bound_std"][:3].tolist()) * math.sqrt(3) for p in chosen]) / rms(
-            [math.radians(length(degrees(p))) for p in chosen])
-        depth = rms([p["bound_std"][5] / p["true_tvec_m"][2] for p in chosen]) / rms(
-            [percent(p)[0] / 100 for p in chosen])
+        chosen = found.where(is_unflipped(found) & ~np.isnan(found["bound_std"]).any(axis=1))
+        std = chosen["bound_std"]
+        rotation = rms(std[:, :3]) * math.sqrt(3) / rms(np.radians(lengths_of(degrees(chosen))))
+        depth = rms(std[:, 5] / chosen["true_tvec_m"][:, 2]) / rms(percent(chosen) / 100)
         assert_agrees(answer, dict(zip(per, index, strict=True)),
                       {"rotation_efficiency": rotation, "range_efficiency": depth})
 
@@ -216,21 +215,24 @@ def test_renderers_are_compared_pose_by_pose():
     per = ["renderer", "cornerRefinementMethod", "solver"]
     groups = poses(results, "estimate", per)
     for index, found in groups.items():
-        aimed = [(a, b) for a, b in zip(found, groups[1, *index[1:]], strict=True)
-                 if looked_for(a) and looked_for(b)]
-        seen = [[p["detection"] == DetectionStatus.detected for p in pair] for pair in aimed]
-        shifts = [a["corner_error_px"].astype(float) - b["corner_error_px"]
-                  for (a, b), both in zip(aimed, seen, strict=True) if all(both)]
-        ranges = [(percent(a) - percent(b))[0] for a, b in aimed if is_solved(a) and is_solved(b)]
-        turns = [np.degrees(a["rotation_error_rad"] - b["rotation_error_rad"])
-                 for a, b in aimed if is_unflipped(a) and is_unflipped(b)]
-        differing = sum(a != b for a, b in seen)
+        pair = found, groups[1, *index[1:]]
+        aimed = looked_for(pair[0]) & looked_for(pair[1])
+        pair = [each.where(aimed) for each in pair]
+        seen, solved, right = (
+            [mask(each) for each in pair] for mask in (is_detected, is_solved, is_unflipped))
+
+        def apart(error, mask, pair=pair):
+            one, two = (error(each.where(mask[0] & mask[1])) for each in pair)
+            return one - two
+
+        differing = int((seen[0] != seen[1]).sum())
         assert_agrees(answer, dict(zip(per, index, strict=True)), {
-            "compared": len(aimed), "differing": differing,
-            "detection_disagreement": differing / len(aimed),
-            "corner_shift_rms_px": rms(np.ravel(shifts).tolist()),
-            "range_bias_percent": math.fsum(ranges) / len(ranges),
-            "rotation_shift_deg": rms([math.hypot(*turn) for turn in turns])})
+            "compared": len(pair[0]), "differing": differing,
+            "detection_disagreement": differing / len(pair[0]),
+            "corner_shift_rms_px": rms(apart(lambda p: p["corner_error_px"].astype(float), seen)),
+            "range_bias_percent": apart(percent, solved).mean(),
+            "rotation_shift_deg": rms(lengths_of(apart(
+                lambda p: np.degrees(p["rotation_error_rad"]), right)))})
 
 
 def test_a_renderer_that_is_not_there_is_refused(mixed):

@@ -1,6 +1,5 @@
 """Rankings, comparisons, limits against plain loops, exact distributions, published values."""
 
-import itertools
 import math
 
 import numpy as np
@@ -16,7 +15,7 @@ from support.small_datasets import (
     is_detected,
     is_run,
     is_solved,
-    length,
+    lengths_of,
     looked_for,
     mean_of,
     mixed,
@@ -36,31 +35,17 @@ from sweep.measure.flags import DetectionStatus, Flipped
 
 # Ranking of marker IDs.
 
-def strata_of(chosen):
-    """Return {cell: {marker: [hits, looked for]}} of poses of all IDs.
+def hypergeometric_parts(aimed, marker):
+    """Return an ID's hits and, of each cell that it was in, (looked for, its, hits) of all IDs.
 
-    ``chosen`` are (marker, cell, pose).
+    ``aimed`` are the poses that were looked for, by ID.
     """
-    strata = {}
-    for marker, cell, pose in chosen:
-        if looked_for(pose):
-            counts = strata.setdefault(cell, {}).setdefault(marker, [0, 0])
-            counts[0] += is_detected(pose)
-            counts[1] += 1
-    return strata
-
-
-def hypergeometric_parts(strata, marker):
-    """Return an ID's hits and, of each cell that others were in, (looked for, its, hits)."""
-    parts, hits = [], 0
-    for counts in strata.values():
-        if marker not in counts:
-            continue
-        own, total = counts[marker], sum(n for _, n in counts.values())
-        detected = sum(k for k, _ in counts.values())
-        hits += own[0]
-        parts.append((total, own[1], detected))
-    return hits, parts
+    own, parts = aimed[marker], []
+    for cell in np.unique(own.cell):
+        total = sum(int((each.cell == cell).sum()) for each in aimed)
+        hits = sum(int(is_detected(each)[each.cell == cell].sum()) for each in aimed)
+        parts.append((total, int((own.cell == cell).sum()), hits))
+    return int(is_detected(own).sum()), parts
 
 
 def cumulants(parts):
@@ -68,16 +53,6 @@ def cumulants(parts):
     moments = [stats.hypergeom.stats(n, k, m, moments="mvs") for n, m, k in parts]
     mean, variance, skewness = np.nan_to_num(np.array(moments, float).T, posinf=0.0, neginf=0.0)
     return mean.sum(), variance.sum(), (skewness * variance**1.5).sum()
-
-
-def of_markers(results, per):
-    """Return {kept indices without the marker: (marker, cell, pose)}; cells hold all IDs."""
-    names = (*per, "marker_id")
-    groups = {}
-    for index, chosen in poses(results, "detection", names).items():
-        groups.setdefault(index[:-1], []).extend(
-            (index[-1], pose["cell"], pose) for pose in chosen)
-    return groups
 
 
 RANKED = {
@@ -116,15 +91,15 @@ def test_rates_and_p_values_of_ids_are_those_of_plain_loops(case):
     adjusted = holm(answer["p_value"].transpose(*kept, "marker_id").values.ravel().tolist())
     np.testing.assert_allclose(
         answer["p_adjusted"].transpose(*kept, "marker_id").values.ravel(), adjusted, rtol=1e-12)
-    for index, chosen in of_markers(results, kept).items():
-        strata = strata_of(chosen)
-        markers = range(results.sizes["marker_id"])
-        for marker in markers:
-            aimed = [pose | {"cell": cell} for who, cell, pose in chosen
-                     if who == marker and looked_for(pose)]
-            hits, parts = hypergeometric_parts(strata, marker)
-            expected = {"looked_for": len(aimed), **rate("detection_rate", aimed, hits),
-                        "expected_rate": cumulants(parts)[0] / len(aimed)}
+    markers = range(results.sizes["marker_id"])
+    found = poses(results, "detection", (*kept, "marker_id"))
+    for index in {index[:-1] for index in found}:
+        some = [found[*index, marker] for marker in markers]
+        aimed = [each.where(looked_for(each)) for each in some]
+        for marker, own in enumerate(aimed):
+            hits, parts = hypergeometric_parts(aimed, marker)
+            expected = {"looked_for": len(own), **rate("detection_rate", own, hits),
+                        "expected_rate": cumulants(parts)[0] / len(own)}
             at = dict(zip((*kept, "marker_id"), (*index, marker), strict=True))
             assert_agrees(answer, at, expected)
             here = answer.isel(at)
@@ -177,69 +152,61 @@ def test_the_difference_of_two_rates_is_the_published_one(table, low, high):
     assert round(answer["detection_difference_high"].item(), 4) == high
 
 
-def pairs_of(first, second, per, bins=None):
-    """Return {kept indices: pairs of poses of the same scene}."""
-    ones, others = (poses(side, "estimate", per, bins) for side in (first, second))
-    groups = {}
-    for index, chosen in ones.items():
-        at = {pose["at"]: pose for pose in others[index]}
-        groups[index] = [(pose, at[pose["at"]]) for pose in chosen]
-    return groups
+def tally(compared, mask, names):
+    """Return how many pairs both, the first, the second and neither are of a mask."""
+    one, two = map(mask, compared)
+    return dict(zip(names, (int(each.sum()) for each in (
+        one & two, one & ~two, ~one & two, ~one & ~two)), strict=True))
 
 
-def expected_seen(pairs):
+def expected_seen(first, second):
     """Of the estimates' poses: a detection counts with each of its estimators."""
-    compared = [pair for pair in pairs if all(map(looked_for, pair))]
-    tally = dict.fromkeys(itertools.product((True, False), repeat=2), 0)
-    for pair in compared:
-        tally[tuple(map(is_detected, pair))] += 1
-    both, first = tally[True, True], tally[True, False]
-    second, neither = tally[False, True], tally[False, False]
-    out = {"compared": len(compared), "both_detected": both, "only_first_detected": first,
-           "only_second_detected": second, "neither_detected": neither}
+    both_looked = looked_for(first) & looked_for(second)
+    compared = [each.where(both_looked) for each in (first, second)]
+    out = {"compared": len(compared[0])} | tally(compared, is_detected, (
+        "both_detected", "only_first_detected", "only_second_detected", "neither_detected"))
     unknown = named("detection_difference", [math.nan] * 3) | {"detection_p_value": math.nan}
-    if not compared:
+    if not len(compared[0]):
         return out | unknown
-    difference, low, high = newcombe(both, first, second, neither)
-    if freedom_in([pose for pose, _ in compared]) == 0:
+    _, *counts = out.values()
+    difference, low, high = newcombe(*counts)
+    if freedom_in(compared[0]) == 0:
         return out | unknown | {"detection_difference": difference}
-    odd = first + second
+    _, one, two, _ = counts
     return out | named("detection_difference", (difference, low, high)) | {
-        "detection_p_value": stats.binomtest(first, odd).pvalue if odd else 1.0}
+        "detection_p_value": stats.binomtest(one, one + two).pvalue if one + two else 1.0}
 
 
-def expected_solved(pairs):
-    compared = [pair for pair in pairs if all(map(looked_for, pair))]
-    run = [pose for pose, other in pairs if is_run(pose) and is_run(other)]
-    tally = dict.fromkeys(itertools.product((True, False), repeat=2), 0)
-    for pair in compared:
-        tally[tuple(map(is_solved, pair))] += 1
-    out = {"both_solved": tally[True, True], "only_first_solved": tally[True, False],
-           "only_second_solved": tally[False, True], "neither_solved": tally[False, False]}
-    solved = [pair for pair in compared if all(map(is_solved, pair))]
-    flips = [tuple(pose["flipped"] == Flipped.flipped for pose in pair) for pair in solved]
-    out |= {"only_first_flipped": flips.count((True, False)),
-            "only_second_flipped": flips.count((False, True))}
+def expected_solved(first, second):
+    both_looked = looked_for(first) & looked_for(second)
+    compared = [each.where(both_looked) for each in (first, second)]
+    run = first.where(is_run(first) & is_run(second))
+    out = tally(compared, is_solved, (
+        "both_solved", "only_first_solved", "only_second_solved", "neither_solved"))
+    both = is_solved(compared[0]) & is_solved(compared[1])
+    solved = [each.where(both) for each in compared]
+    flips = [each["flipped"] == Flipped.flipped for each in solved]
+    out |= {"only_first_flipped": int((flips[0] & ~flips[1]).sum()),
+            "only_second_flipped": int((flips[1] & ~flips[0]).sum())}
     for name, (unit, error) in QUANTITIES.items():
-        sizes = [(pose, length(error(pose)), length(error(other))) for pose, other in solved]
-        differences = [(pose, second - first) for pose, first, second in sizes]
-        out |= named(f"{name}_difference_{unit}", student(*mean_of(differences, run)))
-        out |= named(f"{name}_rmse_ratio", ratio_of(sizes, run))
+        one, two = (lengths_of(error(each)) for each in solved)
+        out |= named(f"{name}_difference_{unit}", student(*mean_of(solved[0], two - one, run)))
+        out |= named(f"{name}_rmse_ratio", ratio_of(solved[0], one, two, run))
         if name == "rotation":
-            unflipped = [size for size, flip in zip(sizes, flips, strict=True) if not any(flip)]
-            out |= named(f"{name}_rmse_unflipped_ratio", ratio_of(unflipped, run))
+            right = ~flips[0] & ~flips[1]
+            out |= named(f"{name}_rmse_unflipped_ratio", ratio_of(
+                solved[0].where(right), one[right], two[right], run))
     return out
 
 
-def ratio_of(sizes, run):
+def ratio_of(used, first, second, run):
     """Return the ratio of two RMS and its interval: of the logarithm, by the delta method."""
-    if not sizes:
+    if not len(used):
         return math.nan, math.nan, math.nan
-    squares = [math.fsum(pair[k] ** 2 for pair in sizes) / len(sizes) for k in (1, 2)]
+    squares = [(sizes**2).mean() for sizes in (first, second)]
     ratio = math.sqrt(squares[1] / squares[0])
-    relative = [(pose, second**2 / squares[1] - first**2 / squares[0])
-                for pose, first, second in sizes]
-    _, deviation, freedom = mean_of(relative, run)
+    relative = second**2 / squares[1] - first**2 / squares[0]
+    _, deviation, freedom = mean_of(used, relative, run)
     half = deviation / 2 * students(freedom)
     return ratio, ratio * math.exp(-half), ratio * math.exp(half)
 
@@ -264,9 +231,10 @@ def test_comparisons_are_those_of_plain_loops(results, name, per, bins):
     answer = compare(first, second, per, bins=bins).compute()
     names = (*per, *bins)
     assert tuple(answer["compared"].dims) == names
-    for index, pairs in pairs_of(first, second, per, bins).items():
+    ones, others = (poses(side, "estimate", per, bins) for side in (first, second))
+    for index, one in ones.items():
         assert_agrees(answer, dict(zip(names, index, strict=True)),
-                      expected_seen(pairs) | expected_solved(pairs))
+                      expected_seen(one, others[index]) | expected_solved(one, others[index]))
 
 
 @pytest.mark.parametrize("analysis", [

@@ -1,6 +1,6 @@
-"""The analysis functions against plain loops over every pose of small datasets.
+"""The analysis functions against plain NumPy on all poses of small datasets.
 
-The loops follow the definitions of the functions' descriptions, and SciPy's distributions. Of
+The references follow the definitions of the functions' descriptions, and SciPy's distributions. Of
 `sweep.analysis` they use the intervals of a proportion, which have tests of their own.
 """
 
@@ -25,7 +25,7 @@ from support.small_datasets import (
     is_run,
     is_solved,
     is_unflipped,
-    length,
+    lengths_of,
     looked_for,
     mean_of,
     mean_vector,
@@ -42,23 +42,22 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 
-def bias(vectors, run):
+def bias(used, vectors, run):
     """Return the length of the mean vector, or the signed mean of what has one component."""
-    if not vectors:
+    if not len(used):
         return math.nan, math.nan, math.nan
     centre = mean_vector(vectors)
     if len(centre) == 1:
-        return student(*mean_of([(pose, vector[0]) for pose, vector in vectors], run))
-    direction = centre / length(centre)
-    along = [(pose, vector @ direction) for pose, vector in vectors]
-    mean, error, freedom = mean_of(along, run)
+        return student(*mean_of(used, vectors[:, 0], run))
+    length = np.linalg.norm(centre)
+    mean, error, freedom = mean_of(used, vectors @ (centre / length), run)
     if math.isnan(error):
-        return length(centre), math.nan, math.nan
+        return length, math.nan, math.nan
     _, _, high = student(mean, error, freedom)
     if freedom <= 2:
-        return length(centre), 0.0, high
+        return length, 0.0, high
     scheffe = math.sqrt(3 * freedom / (freedom - 2) * special.fdtri(3, freedom - 2, 0.95))
-    return length(centre), max(0.0, mean - scheffe * error), high
+    return length, max(0.0, mean - scheffe * error), high
 
 
 @functools.cache
@@ -85,16 +84,16 @@ def order_statistics(values, of, share):
 # The functions.
 
 def expected_detection(found):
-    aimed = [pose for pose in found if looked_for(pose)]
-    hits = sum(map(is_detected, aimed))
+    aimed = found.where(looked_for(found))
+    hits = int(is_detected(aimed).sum())
     return {"looked_for": len(aimed), "detected": hits, "draws": draws_in(aimed),
             **rate("detection_rate", aimed, hits),
             **rate("detection_rate", aimed, hits, "jeffreys")}
 
 
 def expected_flips(found):
-    solved = [pose for pose in found if is_solved(pose)]
-    hits = sum(pose["flipped"] == Flipped.flipped for pose in solved)
+    solved = found.where(is_solved(found))
+    hits = int((solved["flipped"] == Flipped.flipped).sum())
     return {"solved": len(solved), "flipped": hits, "draws": draws_in(solved),
             **rate("flip_rate", solved, hits), **rate("flip_rate", solved, hits, "jeffreys")}
 
@@ -105,18 +104,14 @@ OUTCOMES = (*OF_LOOKED_FOR, "not_visible", "not_modelled", "not_in_photograph", 
             "not_run", "not_needed")
 
 
-def outcome(pose):
-    if is_detected(pose):
-        return EstimateStatus(pose["estimate"]).name
-    return DetectionStatus(pose["detection"]).name
-
-
 def expected_composition(found):
     """Return {"count solved": ..., "share solved": ..., ...}."""
-    aimed = [pose for pose in found if looked_for(pose)]
-    out = {}
+    aimed, out = found.where(looked_for(found)), {}
+    outcome = [EstimateStatus(estimate).name if detection == DetectionStatus.detected else
+               DetectionStatus(detection).name for detection, estimate in zip(
+                   found["detection"].tolist(), found["estimate"].tolist(), strict=True)]
     for name in OUTCOMES:
-        count = sum(outcome(pose) == name for pose in found)
+        count = outcome.count(name)
         values = dict.fromkeys(("share", "share_low", "share_high"), math.nan)
         if name in OF_LOOKED_FOR:
             values = rate("share", aimed, count)
@@ -133,41 +128,42 @@ def by_outcome(answer):
 
 
 def expected_errors(found):
-    aimed = [pose for pose in found if looked_for(pose)]
-    run = [pose for pose in found if is_run(pose)]
-    solved = [pose for pose in aimed if is_solved(pose)]
+    aimed, run = found.where(looked_for(found)), found.where(is_run(found))
+    solved = aimed.where(is_solved(aimed))
+    unflipped, flips = (solved.where(is_unflipped(solved) == right) for right in (True, False))
     out = {"looked_for": len(aimed), "solved": len(solved),
            **rate("solved_rate", aimed, len(solved))}
     for name, (unit, error) in QUANTITIES.items():
-        vectors = [(pose, error(pose)) for pose in solved]
-        unflipped = [(pose, vector) for pose, vector in vectors if is_unflipped(pose)]
-        out |= named(f"{name}_bias_{unit}", bias(unflipped, run))
-        out |= named(f"{name}_sd_{unit}", spread(unflipped, run))
-        rmse = root_mean_square(vectors, run)
+        right = unflipped, error(unflipped), run
+        out |= named(f"{name}_bias_{unit}", bias(*right))
+        out |= named(f"{name}_sd_{unit}", spread(*right))
+        out |= named(f"{name}_rmse_unflipped_{unit}", root_mean_square(*right))
+        rmse = root_mean_square(solved, error(solved), run)
         if name == "rotation":
-            flips = [(pose, vector) for pose, vector in vectors if not is_unflipped(pose)]
-            rmse = rmse[0], *ends_with_flips(rmse[0], unflipped, flips, run)
+            parts = [root_mean_square(*right), root_mean_square(flips, error(flips), run)]
+            rmse = rmse[0], *ends_with_flips(rmse[0], solved, len(flips), parts)
         out |= named(f"{name}_rmse_{unit}", rmse)
-        out |= named(f"{name}_rmse_unflipped_{unit}", root_mean_square(unflipped, run))
-        sizes = [length(error(pose)) if is_solved(pose) else math.inf for pose in aimed]
+        sizes = np.where(is_solved(aimed), lengths_of(error(aimed)), math.inf).tolist()
         for label, share in SHARES.items():
             interval = order_statistics(sizes, aimed, share)
             out |= named(f"{name}_{label}_{unit}", interval)
             given = 2 if freedom_in(aimed) == 0 else 3 if any(map(math.isnan, interval)) else 1
-            out[f"{label}_interval"] = given if aimed else 0
+            out[f"{label}_interval"] = given if len(aimed) else 0
     return out
 
 
-def ends_with_flips(value, unflipped, flips, run, bound=180.0):
-    """Return the least and the largest RMS over the ends of the share of flips and of both RMS."""
-    solved = [pose for pose, _ in (*unflipped, *flips)]
+def ends_with_flips(value, solved, flips, parts, bound=180.0):
+    """Return the least and the largest RMS over the ends of the share of flips and of both RMS.
+
+    ``parts`` are the RMS with their ends of the right poses and of the flips.
+    """
     if freedom_in(solved) == 0:
         return math.nan, math.nan
     n, draws = len(solved), draws_in(solved)
-    few, many = len(flips) * draws // n, -(-len(flips) * draws // n)
+    few, many = flips * draws // n, -(-flips * draws // n)
     shares = [0.0 if few == 0 else stats.beta.ppf(0.025, few, draws - few + 1),
               1.0 if many == draws else stats.beta.ppf(0.975, many + 1, draws - many)]
-    (_, *u), (_, *v) = (root_mean_square(part, run) for part in (unflipped, flips))
+    (_, *u), (_, *v) = parts
     lows = [next((low for low in (own, other) if not math.isnan(low)), 0.0)
             for own, other in ((u[0], v[0]), (v[0], u[0]))]
     highs = [bound if math.isnan(high) else min(high, bound) for high in (u[1], v[1])]

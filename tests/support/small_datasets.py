@@ -1,8 +1,7 @@
-"""Small datasets of poses and the analysis of them by plain loops and SciPy's distributions."""
+"""Small datasets of poses and their analysis by plain NumPy and SciPy's distributions."""
 
 import itertools
 import math
-from collections import Counter
 
 import numpy as np
 import xarray as xr
@@ -162,107 +161,113 @@ def mixed(sizes, seed=1, **options):
     return with_every_flag(rng, perfect(rng, sizes), **options)
 
 
-def poses(results, of, per=(), bins=None):
-    """Return {kept indices: poses} by plain loops; a pose is its values, cell, draw and setting.
+class Poses:
+    """N poses: the values (N, ...) of variables by name, numbers (N,) of their cells and draws."""
 
-    ``of`` is the variable that says which dimensions a pose has.
-    """
+    def __init__(self, values, cell, unit):
+        self.values, self.cell, self.unit = values, cell, unit
+
+    def __getitem__(self, name):
+        return self.values[name]
+
+    def __len__(self):
+        return len(self.cell)
+
+    def where(self, mask):
+        """Return the poses of a mask (N,)."""
+        return Poses({name: array[mask] for name, array in self.values.items()},
+                     self.cell[mask], self.unit[mask])
+
+
+def poses(results, of, per=(), bins=None):
+    """Return {kept indices: poses}; ``of`` is the variable that says which dimensions one has."""
     bins = bins or {}
     axes = [name for name in results[of].dims if name not in INNER]
     axes += [name for name in per if name not in axes]
-    arrays = {name: ([dim for dim in array.dims if dim not in INNER],
-                     array.transpose(..., *(d for d in array.dims if d in INNER)).values)
-              for name, array in results.variables.items()
-              if set(array.dims) <= {*axes, *INNER} and name not in INNER}
-    kept = [range(results.sizes[name]) for name in per]
-    kept += [range(len(edges) - 1) for edges in bins.values()]
-    groups = {index: [] for index in itertools.product(*kept)}
-    for index in itertools.product(*(range(results.sizes[name]) for name in axes)):
-        at = dict(zip(axes, index, strict=True))
-        pose = {name: values[tuple(at[dim] for dim in dims)]
-                for name, (dims, values) in arrays.items()}
-        here = [at[name] for name in per]
-        for name, edges in bins.items():
-            here += [k for k in range(len(edges) - 1) if edges[k] <= pose[name] < edges[k + 1]]
-        if len(here) < len(per) + len(bins):
-            continue  # outside of the bins
-        pooled = [name for name in axes if name not in per]
-        pose["at"] = index
-        pose["cell"] = tuple(at[name] for name in pooled if name in GEOMETRY)
-        pose["draw"] = at["trial"] if "trial" in pooled else 0
-        groups[tuple(here)].append(pose)
-    return groups
+    shape = [results.sizes[name] for name in axes]
+    values = {}
+    for name, variable in results.variables.items():
+        if set(variable.dims) <= {*axes, *INNER} and name not in INNER:
+            sizes = dict(zip(axes, shape, strict=True)) | variable.sizes
+            wide = variable.set_dims(sizes).transpose(*axes, ...)
+            values[name] = wide.values.reshape(-1, *wide.shape[len(axes):])
+    at = dict(zip(axes, np.indices(shape).reshape(len(axes), -1), strict=True))
+    cell, draw = np.zeros((2, math.prod(shape)), dtype=int)
+    for name in axes:
+        if name in GEOMETRY and name not in per:
+            cell = cell * results.sizes[name] + at[name]
+    if "trial" in axes and "trial" not in per:
+        draw = at["trial"]
+    whole = Poses(values, cell, cell * 1000 + draw)
+    places = [at[name] for name in per]
+    places += [np.digitize(values[name], edges) - 1 for name, edges in bins.items()]
+    counts = [results.sizes[name] for name in per] + [len(edges) - 1 for edges in bins.values()]
+    return {
+        index: whole.where(np.logical_and.reduce([np.ones(len(whole), bool), *(
+            place == k for place, k in zip(places, index, strict=True))]))
+        for index in itertools.product(*map(range, counts))}
 
 
-def looked_for(pose):
-    return pose["detection"] not in {
+def looked_for(some):
+    return ~np.isin(some["detection"], [
         DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
         DetectionStatus.not_needed, DetectionStatus.not_in_photograph,
-        DetectionStatus.not_on_board,
-    }
+        DetectionStatus.not_on_board])
 
 
-def is_run(pose):
-    return pose["detection"] not in {DetectionStatus.not_run, DetectionStatus.not_needed}
+def is_run(some):
+    return ~np.isin(some["detection"], [DetectionStatus.not_run, DetectionStatus.not_needed])
 
 
-def is_detected(pose):
-    return pose["detection"] == DetectionStatus.detected
+def is_detected(some):
+    return some["detection"] == DetectionStatus.detected
 
 
-def is_solved(pose):
-    return pose["estimate"] == EstimateStatus.solved
+def is_solved(some):
+    return some["estimate"] == EstimateStatus.solved
 
 
-def is_unflipped(pose):
-    return is_solved(pose) and pose["flipped"] == Flipped.not_flipped
+def is_unflipped(some):
+    return is_solved(some) & (some["flipped"] == Flipped.not_flipped)
 
 
-def degrees(pose):
-    return np.degrees(pose["rotation_error_rad"].astype(np.float64))
+def degrees(some):
+    return np.degrees(some["rotation_error_rad"].astype(np.float64))
 
 
-def percent(pose):
-    return np.array([100.0 * float(pose["translation_error_m"][2])
-                     / float(pose["true_tvec_m"][2])])
+def percent(some):
+    errors = some["translation_error_m"][:, 2].astype(np.float64)
+    return (100.0 * errors / some["true_tvec_m"][:, 2])[:, None]
 
 
-def metres(pose):
-    return pose["translation_error_m"].astype(np.float64)
+def metres(some):
+    return some["translation_error_m"].astype(np.float64)
 
 
 QUANTITIES = {"rotation": ("deg", degrees), "range": ("percent", percent),
               "position": ("m", metres)}
-"""Quantity -> unit, and the error as a vector."""
+"""Quantity -> unit, and the errors (N, ...) of poses."""
 SHARES = {"median": 50, "p95": 95, "p99": 99}
 
 
-def length(vector):
-    return math.hypot(*np.asarray(vector).tolist())
+def lengths_of(vectors):
+    return np.linalg.norm(vectors, axis=1)
 
 
-def draws_by_cell(found):
-    """Return {cell: draws} of a list of poses."""
-    cells = {}
-    for pose in found:
-        cells.setdefault(pose["cell"], set()).add(pose["draw"])
-    return cells
-
-
-def draws_in(found):
+def draws_in(some):
     """Return what poses are worth in draws, Kish's effective number; their number if m is equal."""
-    sizes = Counter((pose["cell"], pose["draw"]) for pose in found).values()
-    return sum(sizes) ** 2 // max(1, sum(size**2 for size in sizes))
+    sizes = np.unique(some.unit, return_counts=True)[1]
+    return int(sizes.sum() ** 2 // max(1, (sizes**2).sum()))
 
 
-def freedom_in(found):
+def freedom_in(some):
     """Return the number of draws beyond the first of each cell; 0: nothing was drawn."""
-    return sum(len(draws) - 1 for draws in draws_by_cell(found).values())
+    return len(np.unique(some.unit)) - len(np.unique(some.cell))
 
 
 def rate(name, of, hits, method="wilson"):
     """Return a rate and its interval, the successes scaled outwards to draws."""
-    n, draws = len(of), draws_in(of)
+    n, draws, hits = len(of), draws_in(of), int(hits)
     out = {name: hits / n if n else math.nan}
     stem = name if method == "wilson" else f"{name}_{method}"
     if freedom_in(of) == 0:
@@ -272,24 +277,22 @@ def rate(name, of, hits, method="wilson"):
                   f"{stem}_high": ends(math.ceil(hits * draws / n), draws)[1]}
 
 
-def mean_of(pairs, run):
-    """Return mean, standard error and degrees of freedom; ``pairs`` of a used pose and its value.
+def mean_of(used, values, run):
+    """Return mean, standard error and degrees of freedom of the values (N,) of used poses.
 
     ``run`` are the poses whose draws make the sample: Cochran 1977, sections 6.11 and 5A.14.
     """
-    if not pairs:
+    n = len(used)
+    if n == 0:
         return math.nan, math.nan, math.nan
-    n = len(pairs)
-    mean = math.fsum(value for _, value in pairs) / n
-    most = freedom_in([pose for pose, _ in pairs])
+    mean = math.fsum(values) / n
+    most = freedom_in(used)
     if most == 0:
         return mean, math.nan, math.nan
-    sums = {(cell, draw): 0.0 for cell, draws in draws_by_cell(run).items() for draw in draws}
-    for pose, value in pairs:
-        sums[pose["cell"], pose["draw"]] += value - mean
+    sums = np.bincount(used.unit, values - mean, minlength=run.unit.max() + 1)
     terms, m2, freedom, alone = [], 0.0, 0, 0
-    for cell, draws in draws_by_cell(run).items():
-        of_cell = np.array([sums[cell, draw] for draw in draws])
+    for cell in np.unique(run.cell):
+        of_cell = sums[np.unique(run.unit[run.cell == cell])]
         if len(of_cell) == 1:
             alone += 1
             continue
@@ -320,37 +323,33 @@ def exponential(mean, error, freedom):
     return mean, mean / factor, mean * factor
 
 
-def root_mean_square(vectors, run):
-    """Return the RMS of ``[(pose, vector)]``.
+def root_mean_square(used, vectors, run):
+    """Return the RMS of the vectors (N, ...) of used poses.
 
     The share of draws that none showed is below 1 - 0.025^(1/n); they are as the largest that was
     seen.
     """
-    pairs = [(pose, length(vector) ** 2) for pose, vector in vectors]
-    mean, low, high = exponential(*mean_of(pairs, run))
+    squares = lengths_of(vectors) ** 2
+    mean, low, high = exponential(*mean_of(used, squares, run))
     if not math.isnan(high):
-        of_draw = {}
-        for pose, value in pairs:
-            of_draw.setdefault((pose["cell"], pose["draw"]), []).append(value)
-        largest = max(map(np.mean, of_draw.values()))
-        unseen = 1 - 0.025 ** (1 / (freedom_in([pose for pose, _ in pairs]) + 1))
+        of_draw = np.bincount(used.unit, squares)[np.unique(used.unit)]
+        largest = (of_draw / np.unique(used.unit, return_counts=True)[1]).max()
+        unseen = 1 - 0.025 ** (1 / (freedom_in(used) + 1))
         high = max(high, (1 - unseen) * high + unseen * largest)
     return math.sqrt(mean), math.sqrt(low), math.sqrt(high)
 
 
 def mean_vector(vectors):
-    return np.array([math.fsum(part) / len(vectors)
-                     for part in zip(*(v.tolist() for _, v in vectors), strict=True)])
+    return np.array([math.fsum(part) / len(vectors) for part in vectors.T])
 
 
-def spread(vectors, run):
+def spread(used, vectors, run):
     """Return the standard deviation about the mean vector, with n - 1."""
-    if len(vectors) < 2:
+    if len(used) < 2:
         return math.nan, math.nan, math.nan
-    centre = mean_vector(vectors)
-    factor = math.sqrt(len(vectors) / (len(vectors) - 1))
-    around = [(pose, vector - centre) for pose, vector in vectors]
-    return tuple(factor * end for end in root_mean_square(around, run))
+    factor = math.sqrt(len(used) / (len(used) - 1))
+    around = vectors - mean_vector(vectors)
+    return tuple(factor * end for end in root_mean_square(used, around, run))
 
 
 def named(name, interval):

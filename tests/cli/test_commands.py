@@ -19,6 +19,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from support.reports import command
 from sweep import cli, installation
 from sweep.cli.command import SESSION, print_error
 from sweep.cli.parser import COMMANDS, build_parser
@@ -36,15 +37,6 @@ def python(code):
         [sys.executable, "-c", code], cwd=TOP, capture_output=True, text=True, check=False)
 
 
-def told(capsys, *arguments):
-    """Run a command in this process; return its exit status, output and error output."""
-    try:
-        code = cli.main(list(arguments))
-    except SystemExit as stopped:
-        code = stopped.code
-    return code, *capsys.readouterr()
-
-
 # Ctrl-C.
 
 @pytest.mark.parametrize(("flags", "begun", "line"), [
@@ -52,7 +44,7 @@ def told(capsys, *arguments):
     (["--overwrite"], False, "stopped before anything was computed"),
     (["--overwrite"], True, "stopped; the same command without --overwrite continues"),
 ])
-def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monkeypatch, capsys):
+def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monkeypatch):
     def execute(*_, progress, **__):
         if begun:
             progress(Progress(0, 1, 0))
@@ -61,7 +53,7 @@ def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monke
     monkeypatch.setattr("sweep.execution.runner.execute", execute)
     pipeline = tmp_path / "one.toml"
     pipeline.write_text("pose = { side_px = 40 }\n")
-    code, out, err = told(capsys, "run", str(pipeline), *flags)
+    code, out, err = command("run", str(pipeline), *flags)
     assert (code, out) == (130, "")
     assert err.splitlines()[-1] == line
 
@@ -69,23 +61,21 @@ def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monke
 # Help and version.
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_each_help_has_two_examples_that_are_commands_and_a_text_for_each_argument(
-    command, capsys
-):
-    code, out, _ = told(capsys, command.name, "--help")
+@pytest.mark.parametrize("named", COMMANDS, ids=lambda named: named.name)
+def test_each_help_has_two_examples_that_are_commands_and_a_text_for_each_argument(named):
+    code, out, _ = command(named.name, "--help")
     assert code == 0
     examples = out.split("examples:\n")[1]
-    assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [*command.examples]
-    assert len(command.examples) == 2
-    assert out.endswith(f"\nguide: {command.guide}\n")
-    for example in command.examples:
+    assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [*named.examples]
+    assert len(named.examples) == 2
+    assert out.endswith(f"\nguide: {named.guide}\n")
+    for example in named.examples:
         _, *arguments = shlex.split(example)
-        assert build_parser()[0].parse_args(arguments).command is command
+        assert build_parser()[0].parse_args(arguments).command is named
         assert all((TOP / value).is_file() for value in arguments
                    if value.startswith("pipelines/"))
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
+    named.add_arguments(parser)
     assert all(action.help for action in parser._actions)
 
 
@@ -149,53 +139,39 @@ def installed(monkeypatch, commands=(), **versions):
     monkeypatch.setattr(installation, "distribution", distribution)
 
 
-def refused(capsys):
-    code, out, err = told(capsys, "status", "none.zarr")
-    assert (code, out) == (2, "")
-    assert len(err.splitlines()) == 1
-    return err
-
-
 @pytest.mark.parametrize("distributions", [
     {"opencv_contrib_python_headless": "5.0.0", "opencv_python_headless": "4.11.0"},
     {},
 ])
-def test_another_distribution_of_opencv_is_warned_of_once(distributions, capsys, monkeypatch):
+def test_another_distribution_of_opencv_is_warned_of_once(distributions, monkeypatch):
     installed(monkeypatch, **distributions)
     installation._warn_of_other_opencv.cache_clear()
-    _, _, err = told(capsys, "status", "none.zarr")
-    warning, _ = err.splitlines()
+    warning, _ = command("status", "none.zarr")[2].splitlines()
     assert warning.startswith("warning: ")
     assert f"OpenCV {cv2.__version__} is loaded" in warning
     for name, version in distributions.items():
         assert name.replace("_", "-") in warning
         assert version in warning
-    assert "warning" not in refused(capsys)
+    assert "warning" not in command("status", "none.zarr")[2]
 
 
-@pytest.mark.parametrize(("loaded", "named"), [
-    (None, "OpenCV cannot be imported: "),
-    (SimpleNamespace(__version__="4.6.0", aruco=SimpleNamespace()),
-     "OpenCV 4.6.0 is loaded, which has no cv2.aruco.ArucoDetector"),
-])
-def test_an_opencv_without_aruco_is_refused_in_one_line(loaded, named, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", loaded)
-    line = refused(capsys)
-    assert line.startswith(named) or named in line
-    assert "`pip install --force-reinstall opencv-contrib-python-headless`" in line
-
-
-def test_the_other_project_s_package_is_refused_and_an_older_one_of_ours_is_not(
-    capsys, monkeypatch
+@pytest.mark.parametrize(("loaded", "version", "words"), [
+    (None, "", ["OpenCV cannot be imported: ",
+                "`pip install --force-reinstall opencv-contrib-python-headless`"]),
+    (SimpleNamespace(__version__="4.6.0", aruco=SimpleNamespace()), "",
+     ["OpenCV 4.6.0 is loaded, which has no cv2.aruco.ArucoDetector"]),
+    (cv2, "0.1.0", ["another project's package `sweep` (0.1.0) is installed",
+                    "`pip uninstall sweep`, then `pip install --force-reinstall fiducial-sweep`"]),
+], ids=["no OpenCV", "old OpenCV", "other project"])
+def test_an_installation_that_cannot_work_is_refused_in_one_line(
+    loaded, version, words, monkeypatch
 ):
-    installed(monkeypatch, ["sweep.main:run"], sweep="0.1.0")
-    assert refused(capsys) == (
-        "another project's package `sweep` (0.1.0) is installed, and its files overwrite those of "
-        "fiducial-sweep: `pip uninstall sweep`, then "
-        "`pip install --force-reinstall fiducial-sweep`\n"
-    )
-    installed(monkeypatch, ["sweep.cli:main"], sweep="0.5.0")
-    assert "another project" not in refused(capsys)
+    monkeypatch.setitem(sys.modules, "cv2", loaded)
+    if version:
+        installed(monkeypatch, ["sweep.main:run"], sweep=version)
+    code, out, err = command("status", "none.zarr")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert all(each in err for each in words)
 
 
 @pytest.mark.system

@@ -9,15 +9,10 @@ from matplotlib.figure import Figure
 import sweep
 from support.board_photographs import POSES, write_set
 from support.photograph_results import results_of, twins
-from sweep import cli
+from support.reports import command
 from sweep.analysis import simulation_gap
 from sweep.report.comparison_tables import gap_figures, gap_lines, gap_table
 from sweep.report.figure import panels_file
-
-
-def told(capsys, *arguments):
-    code = cli.main(list(map(str, arguments)))
-    return code, *capsys.readouterr()
 
 
 def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
@@ -69,8 +64,8 @@ def stores(tmp_path_factory):
     return folder
 
 
-def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
-    code, out, err = told(capsys, "compare", stores / "a.zarr", stores / "b.zarr", "--json")
+def test_two_stores_of_a_pipeline_are_compared(stores):
+    code, out, err = command("compare", stores / "a.zarr", stores / "b.zarr", "--json")
     assert (code, err) == (0, "")
     said = json.loads(out)
     assert said["fingerprint"] == []
@@ -79,7 +74,7 @@ def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
     (one,) = said["corners"]
     assert one["compared"] == 8
     assert one["worst, px"]["value"] is None
-    code, out, _ = told(capsys, "compare", stores / "a.zarr", stores / "b.zarr")
+    code, out, _ = command("compare", stores / "a.zarr", stores / "b.zarr")
     assert code == 0
     assert "next: sweep report" in out
 
@@ -90,29 +85,29 @@ def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
     ("s.toml", ["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
     ("s.toml", ["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
 ])
-def test_what_is_no_pair_is_refused_in_one_line(other, flags, named, stores, capsys):
-    code, out, err = told(capsys, "compare", stores / "a.zarr", stores / other, *flags)
+def test_what_is_no_pair_is_refused_in_one_line(other, flags, named, stores):
+    code, out, err = command("compare", stores / "a.zarr", stores / other, *flags)
     assert (code, out) == (2, "")
     assert named in err
     assert err.count("\n") == 1
 
 
-def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys):
+def test_photographs_are_simulated_and_compared_in_one_command(tmp_path):
     shots = write_set(tmp_path, POSES)
     given = ["--camera", tmp_path / "camera.json", "--board", tmp_path / "board.toml"]
     scene = tmp_path / "same.toml"
     scene.write_text("[scene]\nblack = 35\nwhite = 210\nblur_px = 0.6\nnoise_grey = 2\n")
-    code, *_ = told(
-        capsys, "photos", shots, *given, "--store", tmp_path / "shots.zarr",
+    code, *_ = command(
+        "photos", shots, *given, "--store", tmp_path / "shots.zarr",
         "--set", 'cornerRefinementMethod=["none", "subpix"]',
     )
     assert code == 0
-    code, out, _ = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+    code, out, _ = command("compare", tmp_path / "shots.zarr", scene)
     assert code == 0
     assert "5 photographs and their twins" in out
     assert (tmp_path / "shots-same.zarr").is_dir()
-    code, out, _ = told(
-        capsys, "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
+    code, out, _ = command(
+        "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
     (median,) = (each for each in json.loads(out)["rows"]
                  if each["statistic"].startswith("rotation error, median")
                  and each["cornerRefinementMethod"] == "subpix")
@@ -121,8 +116,8 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys)
     simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
     assert simulated.sizes["trial"] == len(POSES)
     scene.write_text("[scene]\nblur_px = 3\n")
-    code, _, err = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+    code, _, err = command("compare", tmp_path / "shots.zarr", scene)
     assert code == 2
     assert "holds another experiment" in err
-    assert "expected a store of photographs" in told(
-        capsys, "compare", tmp_path / "shots-same.zarr", scene)[2]
+    assert "expected a store of photographs" in command(
+        "compare", tmp_path / "shots-same.zarr", scene)[2]

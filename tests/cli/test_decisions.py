@@ -1,12 +1,13 @@
 """`sweep require` and `sweep size`: lines and exit statuses; bounds that no pose has."""
 
+import functools
 import json
 
 import pytest
 
+from support.reports import command
 from support.stores import by_hand
-from sweep import Pipeline, cli
-from sweep.cli import main
+from sweep import Pipeline
 from sweep.evaluation.block import bound_notes
 from sweep.execution.status import close
 from sweep.report.report_data import read_report_data
@@ -42,14 +43,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def require(folder, monkeypatch, capsys):
+def require(folder, monkeypatch):
     monkeypatch.chdir(folder)
-
-    def run(*arguments):
-        code = cli.main(["require", *arguments])
-        return code, *capsys.readouterr()
-
-    return run
+    return functools.partial(command, "require")
 
 
 def test_what_the_pipeline_requires_is_decided(require):
@@ -137,12 +133,6 @@ max_trials = {trials}
 """
 
 
-def size(arguments, capsys):
-    status = main(["size", *map(str, arguments)])
-    printed = capsys.readouterr()
-    return status, printed.out, printed.err
-
-
 def written(tmp_path, choose='smallest = "side_px"', more="", trials=100):
     path = tmp_path / "marker.toml"
     path.write_text(FILE.format(choose=choose, more=more, trials=trials))
@@ -150,29 +140,29 @@ def written(tmp_path, choose='smallest = "side_px"', more="", trials=100):
 
 
 def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(
-    tmp_path, monkeypatch, capsys
+    tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     written(tmp_path)
-    status, out, _ = size(["marker.toml", "--seconds", "0.2", "--json"], capsys)
+    status, out, _ = command("size", "marker.toml", "--seconds", "0.2", "--json")
     answer = json.loads(out)
     assert (status, answer["decision"], answer["answer"]["side_px"]) == (0, "met", 30.0)
     assert answer["alternatives"][0]["next"] == 4.0
     assert answer["alternatives"][0]["next_cause"]["value"] == 0.0
     assert answer["poses"] <= answer["grid_poses"] <= 600
-    status, out, _ = size(["runs/marker.zarr", "--seconds", "0.2", "--markdown"], capsys)
+    status, out, _ = command("size", "runs/marker.zarr", "--seconds", "0.2", "--markdown")
     assert status == 0
     assert out.startswith("side\\_px=30, solver=")
     assert "| solver | side\\_px | next | ms a frame | why not better |" in out
-    status, out, _ = size(["marker.toml", "--seconds", "0.2"], capsys)
+    status, out, _ = command("size", "marker.toml", "--seconds", "0.2")
     assert "detection_rate >= 0.5 is not met: 0 (" in out
     assert out.splitlines()[-1].startswith("next: sweep report runs/marker.zarr")
 
 
-def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
+def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, more=', "rotation_p95_deg <= 1e-6"')
-    status, out, _ = size([path, "--seconds", "0.2"], capsys)
+    status, out, _ = command("size", path, "--seconds", "0.2")
     assert status == 1
     assert "nearest is side_px=60" in out
     assert "rotation_p95_deg <= 1e-06 is not met" in out
@@ -185,30 +175,30 @@ def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
     ("", "", "expected one of along, smallest"),
 ])
 def test_what_cannot_be_searched_is_a_line_before_anything_runs(
-    choose, more, line, tmp_path, monkeypatch, capsys
+    choose, more, line, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    status, _, err = size([written(tmp_path, choose, more)], capsys)
+    status, _, err = command("size", written(tmp_path, choose, more))
     assert status == 2
     assert line in err
     assert "Traceback" not in err
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(("command", "line"), [
+@pytest.mark.parametrize(("words", "line"), [
     ("size plain.toml", 'expected what is chosen: [search] smallest = "size_m", max_trials = 5000'),
     ("size missing.toml", "missing.toml: cannot be read: No such file"),
     ("limit missing.toml", "missing.toml: cannot be read: No such file"),
 ])
 def test_a_pipeline_that_chooses_nothing_is_told_what_to_write(
-    command, line, tmp_path, monkeypatch, capsys
+    words, line, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plain.toml").write_text(
         "pose.jitter_px = 0.5\naxes = { side_px = [20, 40], trial = 5 }\n")
-    assert main(command.split()) == 2
-    told, = capsys.readouterr().err.splitlines()
-    assert line in told
+    status, _, err = command(*words.split())
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert line in err
 
 
 BOUND = """
@@ -233,11 +223,12 @@ def bounded(tmp_path_factory):
     return url
 
 
-def test_a_bound_that_no_pose_has_is_a_line_of_every_command_and_of_the_report(bounded, capsys):
+def test_a_bound_that_no_pose_has_is_a_line_of_every_command_and_of_the_report(bounded):
     wanted = "no pose has a bound: clipped"
-    for command in ("run", "status", "plan"):
-        assert cli.main([command, bounded]) == 0
-        assert wanted in capsys.readouterr().out
+    for name in ("run", "status", "plan"):
+        status, out, _ = command(name, bounded)
+        assert status == 0
+        assert wanted in out
     assert any(wanted in line for line in read_report_data(bounded).warnings)
 
 

@@ -6,6 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import sweep
+from support.reports import command
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import SweepError
@@ -35,14 +36,6 @@ def stores(tmp_path_factory):
 @pytest.fixture
 def folder(stores, monkeypatch):
     monkeypatch.chdir(stores)
-
-
-def told(capsys, line):
-    try:
-        code = cli.main(shlex.split(line))
-    except SystemExit as stopped:
-        code = stopped.code
-    return code, *capsys.readouterr()
 
 
 @pytest.mark.usefixtures("folder")
@@ -78,8 +71,8 @@ def told(capsys, line):
         ("run small.toml --set seed=5", "holds another experiment; choose another store"),
     ],
 )
-def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
-    code, out, err = told(capsys, line)
+def test_a_mistake_is_refused_with_what_to_change(line, hint):
+    code, out, err = command(*shlex.split(line))
     assert (code, out) == (2, "")
     assert hint in err
     assert "Traceback" not in err
@@ -87,7 +80,7 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
 
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
-    ("line", "command"),
+    ("line", "following"),
     [
         ("run small.toml", "sweep report runs/small.zarr"),
         ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
@@ -99,22 +92,22 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
         ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
     ],
 )
-def test_every_command_ends_with_what_to_do_next(line, command, monkeypatch, capsys):
+def test_every_command_ends_with_what_to_do_next(line, following, monkeypatch):
     if line.startswith("report"):
         monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
-    code, out, _ = told(capsys, line)
+    code, out, _ = command(*shlex.split(line))
     assert code == 0
     last = out.splitlines()[-1]
-    assert last.partition("  #")[0] == f"next: {command}"
-    assert cli.parser.build_parser()[0].parse_args(shlex.split(command)[1:]).command is not None
+    assert last.partition("  #")[0] == f"next: {following}"
+    assert cli.parser.build_parser()[0].parse_args(shlex.split(following)[1:]).command is not None
 
 
 @pytest.mark.usefixtures("folder")
-def test_a_store_that_is_being_written_is_not_said_to_need_a_run(capsys):
+def test_a_store_that_is_being_written_is_not_said_to_need_a_run():
     url = "runs/unfinished.zarr"
     with writing(url, open_store(url, "r+").storage):
-        _, out, _ = told(capsys, f"verify {url} --sample 0")
-        _, _, err = told(capsys, f"report {url}")
+        _, out, _ = command(*shlex.split(f"verify {url} --sample 0"))
+        _, _, err = command(*shlex.split(f"report {url}"))
     assert out.splitlines()[-1] == f"next: sweep status {url}"
     assert err.endswith("it is being written: wait until it is finished\n")
 
@@ -157,17 +150,17 @@ def test_what_has_to_be_confirmed(demand, free, found):
 
 
 def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
-    tmp_path, monkeypatch, capsys
+    tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.toml").write_text(TEXT)
     monkeypatch.setattr(
         "sweep.execution.forecast.free_disk", lambda _url: FreeDisk(100, None))
-    code, out, err = told(capsys, "run small.toml")
+    code, out, err = command(*shlex.split("run small.toml"))
     assert (code, out) == (2, "")
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "
             "`--yes`") in err.splitlines()[-1]
     assert not (tmp_path / "runs/small.zarr").exists()
     with pytest.raises(SweepError, match="yes=True"):
         sweep.run("small.toml")
-    assert told(capsys, "run small.toml --yes")[0] == 0
+    assert command(*shlex.split("run small.toml --yes"))[0] == 0

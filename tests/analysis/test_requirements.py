@@ -145,14 +145,10 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["detection >= 99 %"], "write 0.99"),
     (["detection >= 95"], "write 0.95 for 95 %"),
     (["detection >= 1"], "no number of draws can show a rate of 1"),
-    (["flip_rate <= 0"], "no number of draws can show 0"),
     (["detection >= 0"], "holds always"),
-    (["detection == 1"], "no relation"),
     (["detektion >= 0.9"], "did you mean detection_rate?"),
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
-    (["rotation_p95_deg <= 0.01 rad"], "the number alone, in degrees"),
     (["rotation_error <= 5"], "which statistic of it? There are rotation_median_deg, "),
-    (["detection >= 0,95"], "write 0.95"),
     (["x_p95_m <= 0.005", "x_median_m >= 0.01"], "contradicts"),
     (["range_p95_percent <= -1"], "never negative"),
     (["yaw_bias_deg >= -1"], "the absolute value is required"),
@@ -161,7 +157,6 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["detection >= 0.99", "detection <= 0.5"], "contradicts detection_rate <= 0.5"),
     (["detection >= 0.9", "detection >= 0.8"], "another such limit"),
     (["looked_for >= 100", "foo_deg >= 1"], "foo_deg"),  # every fault is told
-    (["range_p95_percent <= 4", "detection <= 0.8"], "contradicts"),
 ], ids=str)
 def test_a_requirement_that_cannot_be_is_refused(texts, problem):
     with pytest.raises(ArgumentError, match=problem.replace("?", r"\?")) as error:

@@ -43,19 +43,14 @@ def folder(stores, monkeypatch):
     ("line", "hint"),
     [
         ("runn small.toml", "did you mean run?"),
-        ("help", "`sweep COMMAND --help` print the help"),
         ("run small.toml --example smoke", "--example smoke"),
         ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
-        ("run small.toml --set tilt_deg 3", "values are set by --set KEY=VALUE"),
         ("plan small.toml --worker-count 2", "did you mean --workers?"),
-        ("run small", "did you mean small.toml?"),
         ("run runs", "runs: a folder that is no store; expected a TOML file or a store"),
         ("run small.toml --set Tilt_Deg=3", "did you mean tilt_deg?"),
         ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),
-        ("show small.toml --at side_px:30", "expected name=value"),
         ("show small.toml -o cell.jpg", "expected a file that ends in .png"),
         ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
-        ("repro runs/small.zarr --plain", "--plain and --full are for the file of -o"),
         ("repro small.toml", "`sweep run small.toml` makes its store"),
         ("status small", "did you mean runs/small.zarr?"),
         ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
@@ -68,7 +63,6 @@ def folder(stores, monkeypatch):
          "--seconds nan: expected a finite number above 0"),
         ("run few.toml --precision 'detection_rate = 0.1'",
          "--max-trials: expected max_trials, too: the most trials of a condition, such as 2400"),
-        ("run small.toml --set seed=5", "holds another experiment; choose another store"),
     ],
 )
 def test_a_mistake_is_refused_with_what_to_change(line, hint):

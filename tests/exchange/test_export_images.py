@@ -14,7 +14,7 @@ from sweep import cli
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
-from sweep.experiment.pipeline import Pipeline, cell
+from sweep.experiment.pipeline import Pipeline
 
 TEXT = """
 title = "Exported"
@@ -173,7 +173,9 @@ def files_of(folder):
     }
 
 
-def test_folders_of_others_are_refused_in_a_line(exported, pipeline, tmp_path):
+def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
+    exported, pipeline, tmp_path, monkeypatch
+):
     (tmp_path / "notes.txt").write_text("mine")
     other = Pipeline.from_text(pipeline.text.replace("seed = 5", "seed = 6"), name="exported")
     for some, folder, options, line in (
@@ -184,35 +186,16 @@ def test_folders_of_others_are_refused_in_a_line(exported, pipeline, tmp_path):
     ):
         with pytest.raises(StoreError, match=line):
             export(some, folder, **options)
-    with pytest.raises(ArgumentError, match="workers"):
-        export(pipeline, tmp_path / "new", workers=0)
-    assert not (tmp_path / "new").exists()
-
-
-def test_what_is_large_has_to_be_confirmed(pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr(exporting, "MAX_BYTES", 1000)
-    with pytest.raises(StoreError, match=r"takes about .*confirm it with --yes"):
-        export(pipeline, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
     huge = Pipeline.from_text(pipeline.text.replace("trial = 3", "trial = 1000000"), name="huge")
-    with pytest.raises(StoreError, match="6,000,000 scenes; at most 1,000,000"):
-        export(huge, tmp_path / "huge", yes=True)
-
-
-def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
-    keys = pipeline.experiment.image_keys(pipeline.experiment.all_scenes.indices(np.arange(18)))
-    assert len(set(keys.tolist())) == 18
-    single = cell(pipeline, "tilt_deg=50,distance_m=0.2,trial=2")
-    assert single.experiment.image_keys([np.zeros(1, dtype=np.intp)]) == keys[14]
-    larger = Pipeline.from_text(
-        pipeline.text, ["distance_m=[0.05, 0.2]", "trial=9", 'window="full"', "solver=ippe",
-                        "cornerRefinementMethod=none"])
-    among = larger.experiment.image_keys(larger.experiment.all_scenes.indices(np.arange(36)))
-    assert set(among.tolist()) & set(keys.tolist()) == set(keys[[3, 4, 5, 12, 13, 14]].tolist())
-    for other in ("seed=6", "noise_grey=3", "size_m=0.06"):
-        changed = Pipeline.from_text(pipeline.text, [other])
-        among = changed.experiment.image_keys(changed.experiment.all_scenes.indices(np.arange(18)))
-        assert not set(among.tolist()) & set(keys.tolist()), other
+    monkeypatch.setattr(exporting, "MAX_BYTES", 1000)
+    for some, options, line in (
+        (pipeline, {}, "takes about .*confirm it with --yes"),
+        (huge, {"yes": True}, "6,000,000 scenes; at most 1,000,000"),
+        (pipeline, {"workers": 0}, "workers"),
+    ):
+        with pytest.raises((ArgumentError, StoreError), match=line):
+            export(some, tmp_path / "new", **options)
+    assert not (tmp_path / "new").exists()
 
 
 def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):

@@ -276,8 +276,6 @@ BAD = {
                       "and in line 2")),
     "a missing column": (GOOD.replace("y3", "yy3"), "line 1: no column y3; the header has "),
     "NaN": (GOOD.replace(",8", ",nan"), "line 2: y3 = nan: expected a finite number"),
-    "five corners": (GOOD.replace("y3", "y3,x4,y4").replace(",8", ",8,9,9"), "more than four"),
-    "a negative ID": (GOOD.replace(",0,1", ",-2,1"), "line 2: id -2: expected a whole number"),
     "half a pose": ("image,id,rx,ry,rz\n{0},0,1,2,3\n", "line 1: no column tx, ty, tz"),
     "a quaternion of length 2": (
         "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),
@@ -307,7 +305,6 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
         (exported, [tmp_path / "missing.csv"], {}, StoreError, "cannot be read: No such file"),
         (exported, [good, good], {}, ArgumentError, "another name for each file"),
         (exported, [good], {"names": ["../a"]}, ArgumentError, "letters, digits"),
-        (exported, [good], {"doubled": "first"}, ArgumentError, "one of refuse, nearest"),
     ):
         with pytest.raises(error, match=line):
             prepare(folder, files, **options)

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from support.searches import DOCUMENT, changed, flags_of
+from support.searches import DOCUMENT, flags_of
 from support.small_datasets import perfect
 from sweep.analysis.decisions import answers, choice_cells
 from sweep.analysis.requirements import Decision, ErrorShares
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import StoppingRule, not_continued
+from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
@@ -96,21 +96,6 @@ def test_trials_are_needed_up_to_the_first_size_that_fails():
     assert needed[:, :, 0].tolist() == [[False, False], [True, True], [False, False]]
     rates = np.ones((3, 2, 2))
     assert not rule.needed(group(pipeline, rates, 400, np.random.default_rng(1))).any()
-
-
-def test_pipelines_are_read_again_from_their_text_and_others_are_told_apart():
-    pipeline = Pipeline.from_dict(changed(require={"all": ["detection >= 0.9", "budget_ms <= 2"]}))
-    again = Pipeline.from_text(pipeline.to_toml())
-    assert again.stopping == pipeline.stopping
-    assert (again.budget_ms, again.requirements) == (2.0, ("detection >= 0.9",))
-    assert pipeline.stopping.at_all == ("tilt_deg",)
-    assert pipeline.stopping.among == ("dictionary", "solver")
-
-
-    rule = Pipeline.from_dict(changed(search={"max_trials": 500})).stopping
-    assert not_continued(rule, pipeline.stopping) == (
-        "search.max_trials: the store has 400, this run 500")
-    assert not not_continued(rule, rule)
 
 
 def test_answers_name_the_next_size_and_what_it_fails_by():

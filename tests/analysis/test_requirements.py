@@ -130,6 +130,22 @@ def test_about_as_many_draws_as_are_said_decide():
     assert Decision(int(many["decision"].item())) is Decision.met
 
 
+@pytest.mark.parametrize(("trials", "limit"), [(2, 100.0), (40, 100.0), (60, 1.1)])
+def test_draws_that_a_spread_needs_follow_from_its_interval_on_the_scale_of_logarithms(
+    trials, limit
+):
+    results = detected_by_distance([1.0], trials=trials)
+    errors = results["translation_error_m"].values[..., 0]
+    errors[...] = np.random.default_rng(8).normal(0.0, 1e-4, errors.shape)
+    limit *= np.std(errors, ddof=1)
+    table = check_requirements(results, [f"x_sd_m <= {limit:.9g}"])
+    assert Decision(int(table["decision"].item())) is Decision.undecided
+    reach = np.log(table["high"].item() / table["value"].item()) / np.log(
+        limit / table["value"].item())
+    expected = 50 if trials < 50 else trials * reach**2
+    assert table["draws_needed"].item() == pytest.approx(expected, rel=0.05)
+
+
 def test_poses_that_cannot_be_seen_are_no_condition():
     results = detected_by_distance([1.0, 1.0])
     results["detection"].values[1] = DetectionStatus.not_visible

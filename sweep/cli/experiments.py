@@ -516,7 +516,7 @@ def verify(
         then = f"sweep run {url} --overwrite", "computes all of it again"
     else:
         then = f"sweep {_following(store, finished=report.finished)} {url}", ""
-    return findings(lines, report.to_json(), int(bool(report.damage)), *then)
+    return findings(lines, report, int(bool(report.damage)), *then)
 
 
 def _following(url: str, *, finished: bool) -> str:

@@ -15,15 +15,8 @@ from sweep.evaluation.machine_faults import exception_line, machine_faults_raise
 from sweep.execution import BLOCK_TASK
 from sweep.execution.block_task import compute_blocks
 from sweep.execution.waves import Waiting, Work
-from sweep.isolation.child_process import (
-    POLL_S,
-    Child,
-    ChildDiedError,
-    ChildRaisedError,
-    Interrupts,
-    explained,
-    last_line,
-)
+from sweep.isolation import child_process
+from sweep.isolation.child_process import POLL_S, Child, Interrupts
 from sweep.messages import notice
 from sweep.store.blocks import Receipt
 
@@ -105,7 +98,7 @@ class Executor(ABC):
         last, told_s = time.monotonic(), SILENCE_S
 
         def begin(work: Work, failures: list[Failed]) -> None:
-            future = self.submit(task(work), limit_s, failures)
+            future = self.submit(task(work), failures)
             out[future] = work, failures
             future.add_done_callback(finished.put)
 
@@ -140,7 +133,7 @@ class Executor(ABC):
         """Return how many tasks may be out now."""
 
     @abstractmethod
-    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+    def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Call :func:`compute_blocks`, rather not where it failed; return a future."""
 
     @abstractmethod
@@ -186,8 +179,7 @@ class Children(Executor):
         self._idle: SimpleQueue[Child] = SimpleQueue()
         self._idle.put(child)
         self._pool = ThreadPoolExecutor(count)
-        self._began: float | None = None
-        self._closed = False
+        self._grow_at = time.monotonic() + SMALL_RUN_LIMIT_S
         if at_once:
             self._grow()
 
@@ -196,7 +188,6 @@ class Children(Executor):
 
     def __exit__(self, *_: object) -> None:
         """End the processes; a thread that waits for one gets its end for an answer."""
-        self._closed = True
         for child in self._children:
             child.close()
         self._pool.shutdown(cancel_futures=True)
@@ -217,9 +208,7 @@ class Children(Executor):
 
     def room(self) -> int:
         """Return the number of processes."""
-        now = time.monotonic()
-        self._began = now if self._began is None else self._began
-        if now > self._began + SMALL_RUN_LIMIT_S:
+        if time.monotonic() > self._grow_at:
             self._grow()
         return len(self._children)
 
@@ -227,23 +216,20 @@ class Children(Executor):
         """Return how many processes there are."""
         return f"{len(self._children)} processes"
 
-    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+    def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Have a thread call a child that is idle."""
         del failures
-        return self._pool.submit(self._call, arguments, limit_s)
+        return self._pool.submit(self._call, arguments)
 
-    def _call(self, arguments: tuple[Any, ...], limit_s: float) -> list[Receipt]:
+    def _call(self, arguments: tuple[Any, ...]) -> list[Receipt]:
         child = self._idle.get()
         try:
             # The block keeps its own time limit; this one is for what surrounds it.
-            receipts: list[Receipt] = child.call(compute_blocks, *arguments, limit_s=2 * limit_s)
-        except (ChildDiedError, MachineFaultError):
-            if not self._closed:
-                with machine_faults_raised():
-                    child.restart()
+            return child.call(compute_blocks, *arguments, limit_s=2 * arguments[-1])
+        except (child_process.ChildDiedError, MachineFaultError):
+            with machine_faults_raised():
+                child.restart()
             raise
-        else:
-            return receipts
         finally:
             self._idle.put(child)
 
@@ -254,14 +240,14 @@ class Children(Executor):
             receipts: list[Receipt] = future.result()
         except StoreReplacedError:
             raise
-        except ChildDiedError as error:
+        except child_process.ChildDiedError as error:
             # The block is computed in isolation when it is begun again.
-            return Failed(f"its process ended: {explained(error)}", error.from_outside,
-                          tries=MAX_ATTEMPTS)
+            how = child_process.explained(error)
+            return Failed(f"its process ended: {how}", error.from_outside, MAX_ATTEMPTS)
         except MachineFaultError as error:
             return Failed(str(error), machine_fault=True, tries=2)
-        except ChildRaisedError as error:
-            return Failed(last_line(error))
+        except child_process.ChildRaisedError as error:
+            return Failed(child_process.last_line(error))
         except SweepError as error:
             return Failed(f"{type(error).__name__}: {error}")
         return receipts

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreError
 from sweep.evaluation.block import run_cells
@@ -24,13 +23,8 @@ from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import along_photographs
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import (
-    Child,
-    ChildDiedError,
-    ChildRaisedError,
-    default_workers,
-    last_line,
-)
+from sweep.isolation import child_process
+from sweep.isolation.child_process import Child
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
@@ -87,24 +81,25 @@ def seconds_of(pipeline: Pipeline, count: int) -> tuple[float, int]:
     Of photographs, all markers of one. Seconds are those of this thread, since others use the
     processors meanwhile, and compilation does not count.
     """
-    indices = _sample(pipeline, count)
+    generator, scenes = np.random.Generator(np.random.PCG64(count)), pipeline.experiment.all_scenes
+    if pipeline.shows_photographs:
+        photographs = _photographs(pipeline)
+        indices = photographs[int(generator.integers(0, len(photographs)))].indices()
+    else:
+        indices = scenes.indices(generator.integers(0, len(scenes), count))
     begun, compiled = time.thread_time(), compilation_s()
     run_cells(pipeline.experiment, indices)
     took_s = time.thread_time() - begun - (compilation_s() - compiled)
     return max(took_s, 1e-9), len(indices[0]) if indices else 1
 
 
-def _sample(pipeline: Pipeline, count: int) -> list[NDArray[np.intp]]:
-    """Return the indices of a random sample of scenes: of photographs all markers of one."""
+def _photographs(pipeline: Pipeline) -> Blocks:
+    """Return blocks of one photograph, which is searched once, for all its markers."""
     axes = pipeline.experiment.scene_axes
-    generator = np.random.Generator(np.random.PCG64(count))
-    if not pipeline.shows_photographs:
-        return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
-    each = [
-        generator.integers(0, len(axis), 1) if along else np.arange(len(axis))
-        for axis, along in zip(axes, along_photographs(axes), strict=True)
-    ]
-    return [grid.ravel().astype(np.intp) for grid in np.meshgrid(*each, indexing="ij")]
+    lengths = tuple(len(axis) for axis in axes)
+    return Blocks(lengths, tuple(
+        1 if along else length
+        for along, length in zip(along_photographs(axes), lengths, strict=True)))
 
 
 def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
@@ -123,33 +118,32 @@ def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
         count = min(wanted, GROWTH * count)
 
 
-def measure(child: Child, pipeline: Pipeline, limit_s: float = TIMING_LIMIT_S) -> Timing:
+def measure(child: Child, pipeline: Pipeline, limit_s: float) -> Timing:
     """Time a batch of scenes in a child process, which ends if that takes too long.
 
     Raises
     ------
-    ChildDiedError, ChildRaisedError
+    ChildError
         If a scene crashes the child, or raises.
     """
     try:
-        timing: Timing = child.call(
-            timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
-    except ChildDiedError as error:
+        return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
+    except child_process.ChildDiedError as error:
         child.restart()
         if not error.timed_out:
             raise
         return Timing(limit_s, 1, over=True)
-    return timing
 
 
-def measured_or_assumed(child: Child, pipeline: Pipeline, limit_s: float) -> Timing:
+def measured_or_assumed(child: Child, pipeline: Pipeline, block_limit_s: float) -> Timing:
     """Time scenes, which may crash or raise: then :data:`UNMEASURED_S` is assumed.
 
-    Also if this machine is at fault: whether the workers' are is seen by their blocks.
+    Also if this machine is at fault: whether the workers' are is seen by their blocks. The time
+    limit is that of a block in seconds.
     """
     try:
-        return measure(child, pipeline, limit_s)
-    except (ChildDiedError, ChildRaisedError, MachineFaultError):
+        return measure(child, pipeline, min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S))
+    except (child_process.ChildError, MachineFaultError):
         return Timing(UNMEASURED_S, 0)
 
 
@@ -240,10 +234,8 @@ def blocks_of(
     """
     axes = pipeline.experiment.scene_axes
     lengths = tuple(len(axis) for axis in axes)
-    if pipeline.shows_photographs:  # each is searched once, for all its markers
-        along = along_photographs(axes)
-        return Blocks(lengths, tuple(
-            1 if each else length for each, length in zip(along, lengths, strict=True)))
+    if pipeline.shows_photographs:
+        return _photographs(pipeline)
     total_s = pipeline.size(Stage.scene) * scene_s
     rule = make_rule(pipeline)
     if rule is not None:
@@ -476,16 +468,16 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
     try:
         with Child("sweep.execution.forecast") as child:
             timing = measure(child, pipeline, PLAN_SCENES_S)
-    except (ChildDiedError, ChildRaisedError) as error:
+    except child_process.ChildError as error:
         raise RunError(
-            f"a measured scene crashed its process ({last_line(error)}); `sweep run` isolates it "
-            "and computes the others"
+            f"a measured scene crashed its process ({child_process.last_line(error)}); "
+            "`sweep run` isolates it and computes the others"
         ) from None
     poses, least = pipeline.size(Stage.scene), least_share(pipeline)
     small = workers is None and least * poses * timing.scene_s < SMALL_RUN_S
-    count = workers or (1 if small else default_workers())
+    count = workers or (1 if small else child_process.default_workers())
     blocks = blocks_of(pipeline, timing.scene_s, count)
-    busy = min(count, default_workers(), len(blocks))
+    busy = min(count, child_process.default_workers(), len(blocks))
     demand = demand_of(pipeline, timing.scene_s, busy, len(blocks), len(blocks))
     # The child ended: its memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024

@@ -14,11 +14,11 @@ from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import Summary
-from sweep.experiment.document import MAX_BYTES, SEARCH, read_document
+from sweep.experiment.document import SEARCH
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import search_settings, texts_in
-from sweep.model.image_file import read_regular
 from sweep.store.lifecycle import (
+    document_of,
     names_store,
     open_dataset,
     open_store,
@@ -84,7 +84,7 @@ def _with_search(
     source: Pipeline | str | os.PathLike[str], settings: Sequence[str], chosen: Sequence[str]
 ) -> Pipeline:
     """Return a pipeline with the section [search] of its document and of what is chosen."""
-    document = _document(source)
+    document = document_of(source)
     if document is None and not isinstance(source, Pipeline):
         return read_pipeline(source, settings)  # it says why
     document = document or {}
@@ -96,25 +96,7 @@ def _with_search(
         raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
     if "along" not in given:
         raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
-    settings = [*settings, *chosen, *more]
-    if isinstance(source, Pipeline):
-        pipeline = Pipeline.from_text(
-            source.text, settings, name=source.name, source=source.source,
-            folder=source.folder)
-    else:
-        pipeline = read_pipeline(source, settings)
+    pipeline = read_pipeline(source, [*settings, *chosen, *more])
     if pipeline.requirements:
         check_required(pipeline.requirements, pipeline.source)
     return pipeline
-
-
-def _document(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return the document of a pipeline, None if it cannot be read."""
-    try:
-        if isinstance(source, Pipeline):
-            return read_document(source.text)
-        if names_store(source):
-            return read_document(open_store(os.fspath(source)).pipeline.text)
-        return read_document(read_regular(os.fspath(source), MAX_BYTES).decode())
-    except (OSError, ValueError):
-        return None

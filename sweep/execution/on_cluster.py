@@ -82,15 +82,19 @@ def connected(
         if scheduler is not None:
             argument, name = "scheduler", scheduler
             stack.enter_context(silenced_dask_loggers())
-            connection = stack.enter_context(
-                Client(stack.enter_context(_local_cluster(workers or default_workers())),
-                       set_as_default=False)
-                if scheduler == LOCAL else _client_of(scheduler))
+            own = stack.enter_context(_local_cluster(workers or default_workers())) \
+                if scheduler == LOCAL else _checked_address(scheduler)
         else:
             argument, name = "client", _name(client)
-            connection = _borrowed(client, name, stack)
-        check_workers(connection, pipeline, argument, name)
-        yield OnCluster(connection)
+            own = _checked_client(client, name)
+        if not isinstance(own, Client):
+            try:
+                own = stack.enter_context(Client(own, timeout=ANSWER_S, set_as_default=False))
+            except (OSError, RuntimeError, ValueError) as error:
+                reason = f"cannot connect: {exception_line(error)}"
+                raise ArgumentError(argument, name, reason) from None
+        check_workers(own, pipeline, argument, name)
+        yield OnCluster(own)
 
 
 def _local_cluster(workers: int) -> LocalCluster:
@@ -109,10 +113,10 @@ def _local_cluster(workers: int) -> LocalCluster:
         raise RunError(f"{workers} workers cannot be started: {exception_line(error)}") from None
 
 
-def _client_of(address: str) -> Client:
-    """Return a client that the caller closes.
+def _checked_address(address: str) -> str:
+    """Return the address of a scheduler that answers.
 
-    If the address begins with ``tls://``, Dask's own configuration names the certificates.
+    If it begins with ``tls://``, Dask's own configuration names the certificates.
     """
     try:
         parts = urlsplit(address)
@@ -127,14 +131,14 @@ def _client_of(address: str) -> Client:
         # thread, since the caller may be in an event loop, as notebooks are.
         with ThreadPoolExecutor(1) as thread:
             kind = thread.submit(asyncio.run, _kind_of_server(address)).result()
-        if kind != "Scheduler":
-            reason = f"a {kind} answers there, not a scheduler"
-        else:
-            return Client(address, timeout=ANSWER_S, set_as_default=False)
     except TimeoutError:
         reason = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
     except Exception as error:
         reason = f"cannot connect: {exception_line(error)}"
+    else:
+        if kind == "Scheduler":
+            return address
+        reason = f"a {kind} answers there, not a scheduler"
     raise ArgumentError("scheduler", address, reason)
 
 
@@ -147,10 +151,8 @@ async def _kind_of_server(address: str) -> str:
         return str((await server.identity())["type"])
 
 
-def _borrowed(
-    client: Client | Cluster | None, name: str, stack: contextlib.ExitStack
-) -> Client:
-    """Return the caller's client, or a new client of the caller's cluster object."""
+def _checked_client(client: Client | Cluster | None, name: str) -> Client | Cluster:
+    """Return the caller's client or cluster object, if it can be used."""
     if not isinstance(client, (Client, Cluster)):
         raise ArgumentError(
             "client", client,
@@ -163,14 +165,7 @@ def _borrowed(
     state = getattr(state, "name", state)
     if state in ("closing", "closed", "failed"):
         raise ArgumentError("client", name, f"it is {state}")
-    if isinstance(client, Client):
-        return client
-    try:
-        own: Client = stack.enter_context(
-            Client(client, timeout=ANSWER_S, set_as_default=False))
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ArgumentError("client", name, f"cannot connect: {error}") from None
-    return own
+    return client
 
 
 def _name(client: object) -> str:
@@ -208,8 +203,7 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
     begun = fingerprint(pipeline)
     try:
         # A task that any worker may take, so that a cluster that adapts to work starts one.
-        first = client.submit(os.getpid, pure=False)
-        first.result(timeout=WORKERS_S)
+        client.submit(os.getpid, pure=False).result(timeout=WORKERS_S)
         asked = {
             worker: client.submit(this_process, pipeline, begun, workers=[worker], pure=False)
             for worker in client.nthreads()
@@ -333,9 +327,8 @@ class OnCluster(Executor):
             f", {paused} of them paused by Dask because of their memory "
             "(`dask worker --memory-limit`)" if paused else "")
 
-    def submit(self, arguments: tuple[Any, ...], limit_s: float, failures: list[Failed]) -> Any:
+    def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
-        del limit_s
         others = self._others({each.worker for each in failures}) if failures else []
         return self._client.submit(
             on_worker, compute_blocks, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
@@ -349,11 +342,15 @@ class OnCluster(Executor):
 
     def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
         """Return the receipts; what died, or a machine failed, is given to other workers."""
+        worker, result = "", None
         try:
             if future.status == "finished":
                 worker, result = future.result()  # it comes through the scheduler
-            else:
-                worker, result = "", self._error(future)
+            elif future.status == "error":
+                result = future.exception()
+            elif future.status != "lost" or self._client.status != "running":
+                raise RunError(AWAY)
+            # Else its worker died with its receipt.
         except OSError:
             raise RunError(AWAY) from None
         finally:
@@ -377,15 +374,6 @@ class OnCluster(Executor):
             return Failed(str(fault), True, MAX_ATTEMPTS if left else 1, worker)
         receipts: list[Receipt] = result
         return receipts
-
-    def _error(self, future: Any) -> BaseException | None:
-        """Return why a future has no result; None if its worker died with its receipt."""
-        if future.status == "lost" and self._client.status == "running":
-            return None
-        if future.status in ("cancelled", "lost"):
-            raise ConnectionError(AWAY)
-        error: BaseException | None = future.exception()
-        return error
 
     def cancel(self, out: Collection[Any]) -> None:
         """Take back what is still out; a caller's cluster outlives the run."""

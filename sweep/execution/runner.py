@@ -19,18 +19,8 @@ from sweep.errors import (
     StoreError,
     StoreReplacedError,
 )
-from sweep.execution import BLOCK_TASK, TIME_LIMIT_S
+from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
-from sweep.execution.forecast import (
-    TIMING_LIMIT_S,
-    TIMING_SHARE,
-    block_time_limit_s,
-    blocks_of,
-    check_affordable,
-    least_share,
-    measured_or_assumed,
-    scene_s_of,
-)
 from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.status import Summary, close, drop_failed, failed_blocks, summary_of
@@ -42,6 +32,7 @@ from sweep.isolation.crash_isolation import check_plugins
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
+from sweep.store import lifecycle
 from sweep.store.blocks import (
     Receipt,
     RunStore,
@@ -50,14 +41,6 @@ from sweep.store.blocks import (
     drop_block,
     missing_chunks,
     receipts,
-)
-from sweep.store.lifecycle import (
-    create_store,
-    open_store,
-    read_attributes,
-    read_run_metadata,
-    remove_store,
-    reopen,
 )
 from sweep.store.locations import absolute_url, check_writable, exists, open_storage
 from sweep.store.lock import changing, is_written, writing
@@ -164,12 +147,13 @@ def execute(
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
         if begun is not None and done:
-            scene_s, left = scene_s_of(begun, done), 1 - len(done) / len(begun.blocks)
+            scene_s, left = forecast.scene_s_of(begun, done), 1 - len(done) / len(begun.blocks)
         else:
-            limit_s = min(TIMING_SHARE * (time_limit_s or TIME_LIMIT_S), TIMING_LIMIT_S)
-            measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
+            measuring = thread.submit(
+                forecast.measured_or_assumed, child, pipeline, time_limit_s or TIME_LIMIT_S)
             # In waves, nobody knows how much more than the first one is needed.
-            scene_s, left = interrupts.await_result(measuring).scene_s, least_share(pipeline)
+            left = forecast.least_share(pipeline)
+            scene_s = interrupts.await_result(measuring).scene_s
         executor: Executor
         if scheduler is not None or client is not None:
             from sweep.execution.on_cluster import connected  # noqa: PLC0415  (slow to import)
@@ -179,23 +163,23 @@ def execute(
             large = left * pipeline.size(Stage.scene) * scene_s >= SMALL_RUN_S
             executor = stack.enter_context(Children(
                 child, workers or default_workers(), at_once=large or workers is not None))
-        blocks = begun.blocks if begun is not None else blocks_of(
+        blocks = begun.blocks if begun is not None else forecast.blocks_of(
             pipeline, scene_s, executor.threads, block_s, time_limit_s)
         if not (yes or sources):
-            check_affordable(
+            forecast.check_affordable(
                 url, pipeline, scene_s, executor.threads, len(blocks), len(blocks) - len(done))
         if begun is None:
             if overwrite and exists(url):
-                remove_store(url)
-            begun = create_store(url, pipeline, blocks.extents)
+                lifecycle.remove_store(url)
+            begun = lifecycle.create_store(url, pipeline, blocks.extents)
         if stricter:
             begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
             begun, again = drop_failed(begun)
-        limit_s = block_time_limit_s(time_limit_s, scene_s * len(begun.blocks[0]))
+        limit_s = forecast.block_time_limit_s(time_limit_s, scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
-    return summary_of(open_store(url), computed, time.perf_counter() - started, again)
+    return summary_of(lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
 
 def recompute(
@@ -213,8 +197,8 @@ def recompute(
         If blocks failed.
     """
     _check_arguments(workers, None, None, None, time_limit_s)
-    each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
-    limit_s = block_time_limit_s(time_limit_s, each_s)
+    each_s = forecast.scene_s_of(store, committed(store)) * len(store.blocks[0])
+    limit_s = forecast.block_time_limit_s(time_limit_s, each_s)
     with (
         Interrupts() as interrupts, Child(BLOCK_TASK) as child,
         Children(child, workers or default_workers(), at_once=workers is not None) as executor,
@@ -246,10 +230,10 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     if overwrite:
         # It is deleted once everything else is known to work, just before the new one is made.
         storage = open_storage(url, "r+")
-        read_run_metadata(url, storage)
+        lifecycle.read_run_metadata(url, storage)
         with changing(url, storage):
             return None
-    store = open_store(url, "r+")
+    store = lifecycle.open_store(url, "r+")
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
         raise OtherExperimentError(url, lines, is_reusable(pipeline, store))
@@ -264,7 +248,7 @@ def _matching_sources(
     for source in sources:
         if source == absolute_url(url):
             raise ArgumentError("reuse", source, "it is the store that is written; choose another")
-        match(pipeline, open_store(source))
+        match(pipeline, lifecycle.open_store(source))
     return sources
 
 
@@ -283,8 +267,8 @@ def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
         If another process writes the store, or it cannot be written.
     """
     with changing(store.url, store.storage):
-        reopen(store, pipeline)
-    return open_store(store.url, "r+")
+        lifecycle.reopen(store, pipeline)
+    return lifecycle.open_store(store.url, "r+")
 
 
 def _compute_and_close(
@@ -388,7 +372,7 @@ def _raise_failed(url: str, failed: Sequence[tuple[str, bool]]) -> None:
 
 def _check_same_rule(store: RunStore) -> None:
     """Raise StoreError if another process gave the store another rule, as it may on S3."""
-    if read_attributes(store.url, store.storage)["pipeline"] != store.pipeline.text:
+    if lifecycle.read_attributes(store.url, store.storage)["pipeline"] != store.pipeline.text:
         raise StoreError(f"{store.url}: another run has changed when its sampling stops")
 
 

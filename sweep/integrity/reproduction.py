@@ -17,7 +17,7 @@ from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, cell, parse_selection, selection_text
 from sweep.experiment.schema import SCHEMA, Tolerance, Variable
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest, plain, refusal
@@ -355,10 +355,10 @@ def _inspected(
     for function in (inspect_scene, scene_image):
         try:
             with Child() as child:
-                result = child.call(
+                result: Any = child.call(
                     partial(function, cell_pipeline, whole_frame=whole_frame), limit_s=limit_s
                 )
-        except (ChildDiedError, ChildRaisedError, RunError):
+        except (ChildError, RunError):
             continue
         return (result, result.image) if function is inspect_scene else (None, result)
     return None, None

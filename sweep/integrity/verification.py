@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -105,10 +105,6 @@ class IntegrityReport:
     repaired: list[Damage] = field(default_factory=list)
     left_over: list[str] = field(default_factory=list)
     processors: dict[str, int] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the report as ``sweep verify --json`` prints it."""
-        return asdict(self)
 
 
 # --------------------------------------------------------------------------------------------------

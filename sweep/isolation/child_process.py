@@ -18,7 +18,7 @@ from concurrent.futures import Future, wait
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
@@ -82,7 +82,11 @@ PARENT_S = 1.0
 """How often a child looks whether its caller still lives."""
 
 
-class ChildDiedError(Exception):
+class ChildError(Exception):
+    """A call in a child process has no result."""
+
+
+class ChildDiedError(ChildError):
     """A child process ended during a call.
 
     Parameters
@@ -103,13 +107,16 @@ class ChildDiedError(Exception):
         return str(self) in OUTSIDE_SIGNALS
 
 
-class ChildRaisedError(Exception):
+class ChildRaisedError(ChildError):
     """A call raised in the child process; the message is the traceback."""
 
 
-def last_line(error: ChildDiedError | ChildRaisedError) -> str:
+def last_line(error: ChildError) -> str:
     """Return how a child process ended, or the line of its traceback that names the exception."""
     return str(error).strip().splitlines()[-1]
+
+
+Result = TypeVar("Result")
 
 
 class Child:
@@ -155,9 +162,9 @@ class Child:
         self.close()
 
     def call(
-        self, function: Callable[..., Any], *arguments: Any, limit_s: float,
+        self, function: Callable[..., Result], *arguments: Any, limit_s: float,
         grace_s: float = GRACE_S,
-    ) -> Any:
+    ) -> Result:
         """Call a function of a module in the child and return its result.
 
         Parameters
@@ -192,7 +199,7 @@ class Child:
             raise ChildDiedError(ending(code)) from None
         if raised:
             raise result if isinstance(result, SweepError) else ChildRaisedError(result)
-        return result
+        return cast("Result", result)
 
     def close(self) -> None:
         """End the child."""
@@ -244,8 +251,6 @@ def _end_after(parent: int) -> None:
 
 # --------------------------------------------------------------------------------------------------
 # Ctrl-C that stops a run between two steps, never in the middle of one.
-
-Result = TypeVar("Result")
 
 POLL_S = 0.2
 """How often Ctrl-C is checked while a result is awaited."""

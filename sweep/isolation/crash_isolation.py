@@ -16,13 +16,8 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import (
-    Child,
-    ChildDiedError,
-    ChildRaisedError,
-    explained,
-    last_line,
-)
+from sweep.isolation import child_process
+from sweep.isolation.child_process import Child
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -104,16 +99,16 @@ class _IsolatedCells:
                 self._child = Child()
             try:
                 self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
-            except (ChildDiedError, ChildRaisedError) as error:
-                raise local_fault("a child process ended before it computed anything: "
-                                  f"{explained(last_line(error))}") from None
+            except child_process.ChildError as error:
+                how = child_process.explained(child_process.last_line(error))
+                raise local_fault(
+                    f"a child process ended before it computed anything: {how}") from None
             limit_s += min(LOADING * self._limit_s, LOADING_S)
         try:
-            result: CellsResult = self._child.call(_run_held, *arguments, limit_s=limit_s)
-        except ChildDiedError:
+            return self._child.call(_run_held, *arguments, limit_s=limit_s)
+        except child_process.ChildDiedError:
             self._child = None
             raise
-        return result
 
     def scene(self, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_]) -> CellsResult:
         """Return the cells of a scene that crashes its process, never returns, or raises.
@@ -178,19 +173,20 @@ class _IsolatedCells:
             solve[0, part.setting, part.estimator] = True
         elif part.setting is not None:
             search[0, part.setting] = True
-        deaths: list[ChildDiedError] = []
+        deaths: list[child_process.ChildDiedError] = []
         outside = 0
         while len(deaths) + sum(death.timed_out for death in deaths) < DEATHS:
             try:
                 result = self.run(self._share, indices, solve, search)
-            except ChildRaisedError as error:
+            except child_process.ChildRaisedError as error:
                 return dataclasses.replace(part, text=str(error))
-            except ChildDiedError as death:
+            except child_process.ChildDiedError as death:
                 outside += death.from_outside
                 if outside > 1:
+                    how = child_process.explained(death)
                     raise local_fault(
-                        f"two processes that computed one scene were ended by {explained(death)}; "
-                        f"it is --at {self._selected(part, indices)}") from None
+                        "two processes that computed one scene were ended by "
+                        f"{how}; it is --at {self._selected(part, indices)}") from None
                 if death.timed_out:
                     self._share /= 2
                 if not death.from_outside:
@@ -252,7 +248,7 @@ def run_cells_isolated(
             chosen = [index[rows] for index in indices]
             try:
                 done[int(rows[0])] = isolated.run(PIECE, chosen, need[rows])
-            except (ChildDiedError, ChildRaisedError):
+            except child_process.ChildError:
                 if len(rows) > 1:
                     waiting.extendleft(reversed(_pieces(rows)))
                 else:
@@ -342,11 +338,11 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
         name = f"{plugin.kind} {plugin.name}"
         try:
             child.call(use, pipeline, plugin.kind, plugin.name, limit_s=limit_s)
-        except ChildDiedError as error:
+        except child_process.ChildDiedError as error:
             child.restart()
             raise PluginError(f"{name}: ends its process before the first pose: {error}") from None
-        except ChildRaisedError as error:
-            raise PluginError(f"{name}: {last_line(error)}") from None
+        except child_process.ChildRaisedError as error:
+            raise PluginError(f"{name}: {child_process.last_line(error)}") from None
 
 
 @single_threaded()

@@ -27,20 +27,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
-from sweep.store.files import (
-    RECEIPTS,
-    absent_files,
-    checksum_of,
-    delete_files,
-    list_folder,
-    packed,
-    read_files,
-    read_json,
-    sync,
-    unpacked,
-    write_document,
-    write_files,
-)
+from sweep.store import files
 from sweep.store.locations import is_remote, remote_run_id, translate_errors
 
 # --------------------------------------------------------------------------------------------------
@@ -110,7 +97,7 @@ class RunStore:
     @property
     def run_metadata(self) -> dict[str, Any]:
         """The metadata of the run: format, run id, fingerprint, environment, dates."""
-        root = read_json(self.storage, "zarr.json") or {}
+        root = files.read_json(self.storage, "zarr.json") or {}
         return run_metadata_in(root["attributes"])
 
 
@@ -183,7 +170,7 @@ class Chunks:
         """
         whole = self._empty[name].copy()
         whole[tuple(map(slice, np.shape(values)))] = values
-        return packed(whole.tobytes())
+        return files.packed(whole.tobytes())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -192,7 +179,7 @@ class Chunks:
 
 def receipt_key(number: int) -> str:
     """Return the key of a block's receipt."""
-    return f"{RECEIPTS}/c/{number}"
+    return f"{files.RECEIPTS}/c/{number}"
 
 
 STAGES = ("scene", "detection", "estimation")
@@ -287,7 +274,7 @@ class Receipt:
         """Return the chunk that a store holds: a text of JSON, the bytes that Zarr writes."""
         text = json.dumps(asdict(self), separators=(",", ":")).encode()
         # As the codec "vlen-utf8" has it: how many texts, then the length of each before it.
-        return packed(struct.pack("<II", 1, len(text)) + text)
+        return files.packed(struct.pack("<II", 1, len(text)) + text)
 
     @classmethod
     def from_bytes(cls, chunk: bytes | None) -> Receipt:
@@ -301,7 +288,7 @@ class Receipt:
         if chunk is None:
             raise ValueError("missing")
         try:
-            content = json.loads(unpacked(chunk)[8:])
+            content = json.loads(files.unpacked(chunk)[8:])
             failures = tuple(FailedCell(**failure) for failure in content["failures"])
             return cls(**content | {
                 "processors": tuple(content["processors"]), "failures": failures,
@@ -354,7 +341,7 @@ def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
 # A block's values are written first and its receipt last, so that a block is either complete or
 # absent.
 
-BEGUN = f"{RECEIPTS}/begun"
+BEGUN = f"{files.RECEIPTS}/begun"
 """Folder of a mark for each block that was begun and is not committed."""
 
 GOVERNING = {each.present_when.flag for each in VARIABLES.values() if each.present_when}
@@ -380,16 +367,16 @@ def begin_block(store: RunStore, block: Block) -> bool:
     with translate_errors(store.url, "written"):
         check_not_replaced(store)
         key = f"{BEGUN}/{store.blocks.number(block)}"
-        if sync(store.storage.exists(key)):
+        if files.sync(store.storage.exists(key)):
             return True
-        write_document(store.storage, key, {"pid": os.getpid(), "at": time.time()})
+        files.write_document(store.storage, key, {"pid": os.getpid(), "at": time.time()})
     return False
 
 
 def withdraw_block(store: RunStore, block: Block) -> None:
     """Delete the mark that a block was begun, if that can be: it did not end its process."""
     with contextlib.suppress(Exception):
-        sync(store.storage.delete(f"{BEGUN}/{store.blocks.number(block)}"))
+        files.sync(store.storage.delete(f"{BEGUN}/{store.blocks.number(block)}"))
 
 
 def write_block(
@@ -406,18 +393,18 @@ def write_block(
         if before is not None and before.basis == receipt.basis:
             withdraw_block(store, block)
             return before  # another worker was given it, too, perhaps of another processor
-        delete_files(store.storage, [receipt_key(number)])
+        files.delete_files(store.storage, [receipt_key(number)])
         checksums = {}
         for together in in_writing_order(store.variables):
             contents = {}
             for name in together:
                 content = store.chunks.encoded(name, values[name])
                 contents[store.chunks.key(name, number)] = content
-                checksums[name] = checksum_of(content)
-            write_files(store.storage, contents)
+                checksums[name] = files.checksum_of(content)
+            files.write_files(store.storage, contents)
         receipt = dataclasses.replace(receipt, checksums=checksums, block=number)
         check_not_replaced(store)
-        write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
+        files.write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
         withdraw_block(store, block)
     return receipt
 
@@ -439,7 +426,7 @@ def drop_block(store: RunStore, block: Block) -> None:
     names = itertools.chain(*in_writing_order(store.variables))
     keys = [store.chunks.key(name, number) for name in names]
     with translate_errors(store.url, "written"):
-        delete_files(store.storage, [receipt_key(number), *reversed(keys)])
+        files.delete_files(store.storage, [receipt_key(number), *reversed(keys)])
 
 
 def check_not_replaced(store: RunStore) -> None:
@@ -447,7 +434,7 @@ def check_not_replaced(store: RunStore) -> None:
     if is_remote(store.url):
         current = remote_run_id(store.url)
     else:
-        root = read_json(LocalStore(store.url, read_only=True), "zarr.json")
+        root = files.read_json(LocalStore(store.url, read_only=True), "zarr.json")
         current = run_metadata_in(root["attributes"]).get("run_id") if root else None
     if current != store.run_id:
         raise StoreReplacedError(
@@ -457,7 +444,7 @@ def check_not_replaced(store: RunStore) -> None:
 
 def committed(store: RunStore) -> set[int]:
     """Return the numbers of the blocks that are committed."""
-    names = list_folder(store.storage, f"{RECEIPTS}/c")
+    names = files.list_folder(store.storage, f"{files.RECEIPTS}/c")
     numbers = {int(name) for name in names if name.isascii() and name.isdecimal()}
     return {number for number in numbers if number < len(store.blocks)}
 
@@ -495,7 +482,7 @@ def receipts_or_faults(
     ordered = sorted(numbers)
     for start in range(0, len(ordered), RECEIPTS_AT_ONCE):
         some = ordered[start : start + RECEIPTS_AT_ONCE]
-        contents = read_files(store.storage, [receipt_key(number) for number in some])
+        contents = files.read_files(store.storage, [receipt_key(number) for number in some])
         for number, content in zip(some, contents, strict=True):
             try:
                 receipt = Receipt.from_bytes(content)
@@ -514,7 +501,7 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     missing: dict[int, str] = {}
     for variable in store.variables:
         keys = {store.chunks.key(variable.name, number): number for number in numbers}
-        for key in absent_files(store.storage, keys, f"{variable.name}/c"):
+        for key in files.absent_files(store.storage, keys, f"{variable.name}/c"):
             missing.setdefault(keys[key], key)
     return missing
 

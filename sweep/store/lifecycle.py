@@ -26,7 +26,7 @@ from zarr.abc.store import Store
 from zarr.dtype import parse_dtype
 from zarr.storage import LocalStore, MemoryStore
 
-from sweep.errors import PipelineError, StoreError
+from sweep.errors import StoreError, SweepError
 from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
@@ -726,13 +726,15 @@ def names_store(path: str | os.PathLike[str]) -> bool:
     return "://" in os.fspath(path) or Path(path).is_dir()
 
 
-def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> Pipeline:
-    """Return the pipeline of a TOML file, or that of a store.
+def read_pipeline(
+    source: Pipeline | str | os.PathLike[str], settings: Sequence[str] = ()
+) -> Pipeline:
+    """Return the pipeline of a TOML file or of a store, or a pipeline with other settings.
 
     Parameters
     ----------
-    path
-        A TOML file, or the path or URL of a store.
+    source
+        A TOML file, the path or URL of a store, or a pipeline.
     settings
         "key=value" with TOML values, as ``--set`` takes them.
 
@@ -743,24 +745,39 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
     StoreError
         If the store cannot be read.
     """
-    if not names_store(path):
-        return Pipeline.from_toml(os.fspath(path), settings)
-
-    url = os.fspath(path)
+    if isinstance(source, Pipeline):
+        return _with_settings(source, settings, source.source)
+    if not names_store(source):
+        return Pipeline.from_toml(os.fspath(source), settings)
+    url = os.fspath(source)
     if "://" not in url and not (Path(url) / "zarr.json").exists():
         raise refusal([f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
-    stored = open_store(url).pipeline
+    return _with_settings(open_store(url).pipeline, settings, f"{url} (its pipeline)")
+
+
+def _with_settings(pipeline: Pipeline, settings: Sequence[str], source: str) -> Pipeline:
     return Pipeline.from_text(
-        stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",
-        folder=stored.folder,
-    )
+        pipeline.text, settings, name=pipeline.name, source=source, folder=pipeline.folder)
+
+
+def document_of(
+    source: Pipeline | str | os.PathLike[str], settings: Sequence[str] = ()
+) -> dict[str, Any] | None:
+    """Return the document of a pipeline, its file or its store; None if it cannot be read."""
+    try:
+        if isinstance(source, Pipeline):
+            text = source.text
+        elif names_store(source):
+            text = open_store(os.fspath(source)).pipeline.text
+        else:
+            text = read_regular(os.fspath(source), MAX_BYTES).decode()
+        document = read_document(text)
+        apply_settings(document, parse_settings(settings))
+    except (OSError, ValueError, SweepError):
+        return None
+    return document
 
 
 def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
     """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
-    try:
-        document = read_document(read_regular(os.fspath(path), MAX_BYTES).decode())
-        apply_settings(document, parse_settings(settings))
-    except (OSError, ValueError, PipelineError):
-        return []
-    return texts_in(document)
+    return texts_in(document_of(path, settings) or {})

@@ -166,14 +166,9 @@ def remote_run_id(url: str) -> str | None:
         except (TypeError, ValueError, AttributeError, NotImplementedError) as error:
             raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
     run_id = pointer.attrs.get(POINTER)
-    if not isinstance(run_id, str) or not is_run_id(run_id):
+    if not isinstance(run_id, str) or not re.fullmatch("[0-9a-f]{32}", run_id):
         raise StoreError(not_a_store(url))
     return run_id
-
-
-def is_run_id(text: str) -> bool:
-    """Return whether a text has the form of a run's id."""
-    return re.fullmatch("[0-9a-f]{32}", text) is not None
 
 
 def exists(url: str) -> bool:

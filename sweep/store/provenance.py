@@ -82,26 +82,21 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
     StoreError
         If OpenCV cannot be used.
     """
+    where_there_are = {
+        "sampling": "" if pipeline.sampling == SAMPLINGS[0] else pipeline.sampling,
+        # Of distributions that plug-ins depend on; a file is in ``files``.
+        "plugins": {each.name: dict(each.versions) for each in pipeline.plugins if each.versions},
+        # In the order in which they act.
+        "effects": [each.name for each in pipeline.plugins if each.kind == "effect"],
+    }
     return {
         "numbers": NUMBERS_VERSION,
         **versions(),
         "builds": dict(builds()),
         "seed": pipeline.seed,
-        **({} if pipeline.sampling == SAMPLINGS[0] else {"sampling": pipeline.sampling}),
         "files": dict(sorted(pipeline.files.items())),
-        **({"plugins": versions_used} if (versions_used := plugin_versions(pipeline)) else {}),
-        **({"effects": effects} if (effects := effects_in_order(pipeline)) else {}),
+        **{name: value for name, value in where_there_are.items() if value},
     }
-
-
-def effects_in_order(pipeline: Pipeline) -> list[str]:
-    """Return the names of the plug-ins' effects in the order in which they act."""
-    return [each.name for each in pipeline.plugins if each.kind == "effect"]
-
-
-def plugin_versions(pipeline: Pipeline) -> dict[str, dict[str, str]]:
-    """Return the versions of distributions that plug-ins depend on; a file is in ``files``."""
-    return {each.name: dict(each.versions) for each in pipeline.plugins if each.versions}
 
 
 def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:

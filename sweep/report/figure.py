@@ -21,7 +21,6 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
-from numpy.typing import ArrayLike
 
 from sweep.report.output_file import write_output_file
 from sweep.report.table import Bin, Column, Coordinate, Table, Value, cell_text, coordinates
@@ -38,10 +37,7 @@ SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 INK, FAINT, RULE, STRIP, PAPER = "#282828", "#7a7a7a", "#e6e6e6", "#f3f3f3", "#ffffff"
 """Text; secondary text and lines; grid lines; shaded areas; background."""
 
-DASHES: tuple[Any, ...] = (
-    "-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (8, 3)), (0, (3, 1.5)), "-",
-)
-"""Of the lines of a figure; the last stands with black."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 MATPLOTLIB_STYLE: Any = {
     "svg.fonttype": "none",
@@ -61,13 +57,10 @@ MATPLOTLIB_STYLE: Any = {
 """Settings of matplotlib in which every panel is drawn."""
 
 WIDTH, HEIGHT, LINE_HEIGHT = 4.4, 3.2, 0.15
-"""Inches of a panel, and of a line of its legend; a wide panel has twice the width."""
+"""Inches of a panel, and of a line of its legend."""
 
 COLUMNS = 2
 DOTS_PER_INCH = 150
-
-WIDE_FROM = 8
-"""A panel alone takes the whole width if it has more groups along x."""
 
 MAX_LINES, MAX_PANELS, MAX_DOTS = 7, 4, 40
 """Lines of a panel, panels of a column, and rows of dots."""
@@ -116,13 +109,11 @@ class Figure:
         a row of dots.
     by
         Column whose values have a line each; the other columns that name a row tell panels apart.
+        Rows of dots differ by it if it names no row.
     rows
         Rows of dots that are drawn at most.
-    marked
-        Column whose rows that say yes are drawn as diamonds.
     labels
-        Column whose texts stand beside points. The lines are then points, and steps where ``by``
-        says yes.
+        Column whose texts stand beside points; those are joined of which ``by`` says yes.
     covers
         Axes that need no figure of their own beside this one.
     """
@@ -135,7 +126,6 @@ class Figure:
     x: str = ""
     by: str = ""
     rows: int = MAX_DOTS
-    marked: str = ""
     labels: str = ""
     covers: Sequence[str] = ()
 
@@ -145,47 +135,41 @@ class Figure:
         curves = [each for each in self.curves if each.heading in self.table.headings]
         stub = self.table.headings[: self.table.stub]
         rows = self.table.frame.to_dict("records")
+        by = [self.by] if self.by else []
         if not self.x or any(isinstance(row[self.x], str) for row in rows):
-            return [self._dots(curve, rows[: self.rows]) for curve in curves]
+            names = [", ".join(cell_text(row[name]) for name in stub) for row in rows[: self.rows]]
+            dots = [{**row, PLACE: k} for k, row in enumerate(rows[: self.rows])]
+            by = [] if self.by in stub else by
+            return [Panel(heading_title(curve), self._lines(curve, dots, PLACE, by), "", curve,
+                          names) for curve in curves]
         parts = _groups(rows, [name for name in stub if name not in (self.x, self.by, self.labels)])
-        alone = len(curves) * len(parts) == 1
-        return [self._lines(curve, words, part, alone=alone)
+        return [Panel(heading_title(curve) + (f", {words}" if words else ""),
+                      self._lines(curve, part, self.x, by), self.x, curve)
                 for curve in curves for words, part in itertools.islice(parts.items(), MAX_PANELS)]
 
     def _lines(
-        self, curve: Column, words: str, rows: Sequence[dict[str, Any]], *, alone: bool
-    ) -> Panel:
-        lines = [self._series(curve, name, sorted(group, key=lambda row: position(row[self.x])))
-                 for name, group in itertools.islice(
-                     _groups(rows, [self.by] if self.by else []).items(), MAX_LINES)]
-        title = heading_title(curve.heading) + (f", {words}" if words else "")
-        several = len({position(row[self.x]) for row in rows}) > WIDE_FROM
-        return Panel(title, lines, self.x, curve, wide=alone and several)
-
-    def _series(self, curve: Column, name: str, rows: Sequence[dict[str, Any]]) -> Series:
-        """Return a line; of points with names, those that ``by`` says yes of are joined."""
-        known = [row for row in rows if not math.isnan(value_of(row[curve.heading]).value)]
-        x, values = [position(row[self.x]) for row in known], [row[curve.heading] for row in known]
-        if not self.labels:
-            return Series.of(name, x, values)
-        texts = [cell_text(row[self.labels]) for row in known]
-        joined = bool(rows[0][self.by]) if self.by else False
-        return Series.of(self.by if joined else f"not {self.by}", x, values, texts,
-                         "steps" if joined else "points")
-
-    def _dots(self, curve: Column, rows: Sequence[dict[str, Any]]) -> Panel:
-        names = [", ".join(cell_text(row[name]) for name in self.table.headings[: self.table.stub])
-                 for row in rows]
-        marks = [bool(self.marked) and cell_text(row[self.marked]) == "yes" for row in rows]
-        series = []
-        for mark in (False, True):
-            at = [k for k, marked in enumerate(marks) if marked == mark]
-            series.append(
-                Series.of("", at, [rows[k][curve.heading] for k in at], style="points"))
-        return Panel(heading_title(curve.heading), series, "", curve, names)
+        self, curve: Column, rows: Sequence[dict[str, Any]], x: str, by: Sequence[str]
+    ) -> list[Line]:
+        """Return a line for each value of ``by``, of the rows with a number."""
+        lines = []
+        for label, part in itertools.islice(_groups(rows, by).items(), MAX_LINES):
+            known = sorted((row for row in part if not math.isnan(value_of(row[curve.heading])[0])),
+                           key=lambda row: position(row[x]))
+            style = "points" if x == PLACE else "line"
+            if self.labels:
+                style = "steps" if label == self.by else "points"
+            numbers = np.array([(position(row[x]), *value_of(row[curve.heading])) for row in known])
+            at, values, low, high = numbers.reshape(-1, 4).T
+            texts = [cell_text(row[self.labels]) for row in known] if self.labels else []
+            lines.append(Line(label, at, values, low, high, texts, style))
+        return lines
 
 
-class Series(NamedTuple):
+PLACE = "place"
+"""Of rows of dots: their number."""
+
+
+class Line(NamedTuple):
     """Values (n,) along a line, or in rows of dots, with the ends of their intervals or NaN.
 
     ``style`` is "line", "points" or "steps".
@@ -196,18 +180,8 @@ class Series(NamedTuple):
     values: Floats
     low: Floats
     high: Floats
-    texts: Sequence[str] = ()
-    style: str = "line"
-
-    @classmethod
-    def of(
-        cls, label: str, at: ArrayLike, cells: Sequence[Any], texts: Sequence[str] = (),
-        style: str = "line",
-    ) -> Series:
-        """Return the series of cells of a table."""
-        values, low, high = np.array(
-            [value_of(cell) for cell in cells], dtype=np.float64).reshape(-1, 3).T
-        return cls(label, np.asarray(at, dtype=np.float64), values, low, high, texts, style)
+    texts: Sequence[str]
+    style: str
 
 
 def _groups(
@@ -222,11 +196,13 @@ def _groups(
 
 
 def _named(heading: str, cell: Any) -> str:
-    """Return a cell as the name of a line or panel: numbers with their column's words."""
-    text = cell_text(cell)
+    """Return a cell as the name of a line or panel: what is no word with its column's words."""
+    if isinstance(cell, bool):
+        return heading if cell else f"not {heading}"
     if isinstance(cell, str):
-        return text
+        return cell
     words, _, unit = heading.rpartition(", ")
+    text = cell_text(cell)
     return f"{words} {text}\u00b0" if unit == "deg" else f"{words or heading} {text}"
 
 
@@ -242,9 +218,9 @@ def value_of(cell: Any) -> Value:
     return cell if isinstance(cell, Value) else Value(math.nan if cell is None else float(cell))
 
 
-def heading_title(heading: str) -> str:
+def heading_title(column: Column) -> str:
     """Return a column's heading as the title of a panel: its words, without the unit."""
-    words = heading.rpartition(", ")[0] or heading
+    words = column.heading.rpartition(", ")[0] or column.heading
     return words[:1].upper() + words[1:]
 
 
@@ -260,7 +236,7 @@ class Panel:
     ----------
     title
         Stands above it.
-    series
+    lines
         What is drawn.
     place
         Name of the axis along which values stand.
@@ -268,30 +244,27 @@ class Panel:
         Name, scale and reference of the values' axis.
     names
         Of rows of dots, the first at the top; without any, lines go along x.
-    wide
-        Whether it takes the whole width of the page.
     """
 
     title: str
-    series: Sequence[Series]
+    lines: Sequence[Line]
     place: str
     curve: Column
     names: Sequence[str] = ()
-    wide: bool = False
 
     @property
     def height(self) -> float:
         """Its height in inches; the legend takes none of the room of few lines."""
         if self.names:
             return max(1.6, 0.9 + 0.19 * len(self.names))
-        lines = math.ceil(len(self.series) / self.legend_columns)
+        lines = math.ceil(len(self.lines) / self.legend_columns)
         return HEIGHT + LINE_HEIGHT * max(0, lines - 2)
 
     @property
     def legend_columns(self) -> int:
         """Entries of the legend that stand side by side."""
-        longest = max((len(line.label) for line in self.series), default=0)
-        return max(1, min(len(self.series), LEGEND_CHARS // (longest + 6)))
+        longest = max((len(line.label) for line in self.lines), default=0)
+        return max(1, min(len(self.lines), LEGEND_CHARS // (longest + 6)))
 
     @property
     def alt(self) -> str:
@@ -301,30 +274,42 @@ class Panel:
 
     def draw(self, axes: Axes) -> None:
         """Draw it on empty axes; infinite values stand at the edge."""
-        along = "x" if self.names else "y"
-        logarithmic, limits = value_scale(
-            self.series, share=self.curve.share, level=self.curve.level)
+        rows, curve = bool(self.names), self.curve
+        logarithmic, limits = value_scale(self.lines, share=curve.share, level=curve.level)
+        along = "x" if rows else "y"
         axes.set(**{f"{along}scale": "log" if logarithmic else "linear", f"{along}lim": limits,
-                    f"{along}label": self.curve.heading})
-        plain_ticks(axes.xaxis if self.names else axes.yaxis, logarithmic=logarithmic,
-                    share=self.curve.share)
-        (self._rows if self.names else self._places)(axes)
-        for k, line in enumerate(self.series):
-            shift = 0.0 if self.names or line.texts else DODGE * (k - (len(self.series) - 1) / 2)
-            _draw_series(axes, line, k, limits, shift, rows=bool(self.names))
-        if self.curve.level is not None:
-            (axes.axvline if self.names else axes.axhline)(self.curve.level, **REFERENCE)
-        if not any(np.isfinite(line.values).any() for line in self.series):
+                    f"{along}label": curve.heading})
+        plain_ticks(axes.xaxis if rows else axes.yaxis, logarithmic=logarithmic, share=curve.share)
+        if rows:
+            axes.set_ylim(len(self.names) - 0.4, -0.6)
+            axes.set_yticks(range(len(self.names)), [
+                name if len(name) <= ROW_CHARS else name[: ROW_CHARS - 1] + "\u2026"
+                for name in self.names])
+            axes.tick_params(axis="y", length=0)
+        else:
+            x = np.unique(np.concatenate([line.at for line in self.lines]))
+            logarithmic = is_logarithmic(x)
+            axes.set(xscale="log" if logarithmic else "linear", xlabel=self.place,
+                     xlim=value_limits(x, logarithmic=logarithmic, margin=0.05))
+            plain_ticks(axes.xaxis, logarithmic=logarithmic)
+            if 0 < x.size <= MAX_OWN_TICKS and not any(line.texts for line in self.lines):
+                axes.set_xticks(x, coordinates(x.tolist()))
+        axes.grid(visible=True, axis="x" if rows else "both")
+        for k, line in enumerate(self.lines):
+            shift = 0.0 if rows or line.texts else DODGE * (k - (len(self.lines) - 1) / 2)
+            _draw_line(axes, line, k, limits, shift, rows=rows)
+        if curve.level is not None:
+            (axes.axvline if rows else axes.axhline)(curve.level, **REFERENCE)
+        if not any(np.isfinite(line.values).any() for line in self.lines):
             axes.text(0.5, 0.5, "no finite values", transform=axes.transAxes, ha="center",
                       va="center", color=FAINT)
         for artist in (*axes.lines, *axes.collections):
             artist.set_in_layout(False)  # the labels alone are laid out
         _name_points(axes, [
-            (x, min(y, limits[1]), text) for line in self.series
+            (x, min(y, limits[1]), text) for line in self.lines
             if line.style == "steps" or len(line.texts) <= MAX_NAMED
             for x, y, text in zip(line.at, line.values, line.texts, strict=False)])
-        labels = [line.label for line in self.series if line.label]
-        if len(labels) < 2:
+        if len(self.lines) < 2:
             axes.set_title(self.title)
             return
         axes.legend(
@@ -334,39 +319,21 @@ class Panel:
             handlelength=2.2, columnspacing=1.1, handletextpad=0.5, labelspacing=0.25,
             borderpad=0.2)
 
-    def _rows(self, axes: Axes) -> None:
-        axes.set_ylim(len(self.names) - 0.4, -0.6)
-        axes.set_yticks(range(len(self.names)), [
-            name if len(name) <= ROW_CHARS else name[: ROW_CHARS - 1] + "\u2026"
-            for name in self.names])
-        axes.tick_params(axis="y", length=0)
-        axes.grid(visible=True, axis="x")
 
-    def _places(self, axes: Axes) -> None:
-        x = np.unique(np.concatenate([line.at for line in self.series]))
-        logarithmic = is_logarithmic(x)
-        axes.set(xscale="log" if logarithmic else "linear", xlabel=self.place,
-                 xlim=value_limits(x, logarithmic=logarithmic, margin=0.05))
-        plain_ticks(axes.xaxis, logarithmic=logarithmic)
-        if 0 < x.size <= MAX_OWN_TICKS and not any(line.texts for line in self.series):
-            axes.set_xticks(x, coordinates(x.tolist()))
-        axes.grid(visible=True)
-
-
-def _draw_series(
-    axes: Axes, line: Series, number: int, limits: tuple[float, float], shift: float, *, rows: bool
+def _draw_line(
+    axes: Axes, line: Line, number: int, limits: tuple[float, float], shift: float, *, rows: bool
 ) -> None:
-    """Draw one series with its intervals, moved by some points; ``rows`` exchanges x and y."""
-    colour, shape = COLOURS[number % len(COLOURS)], SHAPES[number % len(SHAPES)]
-    shape = "oD"[number] if rows else shape
+    """Draw one line with its intervals, moved by some points; ``rows`` exchanges x and y."""
+    shape = "oD"[number % 2] if rows else SHAPES[number % len(SHAPES)]
     moved = offset_copy(axes.transData, axes.get_figure(root=True), shift, 0, "points")
     finite = np.isfinite(line.values)
     # If only one end is known, the other lies beyond all draws, at the edge.
     low = np.where(np.isnan(line.low) & ~np.isnan(line.high), -np.inf, line.low)
     high = np.where(np.isnan(line.high) & ~np.isnan(line.low), np.inf, line.high)
+    look: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)], "transform": moved}
     (axes.hlines if rows else axes.vlines)(
         line.at[finite], np.clip(low, *limits)[finite], np.clip(high, *limits)[finite],
-        color=colour, linewidth=1, alpha=0.8, zorder=2, transform=moved)
+        linewidth=1, alpha=0.8, zorder=2, **look)
     # Infinite values are gaps of a line, and hollow points at the edge.
     clipped, joined = np.clip(line.values, *limits), line.style != "points"
     for part, values, options in (
@@ -378,8 +345,8 @@ def _draw_series(
             "linestyle": "", "markerfacecolor": PAPER, "clip_on": False, "zorder": 4}),
     ):
         at, shown = line.at[part], values[part]
-        axes.plot(*((shown, at) if rows else (at, shown)), color=colour, marker=shape,
-                  markersize=5, transform=moved, **options)
+        axes.plot(*((shown, at) if rows else (at, shown)), marker=shape, markersize=5, **look,
+                  **options)
 
 
 def _name_points(axes: Axes, named: Sequence[tuple[float, float, str]]) -> None:
@@ -409,13 +376,12 @@ def write_figure(figures: Sequence[Figure], path: Path) -> None:
 
 def panels_file(panels: Sequence[Panel], suffix: str) -> bytes:
     """Return a picture of all panels as the content of a file: ".svg" or ".png"."""
-    wide = any(panel.wide for panel in panels)
-    columns = 1 if wide else min(len(panels), COLUMNS)
-    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    heights = [max(panel.height for panel in row) for row in rows]
+    columns = min(len(panels), COLUMNS)
+    heights = [max(panel.height for panel in panels[k : k + columns])
+               for k in range(0, len(panels), columns)]
     with mpl.rc_context(MATPLOTLIB_STYLE):
-        canvas = Canvas((columns * WIDTH * (2 if wide else 1), sum(heights)))
-        grid = canvas.add_gridspec(len(rows), columns, height_ratios=heights)
+        canvas = Canvas((columns * WIDTH, sum(heights)))
+        grid = canvas.add_gridspec(len(heights), columns, height_ratios=heights)
         for k, panel in enumerate(panels):
             panel.draw(canvas.add_subplot(grid[k // columns, k % columns]))
         encoded = io.BytesIO()
@@ -468,13 +434,13 @@ def value_limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[f
 
 
 def value_scale(
-    series: Sequence[Series], *, share: bool, level: float | None = None
+    lines: Sequence[Line], *, share: bool, level: float | None = None
 ) -> tuple[bool, tuple[float, float]]:
     """Return whether the axis of a chart's values is logarithmic, and its ends.
 
     Parameters
     ----------
-    series
+    lines
         Values with their intervals.
     share
         Whether the values are shares in percent, whose axis is always the same.
@@ -484,8 +450,8 @@ def value_scale(
     if share:
         return False, (-3.0, 103.0)
     values = np.concatenate(
-        [line.values for line in series] + [[] if level is None else [level]])
-    ends = np.concatenate([end for line in series for end in (line.low, line.high)])
+        [line.values for line in lines] + [[] if level is None else [level]])
+    ends = np.concatenate([end for line in lines for end in (line.low, line.high)])
     logarithmic = spans(values, LOGARITHMIC_FROM) and (level is None or level > 0)
     if logarithmic:
         positive = values[np.isfinite(values) & (values > 0)]

@@ -355,7 +355,7 @@ def _ranking(data: ReportData) -> Figure | None:
             f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
             "rate expected if all were alike, with an adjusted p-value under 0.05.",
             data.pooled(*dims)),
-        table, [DETECTED], rows=WEAKEST, marked="weak", covers=(IDS,))
+        table, [DETECTED], by="weak", rows=WEAKEST, covers=(IDS,))
 
 
 SIZE_COLUMNS = 12

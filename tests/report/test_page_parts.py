@@ -107,7 +107,7 @@ def test_names_are_rows_of_dots_never_joined_and_marked_ones_are_diamonds():
     table = Table.of("Rates", ["target", RATE.heading, "weak"], [
         ["a", Value(10), False], ["b", Value(np.nan), False], ["c", Value(30), True]])
     for x in ("", "target"):
-        (title,), (axes,) = drawn(table, x, marked="weak")
+        (title,), (axes,) = drawn(table, x, by="weak")
         assert title == "Rate"
         assert [text.get_text() for text in axes.get_yticklabels()] == ["a", "b", "c"]
         dots = [line for line in axes.lines if len(line.get_xdata())]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
@@ -127,13 +127,13 @@ def answer(data: ReportData) -> Answer:
     one = known.summary.isel({CONFIGURATION: compared.best})
     tiles = tuple(_tile(one, card) for card in CARDS)
     name = compared.name if known.several else ""
+    tables, details, numbers = ((), (), {}) if decided is None else decided[2:]
     return Answer(
         _headline(data, decided, compared, tiles), _notes(data, known), name, tiles,
-        (*(decided.tables if decided is not None else ()), compared.table()),
-        (*(decided.details if decided is not None else ()), *board_tables(data),
-         errors_table(one, name), signed_errors_table(data),
+        (*tables, compared.table()),
+        (*details, *board_tables(data), errors_table(one, name), signed_errors_table(data),
          *threshold_tables(data), *precision_tables(data), *error_model_tables(data)),
-        _numbers(decided, compared))
+        {"comparison": compared.as_json(), **numbers})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -143,35 +143,29 @@ ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not
 """Decisions, the best first."""
 
 
-@dataclass(frozen=True, eq=False)
-class Required:
+class Required(NamedTuple):
     """The decisions on all requirements.
 
     Attributes
     ----------
     line
         The answer in one line.
+    best
+        Number of the configuration that is named.
     tables
         How far, and the decisions, by configuration.
     details
         The decisions at each condition, of the configuration that is named.
-    best
-        Number of the configuration that is named.
-    decision
-        Its decision on all requirements at all conditions.
-    verdicts
-        As `sweep require` prints them, of all configurations.
-    limits
-        As `sweep limit` prints them, at all conditions together; None without an axis.
+    numbers
+        For JSON: the decision on all together of the configuration that is named, verdicts as
+        `sweep require` and limits as `sweep limit` prints them.
     """
 
     line: str
+    best: int
     tables: tuple[Table, ...]
     details: tuple[Table, ...]
-    best: int
-    decision: Decision
-    verdicts: tuple[Verdict, ...]
-    limits: xr.Dataset | None
+    numbers: Mapping[str, Any]
 
 
 def required(data: ReportData) -> Required:
@@ -209,11 +203,12 @@ def required(data: ReportData) -> Required:
     line = f"{' and '.join(data.require)}: {_decided(found[best], decisions[best])}"
     if limits:
         line += _reached([part.isel(positions[best]) for part in limits], others)
-    every = tuple(verdicts(table))
+    every = verdicts(table)
     return Required(
-        f"{line}{whose}.", (*map(limit_table, limits), decision_table(every)),
-        (condition_table(found[best], table, every=True),), best, decisions[best], every,
-        limits[0] if limits else None)
+        f"{line}{whose}.", best, (*map(limit_table, limits), decision_table(every)),
+        (condition_table(found[best], table, every=True),),
+        {"decision": decisions[best], "requirements": every,
+         "limits": limits_as_json(limits[0]) if limits else None})
 
 
 def _decided(found: Sequence[Verdict], decision: Decision) -> str:
@@ -275,16 +270,6 @@ def _notes(data: ReportData, known: Configurations) -> str:
         "A board counts as detected if at least one of its markers is."
         if data.pipeline.shows_boards else "",
         interval_note(data), notes_of(data, {}), data.pooled(*known.axes))
-
-
-def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:
-    """Return the numbers behind the line as JSON values."""
-    numbers: dict[str, Any] = {"comparison": compared.as_json()}
-    if decided is not None:
-        numbers |= {
-            "decision": decided.decision, "requirements": list(decided.verdicts),
-            "limits": None if decided.limits is None else limits_as_json(decided.limits)}
-    return numbers
 
 
 def _tile(one: xr.Dataset, column: Column) -> Tile:

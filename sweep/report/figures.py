@@ -34,7 +34,6 @@ from sweep.report.comparison import trade_lines
 from sweep.report.figure import MAX_LINES, Figure
 from sweep.report.report_data import (
     AREA,
-    BOTH,
     CONFIGURATION,
     IDS,
     Groups,
@@ -89,22 +88,11 @@ INFINITE_ERRORS = (
     "In median and p95 a pose that is not solved counts as an infinite error (drawn at the edge); "
     "an interval that reaches the edge ends beyond all draws.")
 
-SHORT_NAMES = {AREA: "area", "side_px": "size", "distance_m": "distance", "size_m": "marker size"}
-"""Names of the measures of size in titles and sentences."""
-
-MIN_BINNED_SIZES = 20
-"""From this many sizes on, the detection rate is drawn against bins of the area."""
-
 MAX_BINS = 40
 """Groups of a numeric axis."""
 
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
 """Angles that are lines of one configuration, and panels of several."""
-
-
-def short_name(name: str) -> str:
-    """Return the name of an axis as it stands in titles."""
-    return SHORT_NAMES.get(name, name)
 
 
 def sentences(*parts: str) -> str:
@@ -160,49 +148,37 @@ def figure(
         data.label(dims[-1]) if dims else "", by, covers=covers)
 
 
-def groups_along(
-    data: ReportData, along: str, stages: Sequence[Stage] = BOTH, *, angles: bool = True
-) -> Groups:
-    """Return the groups along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
-    groups = data.along(along, MAX_BINS)
-    if not (angles and data.angle_axis) or along == data.angle_axis:
-        return groups
-    # Angles are lines of one configuration, and panels of several.
-    compared = (*data.pipeline.experiment.target_axes, *data.pipeline.axes_of(*stages))
-    several = any(len(axis) > 1 and axis.name != along for axis in compared)
-    return {**data.along(data.angle_axis, MAX_ANGLE_PANELS if several else MAX_ANGLES), **groups}
-
-
 # --------------------------------------------------------------------------------------------------
 # The figures.
 
 
-def _detection(data: ReportData) -> Figure | None:
-    if data.size is None:
-        return None
-    axis, stages = data.size_axis, (Stage.detection,)
-    along = AREA if axis is None or data.length(axis) >= MIN_BINNED_SIZES else axis
-    word = data.pipeline.target_word
-    detected = f"the {word} is detected" + (", by at least one marker" * (word != "marker"))
-    groups = groups_along(data, along, stages)
-    return figure(
-        data, grouped(data, detection_rate, groups, stages), groups, "detection",
-        f"Detection rate by {short_name(along)}",
-        f"Share of the poses looked for in which {detected}.", "Detection rate",
-        (*RATES, Column("draws", "draws")), [DETECTED], covers=data.size_axes)
+def _by_size(data: ReportData) -> Figure | None:
+    return None if data.size is None else _along(data, data.size)
 
 
-def _errors(data: ReportData) -> Figure | None:
-    if data.size is None:
-        return None
-    groups = groups_along(data, data.size)
+def _along(data: ReportData, name: str) -> Figure:
+    """Return the figure of rates and errors along an axis, the area, or a drawn parameter.
+
+    Along the size each angle is apart: a line of one configuration, a panel of several.
+    """
+    axis, target = data.pipeline.axis(name), data.pipeline.target_word
+    meaning = axis.meaning if axis is not None else (
+        "in the image" if name == AREA else data.pipeline.parameters[name].meaning)
+    groups = data.along(name, MAX_BINS)
+    if data.angle_axis and name == data.size:
+        several = data.setting_axes or data.pipeline.experiment.target_axes
+        most = MAX_ANGLE_PANELS if several else MAX_ANGLES
+        groups = {**data.along(data.angle_axis, most), **groups}
     return figure(
-        data, grouped(data, error_statistics, groups), groups, "errors",
-        f"Errors of the pose by {short_name(data.size)}",
-        "Median and 95 % quantile (p95) of the rotation error and of the range error (depth, "
-        "relative to the true depth), and the solved poses that are nearer to the mirror of the "
-        f"truth (flips; they hardly differ if it is frontal). {INFINITE_ERRORS}", "Errors",
-        (LOOKED_FOR, *ERRORS), (*ERROR_CURVES, FLIPS), covers=data.size_axes)
+        data, grouped(data, error_statistics, groups), groups, f"by-{name}",
+        f"Rates and errors by {data.words(name)}",
+        f"Share of the poses looked for in which the {target} is detected"
+        + (", by at least one marker" * (target != "marker")) + ", median and 95 % quantile (p95) "
+        "of the rotation error and of the range error (depth, relative to the true depth), the "
+        "solved poses that are nearer to the mirror of the truth (flips; they hardly differ if it "
+        f"is frontal), and the range's mean error (bias), by {name} ({meaning}). {INFINITE_ERRORS}",
+        f"Errors by {data.words(name)}", (*RATES, *ERRORS),
+        [DETECTED, *ERROR_CURVES, FLIPS, RANGE_BIAS], covers=tuple(groups))
 
 
 def signed_error_statistics(
@@ -222,7 +198,7 @@ def _bias(data: ReportData) -> Figure | None:
     groups = data.along(along, MAX_BINS)
     return figure(
         data, grouped(data, signed_error_statistics, groups), groups, "bias",
-        f"Bias by {short_name(along)}",
+        f"Bias by {data.words(along)}",
         "Mean error of the solved poses that are not flipped, estimated minus true: the range in "
         "percent of the true depth; x (right), y (down) and z (forward) of the "
         f"{data.pipeline.target_word}'s position in the camera's frame; yaw. The table also has "
@@ -278,7 +254,7 @@ def _outcomes(data: ReportData) -> Figure:
     return figure(
         data, happened.assign(looked_for=total.broadcast_like(happened["count"])),
         {"outcome": None, **groups}, "failures", "Outcomes of the poses",
-        "Shares of the poses looked for" + (f", by {short_name(names[0])}" if names else "")
+        "Shares of the poses looked for" + (f", by {data.words(names[0])}" if names else "")
         + ": solved, or the flag that says why not."
         + (f" Not counted in the shares: {left_out}." if left_out else ""),
         "Outcomes", (LOOKED_FOR, share), [share], by="outcome")
@@ -460,8 +436,7 @@ def threshold_tables(data: ReportData) -> list[Table]:
 # The figures of a store, in the order in which they stand.
 
 FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
-    _detection, _errors, _bias, _configurations, _trade, _ambiguity, _outcomes, _frame, _ranking,
-    _bound,
+    _by_size, _bias, _configurations, _trade, _ambiguity, _outcomes, _frame, _ranking, _bound,
 )
 """Makers of figures, None for a store that a figure does not fit; add one here."""
 
@@ -471,22 +446,9 @@ def figures_of(data: ReportData) -> list[Figure]:
     made = [figure for make in FIGURES if (figure := make(data)) is not None]
     covered = {name for figure in made for name in figure.covers}
     return made + [
-        _effect(data, name)
+        _along(data, name)
         for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters)
         if name not in covered]
-
-
-def _effect(data: ReportData, name: str) -> Figure:
-    """Return the figure of rates and errors along an axis or a drawn parameter."""
-    axis = data.pipeline.axis(name)
-    meaning = data.pipeline.parameters[name].meaning if axis is None else axis.meaning
-    groups = data.along(name, MAX_BINS)
-    return figure(
-        data, grouped(data, error_statistics, groups), groups, f"effect-{name}",
-        f"The effect of {name}",
-        "Detection rate, median and 95 % quantile (p95) of rotation and range error, and signed "
-        f"mean of the range error (bias), by {name} ({meaning}). {INFINITE_ERRORS}", f"By {name}",
-        (*RATES, *ERRORS), [DETECTED, *ERROR_CURVES, RANGE_BIAS])
 
 
 # --------------------------------------------------------------------------------------------------

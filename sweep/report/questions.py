@@ -302,7 +302,7 @@ def write_report(
     --------
     >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
     >>> found.numbers["figures"], (folder / "report.html").exists()
-    (5, True)
+    (4, True)
     """
     output, figures = (
         None if each is None else os.fspath(each) for each in (output, figures))

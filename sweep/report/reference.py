@@ -5,8 +5,11 @@ The tables are made from the declarations that the code works by, so they cannot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any
+
+import pandas as pd
 
 from sweep.analysis.summaries import POSE_STATISTICS, error_headings
 from sweep.errors import ArgumentError
@@ -42,63 +45,54 @@ def reference(*names: str) -> Findings:
     >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
     'degree'
     """
-    parameters = [name for name in names if name not in TABLES]
-    for name in parameters:
+    chosen = [name for name in names if name not in TABLES]
+    for name in chosen:
         if name not in PARAMETERS:
             raise ArgumentError(
                 "names", name,
                 f"expected {', '.join(TABLES)}, or a parameter"
                 + nearest(name, [*TABLES, *PARAMETERS]))
     tables = [TABLES[name]() for name in names if name in TABLES]
-    if parameters:
-        tables.append(_parameter_table(
-            "parameters", [PARAMETERS[name] for name in dict.fromkeys(parameters)]))
+    if chosen:
+        tables.append(_parameters("parameters", [PARAMETERS[name] for name in chosen]))
     if not names:
-        tables = [_table("subjects", ["subject", "rows"],
-                         [[name, str(len(make().frame))] for name, make in TABLES.items()])]
+        tables = [_table("subjects", ({"subject": name, "rows": str(len(make().frame))}
+                                      for name, make in TABLES.items()))]
     numbers = {table.caption: table.as_json()["rows"] for table in tables}
     return Findings(tables, numbers, then=("sweep reference NAME", "prints a table, or a parameter")
                     if not names else ("", ""))
 
 
-def _table(caption: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    return Table.of(caption, headings, rows, words=True)
+def _table(caption: str, rows: Iterable[dict[str, str]]) -> Table:
+    """Return a table of rows by their headings."""
+    return Table(caption, pd.DataFrame(list(rows), dtype=object), words=True)
 
 
-def _parameter_table(caption: str, parameters: Sequence[Parameter]) -> Table:
+def _parameters(caption: str, parameters: Iterable[Parameter]) -> Table:
     """Return parameters with default, unit, values and meaning."""
-    return _table(caption, ["parameter", "default", "unit", "values", "meaning"],
-                  [_parameter_row(parameter) for parameter in parameters])
+    return _table(caption, ({
+        "parameter": each.name, "default": _default(each.default), "unit": each.unit,
+        "values": ("a predefined dictionary of the installed OpenCV" if each.name == "dictionary"
+                   else each.expected()) + "; can be drawn" * each.drawable,
+        "meaning": each.meaning} for each in parameters))
 
 
-def _section_table(section: str) -> Table:
-    _, stage = SECTIONS[section]
-    return _parameter_table(f"[{section}] ({stage.name})",
-                            [p for p in PARAMETERS.values() if p.section == section])
+def _default(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else label(value)
 
 
-def _parameter_row(parameter: Parameter) -> list[str]:
-    default = parameter.default
-    if default is None:
-        shown = "-"
-    elif isinstance(default, bool):
-        shown = str(default).lower()
-    else:
-        shown = f"{default:g}" if isinstance(default, float) else label(default)
-    values = parameter.expected()
-    if parameter.name == "dictionary":
-        values = "a predefined dictionary of the installed OpenCV"
-    drawable = "; can be drawn" if parameter.drawable else ""
-    return [parameter.name, shown, parameter.unit, f"{values}{drawable}",
-            parameter.meaning]
+def _section(section: str) -> Table:
+    return _parameters(f"[{section}] ({SECTIONS[section][1].name})",
+                       (each for each in PARAMETERS.values() if each.section == section))
 
 
-def _variable_table() -> Table:
-    return _table(
-        "variables of the dataset",
-        ["variable", "stage", "dimensions beside the axes", "unit", "meaning", "number"],
-        [[v.name, v.stage.name, ", ".join(v.inner), v.units, v.meaning, _presence(v)]
-         for v in VARIABLES.values()])
+FLAGS: dict[str, type[Flag]] = {
+    each.name: each.flags for each in VARIABLES.values() if each.flags is not None}
+"""Flag variable -> its flags."""
 
 
 def _presence(variable: Variable) -> str:
@@ -112,54 +106,34 @@ def _presence(variable: Variable) -> str:
         return "always, unless the scene's computation failed"
     if rule.number == "if_seen":
         return "unless the scene's computation failed, or a corner is behind the camera"
-    names = " or ".join(flag.name for flag in _flags()[rule.flag] if flag.present)
+    names = " or ".join(flag.name for flag in FLAGS[rule.flag] if flag.present)
     return f"{'if' if rule.number == 'always' else 'only if'} {rule.flag} is {names}"
 
 
-def _flags() -> dict[str, type[Flag]]:
-    """Return the flags of each flag variable."""
-    return {v.name: v.flags for v in VARIABLES.values() if v.flags is not None}
-
-
-def _flag_table() -> Table:
-    return _table(
-        "flags", ["variable", "value", "flag", "meaning", "counted in rates"],
-        [[name, str(int(flag)), flag.name, flag.meaning, "yes" if flag.counted else "no"]
-         for name, flags in _flags().items() for flag in flags])
-
-
-def _solver_table() -> Table:
-    return _table(
-        "choices of the estimator's solver", ["solver", "meaning", "from", "guarded"],
-        [[name, solver.meaning,
-          "a file" if solver.recorded else "pixels" if solver.needs_images else "corners",
-          "yes" if solver.guarded else "no"]
-         for name, solver in SOLVERS.items()])
-
-
-def _effect_table() -> Table:
-    return _table(
-        "effects, in physical order",
-        ["effect", "switched on by", "absent at", "acts on", "random", "in the bound", "meaning"],
-        [[effect.label, effect.switch, effect.off_text, effect.step,
-          "yes" if effect.random else "no", "yes" if effect.in_bound else "no",
-          PARAMETERS[effect.switch].meaning]
-         for effect in EFFECTS])
-
-
-def _statistics_table() -> Table:
-    rows = [[record.statistic.outputs()[0].name, record.statistic.outputs()[0].meaning]
-            for record in POSE_STATISTICS]
-    rows += [[f"*_{name}_*", f"error: {heading}"] for heading, name in error_headings().items()]
-    return _table("variables of error_statistics", ["variable", "meaning"], rows)
-
+YES = {True: "yes", False: "no"}
 
 TABLES: dict[str, Callable[[], Table]] = {
-    **{section: partial(_section_table, section) for section in SECTIONS},
-    "effects": _effect_table,
-    "solvers": _solver_table,
-    "variables": _variable_table,
-    "flags": _flag_table,
-    "statistics": _statistics_table,
+    **{section: partial(_section, section) for section in SECTIONS},
+    "effects": lambda: _table("effects, in physical order", ({
+        "effect": each.label, "switched on by": each.switch, "absent at": each.off_text,
+        "acts on": each.step, "random": YES[each.random], "in the bound": YES[each.in_bound],
+        "meaning": PARAMETERS[each.switch].meaning} for each in EFFECTS)),
+    "solvers": lambda: _table("choices of the estimator's solver", ({
+        "solver": name, "meaning": each.meaning,
+        "from": "a file" if each.recorded else "pixels" if each.needs_images else "corners",
+        "guarded": YES[each.guarded]} for name, each in SOLVERS.items())),
+    "variables": lambda: _table("variables of the dataset", ({
+        "variable": each.name, "stage": each.stage.name,
+        "dimensions beside the axes": ", ".join(each.inner), "unit": each.units,
+        "meaning": each.meaning, "number": _presence(each)} for each in VARIABLES.values())),
+    "flags": lambda: _table("flags", ({
+        "variable": name, "value": str(int(flag)), "flag": flag.name, "meaning": flag.meaning,
+        "counted in rates": YES[flag.counted]} for name, flags in FLAGS.items() for flag in flags)),
+    "statistics": lambda: _table("variables of error_statistics", (
+        {"variable": name, "meaning": meaning} for name, meaning in (
+            *((each.statistic.outputs()[0].name, each.statistic.outputs()[0].meaning)
+              for each in POSE_STATISTICS),
+            *((f"*_{name}_*", f"error: {heading}") for heading, name in error_headings().items())
+        ))),
 }
 """Subject -> the function that makes its table."""

@@ -26,10 +26,9 @@ from sweep.errors import StoreError, SweepError
 from sweep.execution.status import Totals, outcome_of_store
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL, Axis
-from sweep.experiment.parameters import WORLD, Stage
+from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, uncounted_values
-from sweep.model.camera import VIEW_PARAMETERS
 from sweep.report.table import axis_label
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.tradeoff.pareto import WRONG, configuration_label
@@ -67,9 +66,6 @@ def bins_of(values: Floats, most: int) -> tuple[float, ...]:
 MAX_READ_BYTES = 600_000_000
 """Results up to this size are read at once: many figures need the same values, and many small
 chunks are slow to read."""
-
-MAX_AREAS = 1_000_000
-"""Areas by which bins are made."""
 
 AREA_RATIO = 2.0
 """Areas vary if the largest exceeds the smallest by this factor."""
@@ -137,38 +133,23 @@ class ReportData:
         """The axis along which the marker is turned away: the tilt, or the viewing angle."""
         return next((name for name in ANGLES if self.length(name) > 1), None)
 
-    @property
-    def size_axes(self) -> list[str]:
-        """The axes of size and angle that there are."""
-        return [name for name in (self.size_axis, self.angle_axis) if name]
-
     @functools.cached_property
     def areas(self) -> Floats:
-        """Areas, px², of the poses looked for (n,), or of a part of very many."""
+        """Areas, px², of the poses looked for (n,), by the first of the detector's settings."""
         first = {axis.name: 0 for axis in self.pipeline.axes_of(Stage.detection)}
         detection, area = (self.results[name].isel(first, missing_dims="ignore")
                            for name in ("detection", AREA))
         with store_errors(self.store):
             counted = ~detection.isin(uncounted_values(DetectionStatus)) & (area > 0)
             values = np.ravel(area.where(counted)).astype(np.float64)
-        known: Floats = values[np.isfinite(values)]
-        return known[:: max(1, known.size // MAX_AREAS)]
-
-    @property
-    def areas_vary(self) -> bool:
-        """Whether areas differ for other reasons than an axis of sizes or angles."""
-        expected = {*SIZE_AXES, *ANGLES}
-        reasons = {*VIEW_PARAMETERS, *WORLD, *expected, "yaw_deg", "pitch_deg", "size_m"}
-        varied = {axis.name for axis in self.pipeline.axes if len(axis) > 1} - expected
-        varied |= {name for axis in self.pipeline.axes if axis.zipped for name in axis.columns}
-        if not (varied | self.pipeline.distributions.keys()) & reasons or not self.areas.size:
-            return False
-        return bool(self.areas.max() > AREA_RATIO * self.areas.min())
+        return np.asarray(values[np.isfinite(values)])
 
     @property
     def size(self) -> str | None:
-        """The measure of size: an axis, or the area if it varies without such an axis."""
-        return self.size_axis or (AREA if self.areas_vary else None)
+        """The measure of size: an axis, or the area if it varies, and not by an axis of angles."""
+        if self.size_axis or self.angle_axis or not self.areas.size:
+            return self.size_axis
+        return AREA if self.areas.max() > AREA_RATIO * self.areas.min() else None
 
     @property
     def setting_axes(self) -> tuple[str, ...]:
@@ -194,18 +175,17 @@ class ReportData:
 
     @property
     def drawn_parameters(self) -> tuple[str, ...]:
-        """Parameters that are drawn from a distribution, and whose draws the store has.
-
-        A drawn size of the image is shown by the area.
-        """
-        return tuple(
-            name for name in self.pipeline.distributions
-            if name in self.results.variables and name not in SIZE_AXES
-        )
+        """Parameters that are drawn from a distribution, and whose draws the store has."""
+        return tuple(name for name in self.pipeline.distributions
+                     if name in self.results.variables)
 
     def label(self, name: str) -> str:
         """Return an axis' name with its unit, as on the axes of charts: ``distance, m``."""
         return axis_label(self.results, name)
+
+    def words(self, name: str) -> str:
+        """Return an axis' name without the unit, as in titles: ``distance``."""
+        return self.label(name).partition(", ")[0]
 
     # Groups of poses.
 

@@ -37,7 +37,7 @@ from sweep.report.scenes import (
 )
 from sweep.report.table import Table, coordinates, markdown_text
 from sweep.store.files import check_folder_writable, write_whole
-from sweep.store.locations import enclosing_store, is_remote
+from sweep.store.locations import enclosing_store
 
 # --------------------------------------------------------------------------------------------------
 # Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
@@ -181,7 +181,7 @@ def _code(text: str, language: str) -> str:
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
 
-def check_output(output: Path, folders: Sequence[Path], store: str) -> None:
+def check_output(output: Path, folders: Sequence[Path]) -> None:
     """Check that a report can be written, before it is computed.
 
     Raises
@@ -190,28 +190,21 @@ def check_output(output: Path, folders: Sequence[Path], store: str) -> None:
         If the output is a folder, or its folder is missing or not writable; if a folder of figures
         is a file; or if anything would be written into a store.
     """
-    own = None if is_remote(store) else Path(os.path.realpath(store))
     for wanted in (output, *folders):
         with write_errors_explained(wanted):
-            resolved = Path(os.path.realpath(wanted))
-            around = own if own in (resolved, *resolved.parents) else enclosing_store(resolved)
+            around = enclosing_store(wanted)
         if around is not None:
             raise StoreError(f"{wanted}: cannot be written: it is inside the store {around}")
     check_output_file(output)
     for folder in folders:
         with write_errors_explained(folder):
-            _check_folder(folder)
-
-
-def _check_folder(wanted: Path) -> None:
-    """Check that files can be written into a folder, which may have to be made."""
-    if os.path.lexists(wanted) and not wanted.is_dir():
-        wanted.stat()  # a link that leads nowhere, or in a circle
-        raise StoreError(f"{wanted}: cannot hold figures: it is a file; choose a folder")
-    folder = wanted if wanted.is_dir() else Path(os.path.realpath(wanted)).parent
-    if not folder.is_dir():
-        raise StoreError(f"{wanted}: cannot be written: folder {folder} not found")
-    check_folder_writable(folder)
+            if folder.is_dir():
+                check_folder_writable(folder)
+            elif os.path.lexists(folder):
+                folder.stat()  # a link that leads nowhere, or in a circle
+                raise StoreError(f"{folder}: cannot hold figures: it is a file; choose a folder")
+            else:
+                check_output_file(folder)  # it can be made
 
 
 def write_page(
@@ -242,7 +235,7 @@ def write_page(
         raise ArgumentError("form", form, f"expected one of {', '.join(FORMATS)}")
     beside = output.with_name(f"{output.stem}_figures") if form == "md" else None
     folders = [folder for folder in (beside, figures) if folder is not None]
-    check_output(output, folders, data.store)
+    check_output(output, folders)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
     title = data.pipeline.heading

@@ -12,7 +12,6 @@ from sweep.analysis.camera_calibration import calibration_summary, camera_calibr
 from sweep.analysis.comparisons import compare, renderer_bias, store_differences
 from sweep.analysis.decisions import (
     detection_limit,
-    farthest_met,
     precision_reached,
     requirement_limits,
 )
@@ -34,7 +33,7 @@ __all__ = [
     "ambiguity", "calibration_summary", "camera_calibrations", "check_requirements", "compare",
     "covariance_trust", "detection_limit", "detection_rate", "efficiency",
     "error_models", "error_statistics",
-    "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
+    "failure_composition", "flip_rate", "marker_ranking", "model_covariance",
     "model_errors", "per_marker", "precision_reached", "renderer_bias", "requirement_limits",
     "simulation_gap", "store_differences",
 ]

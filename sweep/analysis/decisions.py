@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +61,7 @@ from sweep.analysis.summaries import LOOKED_FOR
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL
+from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import cf_attributes
@@ -95,29 +96,41 @@ class Reach(Flag):
     within = flag(4, "They are met between two values, but not at the easiest.", present=True)
 
 
-@describes
-def farthest_met(
-    results: xr.Dataset, requirements: Iterable[Requirement | str], along: str,
-    per: Sequence[str] = (), at_all: Sequence[str] = (), shares: ErrorShares | None = None,
-) -> xr.Dataset:
-    """Return how far along an axis all requirements are met.
+def error_shares(decisions: int, times: int) -> ErrorShares:
+    """Return the shares of the error probability of each decision of a search.
 
     Parameters
     ----------
-    results, requirements
-        As in `sweep.analysis.check_requirements`.
-    along
-        An axis of the scene with numbers, such as ``distance_m``. It is read from easy to hard:
-        one that changes the size in the image towards smaller markers; another from the end at
-        which the requirements are met at more of the conditions, upwards if that is undecided.
-    per
-        Dimensions that are kept: a limit for each of their values.
-    at_all
-        Dimensions at all of whose values the requirements must hold for a value of ``along`` to
-        count, such as ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
-    shares
-        Shares of the error probability that single decisions may spend, if not those of
-        `sweep.analysis.check_requirements`.
+    decisions
+        How many are made for one limit: a false "not met" of any shortens it.
+    times
+        How often each is made.
+    """
+    factor = looks_factor(times)
+    return ErrorShares(met=1.0 / factor, not_met=1.0 / (factor * decisions))
+
+
+@describes
+def requirement_limits(
+    results: xr.Dataset, require: Sequence[str] = (), along: str = "",
+    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+) -> xr.Dataset:
+    """Return how far along an axis all requirements are met, for each condition by itself.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run, of `sweep.limit` or with equally many trials everywhere.
+    require, along, per, at_all
+        As `sweep.limit` takes them; by default those that the run was made for.
+
+        ``along`` is an axis of the scene with numbers, such as ``distance_m``. It is read from easy
+        to hard: one that changes the size in the image towards smaller markers; another from the
+        end at which the requirements are met at more of the conditions, upwards if that is
+        undecided. ``per`` are dimensions that are kept: a limit for each of their values; without a
+        word all axes of the scene, while an empty list pools them. ``at_all`` are dimensions at all
+        of whose values the requirements must hold for a value of ``along`` to count, such as
+        ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
 
     Returns
     -------
@@ -128,9 +141,11 @@ def farthest_met(
           requirements keep their limits; NaN for never. ``start``: the value from which they do,
           which is the easiest, or the first of the longest run of values if they do not there:
           near 0 tilt poses flip, near the camera a marker is cut off.
-        - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
-          easy values they are decided to be met, beyond the other end a requirement is decided not
-          to be met. -inf or inf: the limit may lie beyond the grid's end.
+        - ``low``, ``high``: ends of its interval, in the axis' unit, which covers the limit of each
+          condition with 95 %, however often it was decided anew. Up to the end nearer to the easy
+          values they are decided to be met, beyond the other end a requirement is decided not to be
+          met. -inf or inf: the limit may lie beyond the grid's end. ``settled``: whether the
+          interval is a single value of the grid.
         - ``reach`` (`Reach`).
         - ``limited_by``: the requirement that first fails beyond ``value``, "" for none;
           ``fails_at`` the value of the axis there; ``fails_where``: the values of ``at_all`` at
@@ -139,36 +154,57 @@ def farthest_met(
         - ``met_beyond``: at how many values beyond ``fails_at`` all requirements keep their limits
           again; ``farthest_beyond`` the farthest of them, NaN for none. Detection is not
           monotonic: above 0 there is a dip, which ends ``value``.
+        - ``poses`` (*per): how many scenes were computed for the condition, of all values.
 
         With the dimension ``along``, for each of its values: ``decision`` (`Decision`) of all
-        requirements together, and ``keeps``: whether all values keep their limits.
+        requirements together; ``keeps``: whether all values keep their limits; ``trials`` (*per,
+        along): the most that a cell has there.
 
     Raises
     ------
     ArgumentError, DatasetError
-        As in `sweep.analysis.check_requirements`; also for an axis without an order.
+        As in `sweep.analysis.check_requirements`; also if nothing says what is searched, and for an
+        axis without an order.
 
     Notes
     -----
-    ``low`` (of a limit upwards) is too large with the error probability of one decision: only the
-    first value at which a requirement fails could make it so. ``high`` is too small if any value
-    up to the limit is falsely decided as not met: these decisions are at the error probability of
-    all of them together.
+    Requirements must hold at all values of ``at_all`` and are judged at each value along the axis
+    after each wave: an end of the interval is wrong with 0.025 at most, of all these decisions
+    together (Bonferroni over values and requirements; `looks_factor` over waves). ``low`` (of a
+    limit upwards) is too large with the error probability of one decision: only the first value at
+    which a requirement fails could make it so.
 
     Examples
     --------
-    >>> reach = farthest_met(results.sel(solver=["ippe"]), ["detection >= 0.6"], along="side_px")
-    >>> reach["value"].item(), reach["limited_by"].item(), reach["fails_at"].item()
-    (20.0, 'detection_rate >= 0.6', 10.0)
+    >>> limit = requirement_limits(results, ["detection >= 0.6"], "side_px").sel(solver="ippe")
+    >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
+    (20.0, 20.0, 40.0)
+    >>> limit["limited_by"].item(), limit["fails_at"].item()
+    ('detection_rate >= 0.6', 10.0)
     """
-    required = parse_requirements(requirements)
+    rule = stopping_rule(results)
+    rule = rule if rule is not None and rule.kind == "along" else None
+    require = [require] if isinstance(require, str) and require else require
+    if not require or not along:
+        if rule is None:
+            raise ArgumentError("require" if not require else "along", along,
+                                "this store was not made by sweep limit, so that nothing says it")
+        require, along = require or rule.requirements, along or rule.along
+    if rule is not None and along == rule.along:
+        per = rule.per if per is None else per
+        at_all = rule.at_all if at_all is None else at_all
+    required = parse_requirements(require)
     values = axis_values(results, along)
-    together = [name for name in as_names(at_all) if name != along]
-    names = [name for name in as_names(per) if name != along]
+    together = [name for name in as_names(at_all or ()) if name != along]
+    names = [name for name in axes_of(results, Stage.scene)
+             if name not in (DRAWS, *together)] if per is None else as_names(per)
+    names = [name for name in names if name != along]
     overlap = [name for name in together if name in names]
     if overlap:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
-    table = decide(results, required, [*names, *together, along], shares=shares)
+    count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
+    table = decide(results, required, [*names, *together, along],
+                   shares=error_shares(count, len(rule.ends) if rule else 1))
     keeps = kept_by(table, required)
     upwards = is_harder_upwards(results, along, keeps)
     order = np.argsort(values if upwards else -values, kind="stable")
@@ -217,9 +253,19 @@ def farthest_met(
     coordinates = {name: value for name, value in table.coords.items()
                    if set(value.dims) <= {*kept, along}}
     found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
+    found["settled"] = (found["low"] == found["high"]).assign_attrs(
+        long_name="whether the interval is a single value of the grid", units="1")
+    computed = computed_scenes(results)
+    cells = [name for name in computed.dims if name not in (*names, along)]
+    found["trials"] = computed.sum(DRAWS).max(
+        [name for name in cells if name != DRAWS]).compute().assign_attrs(
+        long_name="trials of a cell, the most at this value", units="1")
+    found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
+        long_name="scenes that were computed, of all values", units="1")
     return found.assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
-        configuration_dims=[name for name in configuration_axes(results) if name in kept])
+        configuration_dims=[name for name in configuration_axes(results) if name in kept],
+        per=[*names], at_all=together, require=[*require])
 
 
 def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -350,96 +396,6 @@ def _cause(
                       for name, value in at.items())
     return {"limited_by": str(worst["requirement"].item()), "fails_where": where,
             "failing_value": float(worst["value"])}
-
-
-# --------------------------------------------------------------------------------------------------
-# Limits that a search decided: how far along an axis requirements are met, per condition.
-
-def error_shares(decisions: int, times: int) -> ErrorShares:
-    """Return the shares of the error probability of each decision of a search.
-
-    Parameters
-    ----------
-    decisions
-        How many are made for one limit: a false "not met" of any shortens it.
-    times
-        How often each is made.
-    """
-    factor = looks_factor(times)
-    return ErrorShares(met=1.0 / factor, not_met=1.0 / (factor * decisions))
-
-
-@describes
-def requirement_limits(
-    results: xr.Dataset, require: Sequence[str] = (), along: str = "",
-    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
-) -> xr.Dataset:
-    """Return how far along an axis requirements are met, for each condition by itself.
-
-    Parameters
-    ----------
-    results
-        The dataset of a run, of `sweep.limit` or with equally many trials everywhere.
-    require, along, per, at_all
-        As `sweep.limit` takes them; by default those that the run was made for.
-
-    Returns
-    -------
-    xr.Dataset
-        As `sweep.analysis.farthest_met`, dimensions (*configuration, *per), whose interval
-        ``low`` to ``high`` covers the limit of each condition with 95 %, however often it was
-        decided anew. Also
-
-        - ``settled``: whether the interval is a single value of the grid.
-        - ``trials`` (*per, along): the most that a cell has there; ``poses`` (*per): how many
-          scenes were computed for the condition, with those of all values.
-
-    Raises
-    ------
-    ArgumentError, DatasetError
-        As in `sweep.analysis.farthest_met`; also if nothing says what is searched.
-
-    Notes
-    -----
-    Requirements must hold at all values of ``at_all`` and are judged at each value along the axis
-    after each wave: an end of the interval is wrong with 0.025 at most, of all these decisions
-    together (Bonferroni over values and requirements; `looks_factor` over waves).
-
-    Examples
-    --------
-    >>> limit = requirement_limits(results, ["detection >= 0.6"], "side_px").sel(solver="ippe")
-    >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
-    (20.0, 20.0, 40.0)
-    """
-    rule = stopping_rule(results)
-    rule = rule if rule is not None and rule.kind == "along" else None
-    require = [require] if isinstance(require, str) and require else require
-    if not require or not along:
-        if rule is None:
-            raise ArgumentError("require" if not require else "along", along,
-                                "this store was not made by sweep limit, so that nothing says it")
-        require, along = require or rule.requirements, along or rule.along
-    if rule is not None and along == rule.along:
-        per = rule.per if per is None else per
-        at_all = rule.at_all if at_all is None else at_all
-    scene = [name for name in axes_of(results) if name not in configuration_axes(results)]
-    at_all = [name for name in as_names(at_all or ()) if name != along]
-    if per is None:
-        per = [name for name in scene if name not in (DRAWS, along, *at_all)]
-    per = as_names(per)
-    count = len([*require]) * math.prod(results.sizes.get(name, 1) for name in (along, *at_all))
-    found = farthest_met(
-        results, require, along, per, at_all, error_shares(count, len(rule.ends) if rule else 1))
-    found["settled"] = (found["low"] == found["high"]).assign_attrs(
-        long_name="whether the interval is a single value of the grid", units="1")
-    computed = computed_scenes(results)
-    cells = [name for name in computed.dims if name not in (*per, along)]
-    found["trials"] = computed.sum(DRAWS).max(
-        [name for name in cells if name != DRAWS]).compute().assign_attrs(
-        long_name="trials of a cell, the most at this value", units="1")
-    found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
-        long_name="scenes that were computed, of all values", units="1")
-    return found.assign_attrs(per=[*per], at_all=at_all, require=[*require])
 
 
 @describes

@@ -7,7 +7,7 @@ from scipy import stats
 
 from support.comparisons import with_detected
 from support.small_datasets import perfect
-from sweep.analysis.decisions import Reach, farthest_met
+from sweep.analysis.decisions import Reach, requirement_limits
 from sweep.analysis.requirements import (
     Decision,
     check_requirements,
@@ -79,7 +79,7 @@ def detected_by_distance(shares, trials=100, tilts=None):
 ])
 def test_the_limit_along_distance_has_an_interval_and_a_cause(rates, reach, ends, fails, beyond):
     required = ["detection >= 0.9", "rotation_median_deg <= 90"]
-    one = farthest_met(detected_by_distance(rates), required, "distance_m").isel(solver=0)
+    one = requirement_limits(detected_by_distance(rates), required, "distance_m").isel(solver=0)
     assert Reach(int(one["reach"])) is reach
     assert [float(one[name]) for name in ("start", "low", "value", "high")] == ends
     assert (float(one["fails_at"]), float(one["failing_value"])) == pytest.approx(fails)
@@ -91,9 +91,9 @@ def test_the_limit_along_distance_has_an_interval_and_a_cause(rates, reach, ends
 
 def test_requirements_hold_at_all_tilts_together():
     results = detected_by_distance([1.0, 1.0, 1.0], tilts=[1.0, 0.5])
-    apart = farthest_met(results, ["detection >= 0.9"], "distance_m", per=["tilt_deg"])
+    apart = requirement_limits(results, ["detection >= 0.9"], "distance_m")
     assert [Reach(int(each)).name for each in apart["reach"].isel(solver=0)] == ["always", "never"]
-    together = farthest_met(results, ["detection >= 0.9"], "distance_m", at_all=["tilt_deg"])
+    together = requirement_limits(results, ["detection >= 0.9"], "distance_m", at_all=["tilt_deg"])
     assert Reach(int(together["reach"].isel(solver=0))) is Reach.never
     assert together["fails_where"].item() == "tilt_deg = 30"
 
@@ -106,7 +106,7 @@ def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
     results = perfect(np.random.default_rng(1), {axis: 3, "trial": 100})
     if not met:
         results["detection"][:] = DetectionStatus.no_candidate
-    one = farthest_met(results, ["detection >= 0.9"], axis)
+    one = requirement_limits(results, ["detection >= 0.9"], axis)
     assert (float(one["low"]), float(one["high"])) == ends
     assert Reach(int(one["reach"])) is (Reach.always if met else Reach.never)
 

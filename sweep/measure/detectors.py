@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -33,123 +34,119 @@ REFINEMENTS = {
 }
 
 
+def _pixels(default: Any, meaning: str, low: float = 1, high: float = 9999) -> Any:
+    """Return the declared field of a number of pixels."""
+    return parameter(default, meaning, low, high, unit="px")
+
+
+def _positive(default: Any, meaning: str, high: float = math.inf) -> Any:
+    """Return the declared field of a number above 0."""
+    return parameter(default, meaning, 0, high, open_low=True)
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorSetting:
     """Every field of ``cv2.aruco.DetectorParameters``, by OpenCV's own name and default."""
 
-    adaptiveThreshWinSizeMin: int = parameter(
-        3, "smallest window of the adaptive threshold", unit="px", low=3, high=9999
-    )
-    adaptiveThreshWinSizeMax: int = parameter(
-        23, "largest window of the adaptive threshold", unit="px", low=3, high=9999
-    )
-    adaptiveThreshWinSizeStep: int = parameter(
-        10, "step between the windows of the adaptive threshold", unit="px", low=1, high=9999
+    adaptiveThreshWinSizeMin: int = _pixels(3, "smallest window of the adaptive threshold", 3)
+    adaptiveThreshWinSizeMax: int = _pixels(23, "largest window of the adaptive threshold", 3)
+    adaptiveThreshWinSizeStep: int = _pixels(
+        10, "step between the windows of the adaptive threshold"
     )
     adaptiveThreshConstant: float = parameter(
         7.0, "constant of the adaptive threshold", unit="grey level"
     )
-    minMarkerPerimeterRate: float = parameter(
-        0.03, "smallest perimeter of a candidate, relative to the image's larger side", low=0,
-        open_low=True,
+    minMarkerPerimeterRate: float = _positive(
+        0.03, "smallest perimeter of a candidate, relative to the image's larger side"
     )
-    maxMarkerPerimeterRate: float = parameter(
-        4.0, "largest perimeter of a candidate, relative to the image's larger side", low=0,
-        high=10_000, open_low=True,
+    maxMarkerPerimeterRate: float = _positive(
+        4.0, "largest perimeter of a candidate, relative to the image's larger side", 10_000
     )
-    polygonalApproxAccuracyRate: float = parameter(
-        0.03, "accuracy of the polygonal approximation, relative to the perimeter", low=0,
-        open_low=True,
+    polygonalApproxAccuracyRate: float = _positive(
+        0.03, "accuracy of the polygonal approximation, relative to the perimeter"
     )
     minCornerDistanceRate: float = parameter(
-        0.05, "smallest distance between corners, relative to the perimeter", low=0
+        0.05, "smallest distance between corners, relative to the perimeter", 0
     )
-    minDistanceToBorder: int = parameter(
-        3, "smallest distance of a corner to the image's border", unit="px", low=0, high=9999
+    minDistanceToBorder: int = _pixels(
+        3, "smallest distance of a corner to the image's border", 0
     )
     minMarkerDistanceRate: float = parameter(
-        0.125, "smallest distance between markers' corners, relative to the perimeter", low=0
+        0.125, "smallest distance between markers' corners, relative to the perimeter", 0
     )
     minGroupDistance: float = parameter(
         0.21, "smallest distance between corners in a group of candidates, relative to the "
-        "perimeter", low=0,
+        "perimeter", 0,
     )
     cornerRefinementMethod: str = parameter(
         "none", "refinement of the corners (apriltag also replaces the search for candidates)",
         choices=tuple(REFINEMENTS), prefix="CORNER_REFINE_", numbers=tuple(REFINEMENTS.items()),
     )
-    cornerRefinementWinSize: int = parameter(
-        5, "largest half window of the sub-pixel refinement", unit="px", low=1, high=9999
-    )
-    relativeCornerRefinmentWinSize: float = parameter(
-        0.3, "half window of the sub-pixel refinement, relative to the module", low=0,
-        open_low=True,
+    cornerRefinementWinSize: int = _pixels(5, "largest half window of the sub-pixel refinement")
+    relativeCornerRefinmentWinSize: float = _positive(
+        0.3, "half window of the sub-pixel refinement, relative to the module"
     )
     cornerRefinementMaxIterations: int = parameter(
-        30, "most iterations of the corner refinement", low=1, high=100_000
+        30, "most iterations of the corner refinement", 1, 100_000
     )
     cornerRefinementMinAccuracy: float = parameter(
-        0.1, "step at which the corner refinement stops", unit="px", low=0, open_low=True
+        0.1, "step at which the corner refinement stops", 0, unit="px", open_low=True
     )
     markerBorderBits: int = parameter(
-        1, "width of the border that the detector expects", unit="module", low=1, high=10
+        1, "width of the border that the detector expects", 1, 10, unit="module"
     )
-    perspectiveRemovePixelPerCell: int = parameter(
-        4, "samples along a side of a module", unit="px", low=1, high=1000
-    )
+    perspectiveRemovePixelPerCell: int = _pixels(4, "samples along a side of a module", 1, 1000)
     perspectiveRemoveIgnoredMarginPerCell: float = parameter(
-        0.13, "margin of a module that is not sampled, relative to the module", low=0, high=0.499
+        0.13, "margin of a module that is not sampled, relative to the module", 0, 0.499
     )
     maxErroneousBitsInBorderRate: float = parameter(
-        0.35, "largest share of wrong bits in the border", low=0, high=1
+        0.35, "largest share of wrong bits in the border", 0, 1
     )
     minOtsuStdDev: float = parameter(
-        5.0, "smallest standard deviation at which Otsu's threshold is taken",
-        unit="grey level", low=0,
+        5.0, "smallest standard deviation at which Otsu's threshold is taken", 0,
+        unit="grey level",
     )
     errorCorrectionRate: float = parameter(
-        0.6, "error correction, relative to the dictionary's maximum", low=0, high=1
+        0.6, "error correction, relative to the dictionary's maximum", 0, 1
     )
     aprilTagQuadDecimate: float = parameter(
-        0.0, "apriltag: decimation of the image before the search", low=0, high=64
+        0.0, "apriltag: decimation of the image before the search", 0, 64
     )
-    aprilTagQuadSigma: float = parameter(
-        0.0, "apriltag: Gaussian blur (negative: sharpening) before the search", unit="px",
-        low=-100, high=100,
+    aprilTagQuadSigma: float = _pixels(
+        0.0, "apriltag: Gaussian blur (negative: sharpening) before the search", -100, 100
     )
-    aprilTagMinClusterPixels: int = parameter(
-        5, "apriltag: smallest cluster of edge pixels", unit="px", low=0, high=10**6
+    aprilTagMinClusterPixels: int = _pixels(
+        5, "apriltag: smallest cluster of edge pixels", 0, 10**6
     )
     aprilTagMaxNmaxima: int = parameter(
-        10, "apriltag: most corner candidates of a cluster", low=1, high=1000
+        10, "apriltag: most corner candidates of a cluster", 1, 1000
     )
     aprilTagCriticalRad: float = parameter(
         0.1745329201221466, "apriltag: edges closer than this to straight or to reversal make no "
-        "corner", unit="radian", low=0, high=3.1416,
+        "corner", 0, 3.1416, unit="radian",
     )
     aprilTagMaxLineFitMse: float = parameter(
-        10.0, "apriltag: largest mean squared error of a line fit", unit="px²", low=0
+        10.0, "apriltag: largest mean squared error of a line fit", 0, unit="px²"
     )
     aprilTagMinWhiteBlackDiff: int = parameter(
-        5, "apriltag: smallest contrast of a tile", unit="grey level", low=0, high=255
+        5, "apriltag: smallest contrast of a tile", 0, 255, unit="grey level"
     )
     aprilTagDeglitch: int = parameter(
         0, "apriltag: clean up the threshold; only 0: with 1 OpenCV's result depends on the "
-        "images searched before (5-7 of 150 images, in 4.14 and 5.0)", low=0, high=0,
+        "images searched before (5-7 of 150 images, in 4.14 and 5.0)", 0, 0,
     )
     detectInvertedMarker: bool = parameter(False, "also search for white-on-black markers")
     useAruco3Detection: bool = parameter(
         False, "the faster search of ArUco 3 (always on the full frame)"
     )
-    minSideLengthCanonicalImg: int = parameter(
-        32, "ArUco 3: smallest side of a candidate in the canonical image", unit="px", low=1,
-        high=10_000,
+    minSideLengthCanonicalImg: int = _pixels(
+        32, "ArUco 3: smallest side of a candidate in the canonical image", 1, 10_000
     )
     minMarkerLengthRatioOriginalImg: float = parameter(
-        0.0, "ArUco 3: smallest marker, relative to the image's larger side", low=0, high=1
+        0.0, "ArUco 3: smallest marker, relative to the image's larger side", 0, 1
     )
     validBitIdThreshold: float = parameter(
-        0.49, "share of a module's pixels from which its bit is uncertain", low=0, high=1
+        0.49, "share of a module's pixels from which its bit is uncertain", 0, 1
     )
 
     @classmethod
@@ -215,18 +212,6 @@ is 0; and corners of the rejected candidates."""
 SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
 
 
-def perimeter_rates(setting: DetectorSetting, side: int, frame_side: int) -> tuple[float, float]:
-    """Return the perimeter limits for an image of larger side ``side``, a window of a frame.
-
-    OpenCV takes them relative to the image that it is given and turns them into whole pixels: they
-    are passed so that they give the same numbers as on the frame.
-    """
-    low, high = setting.minMarkerPerimeterRate, setting.maxMarkerPerimeterRate
-    if side == frame_side:
-        return low, high
-    return (int(low * frame_side) + 0.5) / side, (int(high * frame_side) + 0.5) / side
-
-
 def opencv_parameters(setting: DetectorSetting) -> cv2.aruco.DetectorParameters:
     """Return a setting as OpenCV's detectors take it."""
     parameters = cv2.aruco.DetectorParameters()
@@ -253,10 +238,16 @@ class Detector:
         return self._search(dictionary, max(image.shape), frame_side)(image)
 
     def _new_search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
-        """Return OpenCV's search for images of larger side ``side``."""
-        low, high = perimeter_rates(self._setting, side, frame_side)
+        """Return OpenCV's search for images of larger side ``side``, windows of a frame.
+
+        OpenCV takes the limits of the perimeter relative to the image that it is given and turns
+        them into whole pixels: they are passed so that they give the same numbers as on the frame.
+        """
         parameters = opencv_parameters(self._setting)
-        parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
+        if side != frame_side:
+            for name in ("minMarkerPerimeterRate", "maxMarkerPerimeterRate"):
+                pixels = int(getattr(self._setting, name) * frame_side)
+                setattr(parameters, name, (pixels + 0.5) / side)
         detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
         # OpenCV's stubs have neither the element types nor that the IDs may be None.
         return cast("SearchFunction", detector.detectMarkers)

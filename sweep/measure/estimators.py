@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.declaration import parameter
+from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
 from sweep.measure.estimation import (
     Detections,
@@ -189,12 +189,11 @@ class EstimatorSetting:
     )
     reprojection_limit: float = parameter(
         0.25, "largest RMS reprojection error of a solution, as a share of the detected side; of a "
-        "pose at infinity it is 0.7", low=0, high=0.5, open_low=True,
+        "pose at infinity it is 0.7", 0, 0.5, open_low=True,
     )
     corner_noise_px: float | None = parameter(
         None, "standard deviation of a detected corner's coordinates, for the pose covariance of "
-        f"solvers that use corners alone; {_PIXELS} computes its own from the pixels", unit="px",
-        low=1e-6, high=1e6,
+        f"solvers that use corners alone; {_PIXELS} computes its own from the pixels", 1e-6, 1e6,
     )
     refined_starts: bool = parameter(
         False, "photometric and photometric_real also start from the detector's corners after "
@@ -225,34 +224,25 @@ class EstimatorSetting:
         "calibration_covariance",
         choices=("truth", "calibration"),
     )
-    believed_focal_scale: float | None = parameter(
+    believed_focal_scale: float | None = drawn(
         None, "factor on both true focal lengths that is assumed: 1.01 is a focal length believed "
-        "1 % too long", low=1e-3, high=1e3, drawable=True,
+        "1 % too long", 1e-3, 1e3,
     )
-    believed_fx_px: float | None = parameter(
-        None, f"focal length along x {_ASSUMED}; that along y stays as it is", unit="px",
-        low=1e-3, high=1e9, drawable=True,
+    believed_fx_px: float | None = drawn(
+        None, f"focal length along x {_ASSUMED}; that along y stays as it is", 1e-3, 1e9
     )
-    believed_fy_px: float | None = parameter(
-        None, f"focal length along y {_ASSUMED}", unit="px", low=1e-3, high=1e9, drawable=True
-    )
-    believed_cx_px: float | None = parameter(
-        None, f"principal point, x, {_ASSUMED}", unit="px", low=-1e9, high=1e9, drawable=True
-    )
-    believed_cy_px: float | None = parameter(
-        None, f"principal point, y, {_ASSUMED}", unit="px", low=-1e9, high=1e9, drawable=True
-    )
+    believed_fy_px: float | None = drawn(None, f"focal length along y {_ASSUMED}", 1e-3, 1e9)
+    believed_cx_px: float | None = drawn(None, f"principal point, x, {_ASSUMED}", -1e9, 1e9)
+    believed_cy_px: float | None = drawn(None, f"principal point, y, {_ASSUMED}", -1e9, 1e9)
     believed_distortion: tuple[float, ...] | None = parameter(
         None, f"lens coefficients {_ASSUMED}", lengths=COUNTS
     )
-    believed_size_m: float | None = parameter(
-        None, f"side of the black square {_ASSUMED}", unit="m", low=1e-9, high=1e9, drawable=True
-    )
+    believed_size_m: float | None = drawn(None, f"side of the black square {_ASSUMED}", 1e-9, 1e9)
     believed_blur_px: float | None = parameter(
-        None, f"Gaussian point spread {_ASSUMED}", unit="px", low=0, high=1000
+        None, f"Gaussian point spread {_ASSUMED}", 0, 1000
     )
     believed_noise_grey: float | None = parameter(
-        None, f"noise of a pixel {_ASSUMED}", unit="grey level", low=0, high=1e6
+        None, f"noise of a pixel {_ASSUMED}", 0, 1e6, unit="grey level"
     )
 
 

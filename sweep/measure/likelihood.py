@@ -34,6 +34,7 @@ from sweep.model.coverage import (
     MarkerEdges,
     Work,
     differentiate,
+    joined,
     normal_equations,
     work_space,
 )
@@ -179,14 +180,8 @@ def _seen_sheets(
     in_frame[:, :, 2] -= translation
     radius = scale * float(np.linalg.norm(sheets_m(target)[: own_sheets(target)], axis=2).max())
     first = np.cumsum([0, *(len(edges.ends) for edges, _ in groups)])
-    return (
-        MarkerEdges(
-            np.concatenate([np.empty((0, 4)), *(edges.ends for edges, _ in groups)]),
-            np.concatenate(
-                [np.empty((0, 2), dtype=np.int64), *(edges.sides for edges, _ in groups)]),
-        ),
-        Sheets(first, np.ascontiguousarray(rotation.T @ in_frame), radius),
-    )
+    sheets = Sheets(first, np.ascontiguousarray(rotation.T @ in_frame), radius)
+    return joined([edges for edges, _ in groups]), sheets
 
 
 def middle_m(target: Board) -> Floats:

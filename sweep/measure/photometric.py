@@ -45,7 +45,7 @@ from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit
 from sweep.model.coverage import LEVELS, POSE
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.typing import Floats, Grey
+from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # First poses of one target, marker or board, and the part of the image that is fitted.
@@ -89,24 +89,17 @@ def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
 def refined_corners(one: Detections) -> Floats:
     """Return the corners (k, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
     refined, (image,), (origin,) = one.corners.copy(), one.images, one.origins
+    modules, last = module_count(one.targets[0].dictionary), np.array(image.shape[::-1]) - 1
     for k, corners in enumerate(one.corners - origin):
-        moved = refined_quad(image, corners, module_count(one.targets[0].dictionary))
-        if moved is not None:
-            refined[k] = moved + origin
+        if ((corners >= 0) & (corners <= last)).all():
+            side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+            half = min(5, max(1, round(0.3 * (side / modules))))
+            moved = cv2.cornerSubPix(
+                image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+                (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+            )
+            refined[k] = np.asarray(moved[:, 0], dtype=np.float64) + origin
     return refined
-
-
-def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
-    """As :func:`refined_corners`, of corners (4, 2) in the image; None if one is not in it."""
-    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
-        return None
-    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-    half = min(5, max(1, round(0.3 * (side / modules))))
-    moved = cv2.cornerSubPix(
-        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
-        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
-    )
-    return np.asarray(moved[:, 0], dtype=np.float64)
 
 
 def start_states(

@@ -17,7 +17,6 @@ from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges, joined
 from sweep.model.marker import BLACK, OCCLUDER, OUTSIDE, WHITE
 from sweep.model.polygon import following, half_plane
-from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -37,22 +36,20 @@ class Print(NamedTuple):
         Metres in a unit: a marker's module.
     half_m
         How far left of and above its centre the edges' origin lies.
-    x_m, y_m
-        Its centre in the board's frame.
+    centre_m
+        (3,) its centre in the board's frame.
     roll_rad
         Its turn in its plane, from x to y.
-    z_m, turn
-        Of a print that is not in the board's plane: its centre's height, and the rotation (3, 3)
-        of its plane; None of one in it.
+    turn
+        The rotation (3, 3) of the plane of a print on a sheet of its own; None of one in the
+        board's plane.
     """
 
     edges: MarkerEdges
     unit_m: float
     half_m: float
-    x_m: float = 0.0
-    y_m: float = 0.0
+    centre_m: Sequence[float] = (0.0, 0.0, 0.0)
     roll_rad: float = 0.0
-    z_m: float = 0.0
     turn: Floats | None = None
 
     def plane(self, rotation: Floats, translation: Floats) -> Floats:
@@ -62,13 +59,10 @@ class Print(NamedTuple):
         (:func:`sweep.model.scene.build_scenes`) is the same to the bit.
         """
         cosine, sine = math.cos(self.roll_rad), math.sin(self.roll_rad)
-        if self.turn is not None:
-            translation = translation + rotation @ [self.x_m, self.y_m, self.z_m]
-            flat = self._replace(x_m=0.0, y_m=0.0, turn=None)
-            return flat.plane(rotation @ self.turn, translation)
-        right = rotation[:, 0] * cosine + rotation[:, 1] * sine
-        up = rotation[:, 1] * cosine - rotation[:, 0] * sine
-        centre = translation + rotation[:, 0] * self.x_m + rotation[:, 1] * self.y_m
+        centre = translation + rotation @ self.centre_m
+        turned = rotation if self.turn is None else rotation @ self.turn
+        right = turned[:, 0] * cosine + turned[:, 1] * sine
+        up = turned[:, 1] * cosine - turned[:, 0] * sine
         return np.stack(
             [right * self.unit_m, -up * self.unit_m, centre - (right - up) * self.half_m], axis=1
         )
@@ -146,7 +140,7 @@ class Board:
         if len(self.prints) > 1 or len(self) != 1 or self.distractors:
             return False
         only = self.prints[0]
-        return self.is_flat and only.x_m == only.y_m == only.roll_rad == 0.0
+        return self.is_flat and not any(only.centre_m) and only.roll_rad == 0.0
 
 
 @lru_cache(maxsize=8192)
@@ -181,12 +175,19 @@ def edges_on_sheet(prints: Sequence[Print]) -> MarkerEdges:
 
 def marker_print(
     dictionary: str, marker_id: int, size_m: float, quiet_zone_modules: float | None,
-    x_m: float = 0.0, y_m: float = 0.0, roll_deg: float = 0.0,
-) -> Print:
-    """Return a marker with its centre at (x, y), on a sheet of its own or on a white one.
+    centre_m: Sequence[float], roll_deg: float = 0.0, turn: Floats | None = None,
+) -> tuple[Print, Floats]:
+    """Return a marker's print, and its square's corners (4, 3) in the board's frame.
 
-    ``quiet_zone_modules`` is the width of the white that surrounds it on its own sheet; None if
-    it is printed on white that another print encloses.
+    Parameters
+    ----------
+    dictionary, marker_id, size_m
+        The marker, and the side of its square.
+    quiet_zone_modules
+        Width of the white that surrounds it on its own sheet; None if it is printed on white that
+        another print encloses.
+    centre_m, roll_deg, turn
+        As :class:`Print` has them.
     """
     around = marker.overhang(dictionary) + (quiet_zone_modules or 0.0)
     outline = marker.edges(dictionary, marker_id, around)
@@ -194,35 +195,13 @@ def marker_print(
         sides = np.where(outline.sides == OUTSIDE, WHITE, outline.sides)
         seen = sides[:, 0] != sides[:, 1]
         outline = MarkerEdges(outline.ends[seen], sides[seen])
-    module_m = size_m / marker.module_count(dictionary)
-    return Print(outline, module_m, size_m / 2, x_m, y_m, math.radians(roll_deg))
-
-
-def solid_print(
-    flat: Print, z_m: float, tilt_deg: float, azimuth_deg: float
-) -> tuple[Print, Floats]:
-    """Return a print with its centre at a height and its plane tilted, and its corners (4, 3).
-
-    By ``tilt_deg`` about the axis (cos azimuth, sin azimuth, 0) of the board, after its roll; the
-    corners are those of its marker's square: TL, TR, BR, BL.
-    """
-    turn = rotation_of_vector(
-        math.radians(tilt_deg) * np.array([[
-            math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg)), 0.0
-        ]])
-    )[0]
-    corners = corners_of(2 * flat.half_m, 0.0, 0.0, math.degrees(flat.roll_rad))
-    return flat._replace(z_m=z_m, turn=turn), np.asarray(
-        corners @ turn.T + [flat.x_m, flat.y_m, z_m]
-    )
-
-
-def corners_of(size_m: float, x_m: float, y_m: float, roll_deg: float = 0.0) -> Floats:
-    """Return the corners (4, 3) of a marker's square in the board's frame: TL, TR, BR, BL."""
-    corners = marker.marker_corners(np.array([size_m]))[0]
-    cosine, sine = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(corners @ turn + [x_m, y_m, 0.0])
+    module_m, roll_rad = size_m / marker.module_count(dictionary), math.radians(roll_deg)
+    cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
+    corners = marker.marker_corners(np.array([size_m]))[0] @ np.array([
+        [cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]
+    ])
+    printed = Print(outline, module_m, size_m / 2, centre_m, roll_rad, turn)
+    return printed, np.asarray((corners if turn is None else corners @ turn.T) + centre_m)
 
 
 def cells_print(codes: Integers, side_m: float) -> Print:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from sweep.model import board, marker
 from sweep.model.board import Board, Chessboard, Print
 from sweep.model.coverage import joined
 from sweep.model.marker import BLACK, OUTSIDE, WHITE
+from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -121,13 +123,17 @@ class BoardMarker:
     ) -> tuple[Print, Floats]:
         """Return its print and the corners (4, 3) of its square.
 
-        ``solid``: on a plane of its own. ``quiet_modules`` is as of :func:`marker_print`.
+        ``solid``: on a plane of its own, tilted about the axis (cos azimuth, sin azimuth, 0) of the
+        board after its roll. ``quiet_modules`` is as of :func:`sweep.model.board.marker_print`.
         """
-        where = self.x_m, self.y_m, self.roll_deg
-        printed = board.marker_print(dictionary, self.marker_id, self.size_m, quiet_modules, *where)
+        turn, azimuth = None, math.radians(self.azimuth_deg)
         if solid:
-            return board.solid_print(printed, self.z_m, self.tilt_deg, self.azimuth_deg)
-        return printed, board.corners_of(self.size_m, *where)
+            axis = np.array([[math.cos(azimuth), math.sin(azimuth), 0.0]])
+            (turn,) = rotation_of_vector(math.radians(self.tilt_deg) * axis)
+        return board.marker_print(
+            dictionary, self.marker_id, self.size_m, quiet_modules,
+            (self.x_m, self.y_m, self.z_m), self.roll_deg, turn,
+        )
 
 
 _TABLES = "tables [[markers]]"
@@ -376,7 +382,7 @@ class _OnSheet:
         module_m = marker_m / marker.module_count(self.dictionary)
         beyond = half_m + (module_m if self.margin_m is None else self.margin_m)
         prints, corners = zip(
-            *(BoardMarker(marker_id, x, y, marker_m, roll_deg).placed(self.dictionary, None, False)
+            *(board.marker_print(self.dictionary, marker_id, marker_m, None, (x, y, 0.0), roll_deg)
               for marker_id, (x, y) in zip(self._ids, centres_m.tolist(), strict=True)),
             strict=True,
         )

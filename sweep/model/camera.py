@@ -291,10 +291,7 @@ class Column:
         """Return the values as a list of ``count``."""
         if self.constant:
             return [self.values] * count
-        each: list[Any] = (
-            self.values.tolist() if isinstance(self.values, np.ndarray) else self.values
-        )
-        return each
+        return self.values.tolist() if isinstance(self.values, np.ndarray) else list(self.values)
 
     def map(self, function: Callable[[Any], Any]) -> Column:
         """Return the column of ``function`` of each value."""
@@ -314,14 +311,9 @@ def map_columns(function: Callable[..., Any], columns: Sequence[Column]) -> Colu
     """
     if all(column.constant for column in columns):
         return Column(function(*(column.values for column in columns)), constant=True)
-    rows = zip(
-        *(
-            itertools.repeat(column.values) if column.constant else column.listed(0)
-            for column in columns
-        ),
-        strict=False,  # constants repeat without end
-    )
-    return Column([function(*row) for row in rows], constant=False)
+    each = (itertools.repeat(one.values) if one.constant else one.listed(0) for one in columns)
+    # Constants repeat without end.
+    return Column([function(*row) for row in zip(*each, strict=False)], constant=False)
 
 
 # --------------------------------------------------------------------------------------------------

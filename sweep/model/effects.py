@@ -56,6 +56,11 @@ class Patch:
         sensor.standard_normals(self.stream_key(stream), 0, self.left, self.top, normals)
         return normals
 
+    def noise(self, key: np.uint64, draw: int, levels: Floats) -> Floats:
+        """Return standard normal numbers for levels (h, w), correlated as the scene's noise is."""
+        correlation = self.values["noise_correlation"]
+        return sensor.normal_field(key, draw, self.left, self.top, levels.shape, correlation)
+
     def stream_key(self, stream: str) -> np.uint64:
         """Return the key of a stream of random numbers of this scene."""
         own = int.from_bytes(sha256(stream.encode()).digest()[:8], "little")
@@ -226,11 +231,8 @@ def _exposed(levels: Floats, patch: Patch) -> Floats:
 
 def _noisy(levels: Floats, patch: Patch) -> Floats:
     """Return levels with plain grey noise, which may be correlated."""
-    field = sensor.normal_field(
-        patch.noise_key, sensor.GREY_NOISE_DRAW, patch.left, patch.top, levels.shape,
-        patch.values["noise_correlation"],
-    )
-    return np.asarray(levels + patch.values["noise_grey"] * field)
+    noise = patch.noise(patch.noise_key, sensor.GREY_NOISE_DRAW, levels)
+    return np.asarray(levels + patch.values["noise_grey"] * noise)
 
 
 def _demosaiced(levels: Floats, patch: Patch) -> Floats:
@@ -249,11 +251,8 @@ def _toned(levels: Floats, patch: Patch) -> Floats:
 def _noisy_by_level(levels: Floats, patch: Patch) -> Floats:
     """Return levels with noise whose standard deviation is interpolated over the level."""
     table = patch.values["noise_table"]
-    field = sensor.normal_field(
-        patch.stream_key("noise_table"), 0, patch.left, patch.top, levels.shape,
-        patch.values["noise_correlation"],
-    )
-    return np.asarray(levels + np.interp(levels, table[::2], table[1::2]) * field)
+    noise = patch.noise(patch.stream_key("noise_table"), 0, levels)
+    return np.asarray(levels + np.interp(levels, table[::2], table[1::2]) * noise)
 
 
 EFFECTS: tuple[Effect, ...] = (

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board import corners_of, edges_on_sheet, first_overlap
+from sweep.model.board import edges_on_sheet, first_overlap
 from sweep.model.board_kinds import AprilGrid, Charuco
 
 DICTIONARY = "DICT_4X4_250"
@@ -54,8 +54,9 @@ def test_charuco_board_is_opencvs(shape, legacy):
 
 
 def squares(centres, sides, rolls):
-    return np.array([corners_of(side, *centre, np.degrees(roll))
-                     for centre, side, roll in zip(centres, sides, rolls, strict=True)])
+    return np.array([
+        np.column_stack([cv2.boxPoints((centre, (side, side), np.degrees(roll))), np.zeros(4)])
+        for centre, side, roll in zip(centres, sides, rolls, strict=True)])
 
 
 def test_squares_overlap_as_their_clipped_polygons_do():

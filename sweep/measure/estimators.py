@@ -11,12 +11,7 @@ import numpy as np
 
 from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
-from sweep.measure.estimation import (
-    Detections,
-    Estimates,
-    PoseEstimator,
-    credible_estimates,
-)
+from sweep.measure.estimation import Detections, Estimates, PoseEstimator, credible_estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.solver import OPENCV_SOLVERS, Solver

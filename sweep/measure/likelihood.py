@@ -15,29 +15,9 @@ from sweep.compilation import choose_when_compiled, compiled
 from sweep.declaration import parameter
 from sweep.measure.estimation import covariance_elsewhere, pose_covariance, solve_positive
 from sweep.measure.flags import BoundStatus
-from sweep.model import coverage
-from sweep.model.board import (
-    Board,
-    extent_of,
-    moving_edges,
-    own_sheets,
-    sheet_planes,
-    sheets_m,
-    side_m,
-    target_edges,
-    unit_m,
-    visible_prints,
-)
-from sweep.model.coverage import (
-    LEVELS,
-    POSE,
-    MarkerEdges,
-    Work,
-    differentiate,
-    joined,
-    normal_equations,
-    work_space,
-)
+from sweep.model import board, coverage
+from sweep.model.board import Board
+from sweep.model.coverage import LEVELS, POSE, MarkerEdges, Work, work_space
 from sweep.model.polygon import Optics, Projection, flat_sheet
 from sweep.model.pose import rotations, vectors
 from sweep.model.renderers import beside_pixels
@@ -155,9 +135,9 @@ def marker_view(
     outline, box = _around_middle(target)
     local = optics.intrinsics.copy()
     local[2:] -= corner
-    modules, sheets = extent_of(target).modules, FLAT
+    modules, sheets = board.extent_of(target).modules, FLAT
     if seen_from is not None and not target.is_planar:
-        outline, sheets = _seen_sheets(target, size_m / modules / unit_m(target), *seen_from)
+        outline, sheets = _seen_sheets(target, size_m / modules / board.unit_m(target), *seen_from)
     return MarkerView(
         outline, box, modules, float(size_m), Optics(local, optics.lens, optics.distorted),
         float(variance), 0.0, sheets,
@@ -171,17 +151,17 @@ def _seen_sheets(
 
     An edge at which a sheet hides another moves with the sheet in front.
     """
-    planes = sheet_planes(target, rotation, translation, scale)
+    planes, own = board.sheet_planes(target, rotation, translation, scale), board.own_sheets(target)
     groups = [
-        group for seen in visible_prints(target, planes) if seen.number < own_sheets(target)
-        for group in moving_edges(seen, planes)
+        group for seen in board.visible_prints(target, planes) if seen.number < own
+        for group in board.moving_edges(seen, planes)
     ]
     in_frame = np.array([plane for _, plane in groups]).reshape(-1, 3, 3)
     in_frame[:, :, 2] -= translation
-    radius = scale * float(np.linalg.norm(sheets_m(target)[: own_sheets(target)], axis=2).max())
+    radius = scale * float(np.linalg.norm(board.sheets_m(target)[:own], axis=2).max())
     first = np.cumsum([0, *(len(edges.ends) for edges, _ in groups)])
     sheets = Sheets(first, np.ascontiguousarray(rotation.T @ in_frame), radius)
-    return joined([edges for edges, _ in groups]), sheets
+    return coverage.joined([edges for edges, _ in groups]), sheets
 
 
 def middle_m(target: Board) -> Floats:
@@ -191,15 +171,15 @@ def middle_m(target: Board) -> Floats:
     """
     if not target.is_planar:
         return np.zeros(3)
-    extent = extent_of(target)
+    extent = board.extent_of(target)
     across, down = (extent.middle - extent.origin).tolist()
-    return np.array([across, -down, 0.0]) * unit_m(target)
+    return np.array([across, -down, 0.0]) * board.unit_m(target)
 
 
 @lru_cache(maxsize=8192)
 def _around_middle(target: Board) -> tuple[MarkerEdges, Floats]:
     """Return edges and extent of a target as :class:`MarkerView` has them."""
-    outline, extent = target_edges(target), extent_of(target)
+    outline, extent = board.target_edges(target), board.extent_of(target)
     shift = np.tile(extent.modules / 2 - extent.middle, 2)
     return MarkerEdges(outline.ends + shift, outline.sides), extent.target + shift
 
@@ -289,13 +269,13 @@ def curvature(
     grey_levels = state[GREY_LEVELS]
     sheets, count = view.sheets, 0
     if len(sheets.planes) == 0:
-        count = differentiate(
+        count = coverage.differentiate(
             work, view.edges, grey_levels, Projection(plane_of(state, view), view.optics),
             state[POSITION], state[SPREAD], 0,
         )
     for k in range(len(sheets.planes)):
         some = slice(sheets.first[k], sheets.first[k + 1])
-        count = differentiate(
+        count = coverage.differentiate(
             work, MarkerEdges(view.edges.ends[some], view.edges.sides[some]), grey_levels,
             Projection(_sheet_plane(state, sheets.planes[k]), view.optics), state[POSITION],
             state[SPREAD], count,
@@ -306,7 +286,7 @@ def curvature(
             work.slopes[slot, k] *= distance
         if spread_free and state[SPREAD] > 0.0:
             work.slopes[slot, POSE] /= 2.0 * state[SPREAD]
-    normal_equations(image, work, free, matrix, vector)
+    coverage.normal_equations(image, work, free, matrix, vector)
     explained = eliminate(matrix, vector, grey_levels, information, gradient)
     if spread_free and not state[SPREAD] > 0.0:
         # A point spread of 0 stays as it is.
@@ -989,7 +969,7 @@ def bounds(
         effects, rotation = scenes.effects.of(row), scenes.rotation[row]
         target, translation = scenes.targets[row], scenes.translation[row]
         view = marker_view(
-            target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row),
+            target, board.side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row),
             low[row], noise_variance(effects["noise_grey"]), (rotation, translation),
         )
         arm = rotation @ middle_m(target)

@@ -8,40 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.compilation import compiled, compiled_inline
+from sweep.measure import likelihood
 from sweep.measure.estimation import solve_positive
-from sweep.measure.likelihood import (
-    BLACK,
-    DEPTH,
-    FLAT,
-    MODELS,
-    OUTSIDE,
-    OUTSIDE_SHARE,
-    SPREAD,
-    TONE,
-    WHITE,
-    MarkerView,
-    Search,
-    binned_view,
-    eliminate,
-    halve,
-    locate,
-    plane_of,
-    product,
-)
+from sweep.measure.likelihood import BLACK, DEPTH, OUTSIDE, OUTSIDE_SHARE, SPREAD, TONE, WHITE
 from sweep.measure.surroundings import BoardMarker, ring_modules, surroundings
+from sweep.model import polygon
 from sweep.model.board import Board
 from sweep.model.coverage import NODES, POSE, WEIGHTS, MarkerEdges
 from sweep.model.lens import jacobian, undistort
 from sweep.model.marker import module_count
-from sweep.model.polygon import (
-    ModuleEdge,
-    Optics,
-    Projection,
-    chord_count,
-    edge_pixel,
-    flat_sheet,
-    homogeneous_pixel,
-)
+from sweep.model.polygon import ModuleEdge, Optics, Projection
 from sweep.typing import Floats, Grey, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -224,7 +200,7 @@ def add_plane(
     """
     intrinsics = projection.optics.intrinsics
     shift_x, shift_y = intrinsics[2] + 0.5, intrinsics[3] + 0.5
-    ends, sides, flat = edges.ends, edges.sides, flat_sheet()
+    ends, sides, flat = edges.ends, edges.sides, polygon.flat_sheet()
     for e in range(ends.shape[0]):
         jump = values[sides[e, 1]] - values[sides[e, 0]]
         outside = 1.0 * (sides[e, 1] == 0) - 1.0 * (sides[e, 0] == 0)
@@ -232,19 +208,21 @@ def add_plane(
             continue
         edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
         if not projection.optics.distorted:
-            x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, edge.column, edge.row)
-            x1, y1, z1 = homogeneous_pixel(
+            x0, y0, z0 = polygon.homogeneous_pixel(
+                projection, shift_x, shift_y, edge.column, edge.row
+            )
+            x1, y1, z1 = polygon.homogeneous_pixel(
                 projection, shift_x, shift_y, edge.to_column, edge.to_row
             )
             _add_segment(
                 out, jump, outside, sigma, shortest, x0 / z0, y0 / z0, x1 / z1, y1 / z1
             )
             continue
-        x, y = edge_pixel(0.0, edge, projection, flat)
-        u, v = edge_pixel(1.0, edge, projection, flat)
-        chords = chord_count(edge, 0, 1, (x, y, u, v), projection, flat)
+        x, y = polygon.edge_pixel(0.0, edge, projection, flat)
+        u, v = polygon.edge_pixel(1.0, edge, projection, flat)
+        chords = polygon.chord_count(edge, 0, 1, (x, y, u, v), projection, flat)
         for chord in range(1, chords + 1):
-            u, v = edge_pixel(chord / chords, edge, projection, flat)
+            u, v = polygon.edge_pixel(chord / chords, edge, projection, flat)
             _add_segment(
                 out, jump, outside, sigma, shortest, x + 0.5, y + 0.5, u + 0.5, v + 0.5
             )
@@ -308,7 +286,7 @@ class PhotographView(NamedTuple):
         Whether the tone curve is estimated.
     """
 
-    marker: MarkerView
+    marker: likelihood.MarkerView
     levels: Floats
     spans: Integers
     rays: Floats
@@ -367,7 +345,7 @@ def draw(view: PhotographView, state: Floats, work: System) -> None:
     height, width = view.levels.shape
     add_plane(
         work, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
-        Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
+        Projection(likelihood.plane_of(state, view.marker), view.marker.optics), state[SPREAD],
         view.panel_px,
     )
     tone = min(max(state[TONE], -MAX_TONE), MAX_TONE)
@@ -518,7 +496,7 @@ def _squares_of_photograph(
     if matrix[outside, outside] < MIN_OUTSIDE_PX:
         matrix[outside, :] = 0.0
         matrix[:, outside] = 0.0
-    squares = matrix[SIZE, SIZE] - eliminate(
+    squares = matrix[SIZE, SIZE] - likelihood.eliminate(
         matrix[:SIZE, :SIZE], matrix[SIZE, :SIZE], linear, information, gradient
     )
     black, contrast, change, toned = linear[0], linear[1], linear[2], linear[3]
@@ -542,7 +520,7 @@ def _squares_of_photograph(
     return max(float(squares), 0.0)
 
 
-MODELS[PhotographView] = _squares_of_photograph
+likelihood.MODELS[PhotographView] = _squares_of_photograph
 
 
 # --------------------------------------------------------------------------------------------------
@@ -617,9 +595,9 @@ def photograph_view(
     local[2:] -= low
     optics = Optics(local, optics.lens, optics.distorted)
     extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
-    known = MarkerView(
+    known = likelihood.MarkerView(
         surroundings(on_board or marker, extent), np.repeat([-extent, modules + extent], 2),
-        float(modules), float(size_m), optics, 0.0, MIN_SPREAD_PX, FLAT,
+        float(modules), float(size_m), optics, 0.0, MIN_SPREAD_PX, likelihood.FLAT,
     )
     to_modules[:, 2] += to_modules[:, :2] @ low
     at, spans = _fitted_pixels(
@@ -685,17 +663,17 @@ def binned_photograph(view: PhotographView) -> PhotographView:
     height, width = view.levels.shape[0] // 2, view.levels.shape[1] // 2
     levels, spans = np.empty((height, width)), np.empty((height, 2), dtype=np.int64)
     at, rays = np.empty((2, height, width)), np.empty((6, height, width))
-    halve(view.levels, 0.25, levels)
+    likelihood.halve(view.levels, 0.25, levels)
     for k in range(2):
-        halve(view.at[k], 0.25, at[k])
+        likelihood.halve(view.at[k], 0.25, at[k])
     for k in range(6):
-        halve(view.rays[k], 0.25 if k < 2 else 0.125, rays[k])
+        likelihood.halve(view.rays[k], 0.25 if k < 2 else 0.125, rays[k])
     for i in range(height):
         first = max(view.spans[2 * i, 0], view.spans[2 * i + 1, 0])
         last = min(view.spans[2 * i, 1], view.spans[2 * i + 1, 1])
         spans[i, 0] = (first + 1) // 2
         spans[i, 1] = max(last // 2, spans[i, 0])
-    marker = binned_view(view.marker)
+    marker = likelihood.binned_view(view.marker)
     return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX, view.toned)
 
 
@@ -910,9 +888,9 @@ def judge(
     freedom = pixels - SIZE - nodes
     if freedom < 1 or not solve_positive(matrix, inverse):
         return math.nan
-    influence, fitted = product(inverse, crossed), product(inverse, levels)
-    schur = total[SIZE + 1 :, SIZE + 1 :] - product(crossed.T, influence)
-    pull -= product(crossed.T, fitted)
+    influence, fitted = likelihood.product(inverse, crossed), likelihood.product(inverse, levels)
+    schur = total[SIZE + 1 :, SIZE + 1 :] - likelihood.product(crossed.T, influence)
+    pull -= likelihood.product(crossed.T, fitted)
     shifts, ridged = pull.copy(), schur.copy()
     for k in range(SIZE):
         mean_square -= fitted[k, 0] * levels[k, 0] / pixels
@@ -921,7 +899,7 @@ def judge(
     if not solve_positive(ridged, shifts):
         return math.nan
     # What is left after the best field of shifts is noise.
-    fitted -= product(influence, shifts)
+    fitted -= likelihood.product(influence, shifts)
     field = np.zeros((height, width, WIDE))
     _write_residuals(view, state, work.images, inverse, fitted, shifts, field)
     variance = _lagged(field, view, 0, 0)
@@ -935,7 +913,7 @@ def judge(
     raised = 0.0
     for m in range(POSE):
         raised += covariance[m, m] / (variance * inverse[m, m] * POSE) if variance > 0.0 else 0.0
-    spread = product(schur, schur)
+    spread = likelihood.product(schur, schur)
     square_trace = (schur * schur).sum()
     # The noise alone gives a pull of that mean, and of this standard deviation.
     excess = (pull * pull).sum() - raised * variance * np.trace(schur)
@@ -943,7 +921,7 @@ def judge(
     shift_variance = excess / (_CORRELATIONS * spread).sum() if excess > chance else 0.0
     misfit = math.sqrt(excess / square_trace) if excess > chance else 0.0
     of_pose = influence[:POSE]
-    shifted = product(of_pose, product(_CORRELATIONS, of_pose.T))
+    shifted = likelihood.product(of_pose, likelihood.product(_CORRELATIONS, of_pose.T))
     distance = abs(state[DEPTH])
     for m in range(POSE):
         for k in range(POSE):
@@ -985,7 +963,7 @@ def _write_residuals(
 # --------------------------------------------------------------------------------------------------
 # The pose in a photograph: the best minimum of several starts, and its covariance.
 
-REAL = Search(4.0, 16.0, 50.0)
+REAL = likelihood.Search(4.0, 16.0, 50.0)
 """Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
 Fits of all pixels chose the mirror at an excess of at most 44."""
 
@@ -1002,7 +980,7 @@ def locate_photograph(
     freedom = pixel_count(view) - SIZE
     coarse = binned_photograph(view)
     work = system(view.levels.shape[0], view.levels.shape[1])
-    state, level, reached, other = locate(
+    state, level, reached, other = likelihood.locate(
         view, work, freedom, coarse,
         system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL,
         np.empty((MOVED, MOVED)),

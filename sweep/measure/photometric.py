@@ -9,29 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sweep.measure.estimation import (
-    Detections,
-    Estimates,
-    covariance_elsewhere,
-    pose_covariance,
-)
+from sweep.measure import likelihood
+from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere, pose_covariance
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.likelihood import (
-    BACKGROUND_MARGIN_PX,
-    BLACK,
-    DEPTH,
-    POSITION,
-    WHITE,
-    MarkerView,
-    explains,
-    locate_exactly,
-    locate_in_sight,
-    marker_view,
-    middle_m,
-    noise_variance,
-    rotation_of,
-    state_of,
-)
+from sweep.measure.likelihood import BLACK, DEPTH, POSITION, WHITE
 from sweep.measure.photograph import SIZE, locate_photograph, photograph_view, pixel_count
 from sweep.measure.solver import (
     MIN_POINTS,
@@ -102,12 +83,11 @@ def refined_corners(one: Detections) -> Floats:
     return refined
 
 
-def start_states(
-    poses: list[Pose], middle_m: Floats, spread_px: float
-) -> Floats:
+def start_states(poses: list[Pose], middle: Floats, spread_px: float) -> Floats:
     """Return the states (K, 18) of a target's middle at the finite ones of some poses."""
+    levels = np.zeros(LEVELS)
     states = [
-        state_of(rotation, translation + rotation @ middle_m, spread_px, np.zeros(LEVELS))
+        likelihood.state_of(rotation, translation + rotation @ middle, spread_px, levels)
         for rotation, translation in poses
     ]
     return np.array([each for each in states if np.isfinite(each).all()])
@@ -132,7 +112,7 @@ def window_of(one: Detections, poses: list[Pose]) -> list[int]:
     if target.is_marker:
         low, high = one.corners[0].min(axis=0), one.corners[0].max(axis=0)
         share = 1.5 * (target.margin or 0.0) / modules
-        margin = BACKGROUND_MARGIN_PX + share * (high - low)
+        margin = likelihood.BACKGROUND_MARGIN_PX + share * (high - low)
         low, high = low - margin, high + margin
     else:
         scale = first_side_m(one) / modules
@@ -147,8 +127,8 @@ def window_of(one: Detections, poses: list[Pose]) -> list[int]:
         ])
         if not np.isfinite(pixels).any():
             return [0, 0, 0, 0]
-        low = np.nanmin(pixels, axis=0) - BACKGROUND_MARGIN_PX
-        high = np.nanmax(pixels, axis=0) + BACKGROUND_MARGIN_PX
+        low = np.nanmin(pixels, axis=0) - likelihood.BACKGROUND_MARGIN_PX
+        high = np.nanmax(pixels, axis=0) + likelihood.BACKGROUND_MARGIN_PX
     size = np.array(image.shape[::-1])
     window: list[int] = np.concatenate([
         np.clip(np.floor(low) - origin, 0, size),
@@ -204,18 +184,20 @@ class Photometric:
                 continue
             both = list(zip(*(each[i] for each in planar), strict=True))
             poses = first_poses(one, both, refined=self.refined)
-            middle = float(one.scale[0]) * middle_m(one.targets[0])
+            middle = float(one.scale[0]) * likelihood.middle_m(one.targets[0])
             states = self._fitted(one, poses, middle, out, i) if poses else None
             if states is None:
                 continue
             points, pixels = one.objects_m.reshape(-1, 3), one.corners.reshape(-1, 2)
-            out.rotation[i], out.translation[i] = rotation_of(states[0]), states[0][POSITION]
-            out.alternative_rotation[i] = rotation_of(states[1])
+            (rotation, position), (turned, moved) = (
+                (likelihood.rotation_of(state), state[POSITION]) for state in states
+            )
+            out.rotation[i], out.translation[i] = rotation, position
+            out.alternative_rotation[i] = turned
             out.reprojection_px[i], out.alternative_reprojection_px[i] = (
-                reprojection_px(
-                    rotation_of(state), state[POSITION] - rotation_of(state) @ middle,
-                    points, pixels, one.cameras,
-                ) for state in states
+                reprojection_px(*pose, points, pixels, one.cameras) for pose in (
+                    (rotation, position - rotation @ middle), (turned, moved - turned @ middle)
+                )
             )
             out.point_count[i] = len(pixels)
             arm = -out.rotation[i] @ middle
@@ -243,16 +225,16 @@ class Photometric:
         free = POSE + 1 if self.spread_free else POSE
         information = np.empty((free, free))
 
-        def seen_from(pose: Pose) -> MarkerView:
-            return marker_view(
+        def seen_from(pose: Pose) -> likelihood.MarkerView:
+            return likelihood.marker_view(
                 one.targets[0], first_side_m(one), one.cameras.optics(0),
-                one.origins[0] + np.array([left, top]), noise_variance(noise_grey), pose,
+                one.origins[0] + np.array([left, top]), likelihood.noise_variance(noise_grey), pose,
             )
 
         view = seen_from(poses[0])
         state, level, reached, other, freedom = (
-            locate_exactly(image, starts, view, information) if one.targets[0].is_planar
-            else locate_in_sight(image, starts, view, seen_from, information)
+            likelihood.locate_exactly(image, starts, view, information) if one.targets[0].is_planar
+            else likelihood.locate_in_sight(image, starts, view, seen_from, information)
         )
         if not math.isfinite(level) or freedom < 1:
             return None
@@ -261,7 +243,7 @@ class Photometric:
             return None
         chi_square = level / view.variance
         out.status[i] = (
-            EstimateStatus.solved if explains(chi_square, freedom, noise_grey)
+            EstimateStatus.solved if likelihood.explains(chi_square, freedom, noise_grey)
             else EstimateStatus.not_explained
         )
         covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
@@ -308,5 +290,6 @@ class PhotometricReal(Photometric):
             EstimateStatus.not_explained if misfit > MAX_MISFIT_PX else EstimateStatus.solved
         )
         out.covariance[i], out.misfit_px[i] = covariance, misfit
-        out.residual_ratio[i] = level / (noise_variance(float(one.noise_grey[0])) * freedom)
+        noise = likelihood.noise_variance(float(one.noise_grey[0]))
+        out.residual_ratio[i] = level / (noise * freedom)
         return state, other

@@ -12,13 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.estimation import (
-    Detections,
-    Estimates,
-    PoseEstimator,
-    credible_estimates,
-    point_covariance,
-)
+from sweep.measure import estimation
+from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
 from sweep.model.marker import marker_corners
@@ -57,7 +52,7 @@ class Solver:
     """
 
     meaning: str
-    build: Callable[[Any], PoseEstimator]
+    build: Callable[[Any], estimation.PoseEstimator]
     method: Any = None
     needs_images: bool = False
     guarded: bool = False
@@ -561,7 +556,7 @@ class PointSolver:
         rotation, translation = square_poses(
             detections.corners, detections.cameras, detections.size_m, self.solver, self.guarded
         )
-        return credible_estimates(
+        return estimation.credible_estimates(
             detections, rotation[:, 0], translation[:, 0], self.reprojection_limit,
             alternative=(rotation[:, 1], translation[:, 1]),
             corner_noise_px=self.corner_noise_px,
@@ -584,7 +579,7 @@ class PointSolver:
         out.rotation[i], out.translation[i], out.reprojection_px[i], used = best
         out.alternative_rotation[i], _, out.alternative_reprojection_px[i], _ = other
         if self.corner_noise_px is not None:
-            out.covariance[i] = point_covariance(
+            out.covariance[i] = estimation.point_covariance(
                 best.rotation[None], best.translation[None], used[None],
                 np.zeros(1, dtype=np.int64), one.cameras, self.corner_noise_px,
             )[0]

@@ -8,16 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.measure import detectors
 from sweep.measure.classify import Findings, TargetScenes
-from sweep.measure.detectors import (
-    AnyDetectorSetting,
-    BoardDetectorSetting,
-    DetectorSetting,
-    FindFunction,
-    SearchOutput,
-    completed,
-    make_detector,
-)
+from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
@@ -39,17 +32,17 @@ class ImageSearch:
         What the images show.
     """
 
-    setting: AnyDetectorSetting
-    on_board: BoardDetectorSetting
+    setting: detectors.AnyDetectorSetting
+    on_board: detectors.BoardDetectorSetting
     scenes: Scenes
     targets: TargetScenes
     needs_images: bool = True
-    _find: FindFunction = field(init=False)
+    _find: detectors.FindFunction = field(init=False)
     _sides: list[int] = field(init=False)
     _last: tuple[Grey, str, SearchOutput] | None = None
 
     def __post_init__(self) -> None:
-        self._find = make_detector(self.setting)
+        self._find = detectors.make_detector(self.setting)
         self._sides = self.scenes.frame.max(axis=1).tolist()
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
@@ -62,8 +55,10 @@ class ImageSearch:
         if target.is_marker:
             output = SearchOutput(*found)
         else:
-            own = self.setting if isinstance(self.setting, DetectorSetting) else DetectorSetting()
-            output = completed(image, target, found, self.on_board, own)
+            opencv, own = detectors.DetectorSetting, self.setting
+            output = detectors.completed(
+                image, target, found, self.on_board, own if isinstance(own, opencv) else opencv()
+            )
         self._last = image, dictionary, output
         return output
 
@@ -158,7 +153,7 @@ the place of both if there never are any.
 
 
 def detection_source(
-    setting: AnyDetectorSetting, on_board: BoardDetectorSetting, scenes: Scenes,
+    setting: detectors.AnyDetectorSetting, on_board: detectors.BoardDetectorSetting, scenes: Scenes,
     targets: TargetScenes, keys: Callable[[], NDArray[np.uint64]],
 ) -> DetectionSource:
     """Return where the detections of N scenes with a setting come from.

@@ -1,5 +1,6 @@
 """Costs and sizes: measured within a limit, memory flat and plans lazy, whatever the grid."""
 
+import itertools
 import json
 import math
 import os
@@ -8,6 +9,7 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import psutil
 import pytest
 
@@ -107,7 +109,7 @@ trial = %d
 CLIENT = """
 import json, sys
 import synthetic
-synthetic.install()
+synthetic.dask_setup()
 from sweep.execution.runner import execute
 from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
@@ -151,7 +153,11 @@ def test_memory_of_client_and_scheduler_does_not_grow_with_the_grid(tmp_path):
     assert large["scheduler"] < 1.25 * small["scheduler"]
 
 
-def test_a_billion_poses_are_planned_lazily():
+def test_blocks_cover_the_grid_once_and_a_billion_poses_are_planned_lazily():
+    scenes = [tuple(np.transpose(block.indices())) for block in Blocks((7, 5), (3, 2))]
+    assert len(scenes) == 9
+    cells = sorted(tuple(cell) for block in scenes for cell in block)
+    assert cells == list(itertools.product(range(7), range(5)))
     pipeline = Pipeline.from_text(GRID % 100_000)
     assert pipeline.size(Stage.scene) == 10**9
     blocks = Blocks(tuple(len(axis) for axis in pipeline.experiment.scene_axes), (1, 200, 20))

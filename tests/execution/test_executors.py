@@ -188,14 +188,11 @@ def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(tmp_path
     assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
 
 
-@pytest.mark.parametrize("client", ["tcp://127.0.0.1:9", 3, object()])
-def test_what_is_no_client_is_refused(client):
-    assert "expected a distributed.Client or a cluster object" in refusal(client)
-
-
-@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a"])
-def test_what_is_no_address_is_refused(address):
-    assert "expected an address such as tcp://host:8786" in refusal(None, address)
+def test_what_is_no_client_and_what_is_no_address_are_refused():
+    for client in ("tcp://127.0.0.1:9", 3, object()):
+        assert "expected a distributed.Client or a cluster object" in refusal(client)
+    for address in ("nowhere", "tcp://", "tcp://a:b", "tcp://a"):
+        assert "expected an address such as tcp://host:8786" in refusal(None, address)
 
 
 def test_run_without_progress_says_so_once_in_a_while(monkeypatch, capsys):

@@ -14,30 +14,20 @@ from scipy.spatial.transform import Rotation
 
 import sweep
 from support.commands import started
-from support.stores import by_hand, same
+from support.stores import GRID, by_hand, same
 from sweep.analysis import compare, detection_rate
 from sweep.errors import ArgumentError, DatasetError, MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
 from sweep.execution.status import status
-from sweep.experiment.grid import Blocks
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import provenance
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.provenance import builds
 
-TEXT = """
-title = "A small grid with every kind of axis"
-seed = 5
-[marker]
-size_m = 0.04
-[pose]
-jitter_px = 0.5
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 128
+TEXT = GRID.partition("[axes]")[0].replace("seed = 11", "seed = 5") + """
 [axes]
 dictionary = ["DICT_4X4_50", "DICT_5X5_50"]
 distance_m = { geom = [0.2, 1.5, 4] }
@@ -233,15 +223,6 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
     state = status(str(tmp_path / "runs" / "long.zarr"))
     assert not state.being_written
     assert 0 < state.blocks_done < state.blocks
-
-
-def test_blocks_cover_the_grid_once():
-    blocks = Blocks((7, 5), (3, 2))
-    seen = np.zeros((7, 5), dtype=int)
-    for block in blocks:
-        seen[block.starts[0] : block.stops[0], block.starts[1] : block.stops[1]] += 1
-    assert (seen == 1).all()
-    assert len(blocks) == 9
 
 
 def test_another_build_of_the_same_version_is_refused_by_run_reuse_and_workers(

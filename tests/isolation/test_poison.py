@@ -10,6 +10,7 @@ import xarray as xr
 
 from support.commands import command, complaints
 from support.poison import RAISES, Poison, poisoned
+from support.stores import GRID as TEXT
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.experiment.parameters import Stage
@@ -21,24 +22,6 @@ from sweep.store.lifecycle import create_store, open_store
 
 pytestmark = pytest.mark.system
 
-
-TEXT = """
-title = "Scenes of which some are poisoned"
-seed = 11
-[marker]
-size_m = 0.04
-[pose]
-jitter_px = 0.5
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 128
-[axes]
-distance_m = [0.2, 0.3, 0.4]
-cornerRefinementMethod = ["none", "subpix"]
-tilt_deg = [10, 45]
-solver = ["ippe_square", "iterative"]
-trial = 8
-"""
 
 SUBPIX = (("cornerRefinementMethod", "subpix"),)
 ITERATIVE = (("solver", "iterative"),)

@@ -8,6 +8,20 @@ from sweep.experiment.grid import TRIAL
 from sweep.sampling.rules import block_unit, make_rule
 from sweep.store.lifecycle import create_store
 
+GRID = """
+seed = 11
+marker = { size_m = 0.04 }
+pose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }
+scene = { background = 128 }
+[axes]
+distance_m = [0.2, 0.3, 0.4]
+cornerRefinementMethod = ["none", "subpix"]
+tilt_deg = [10, 45]
+solver = ["ippe_square", "iterative"]
+trial = 8
+"""
+"""A grid of 96 scenes with axes of every stage."""
+
 
 def by_hand(url, pipeline, extents=None):
     """Compute a store in this process, without a cluster; as one block unless extents are given.

@@ -377,8 +377,7 @@ def _of_symmetric(matrices: Floats, function: Callable[[Floats], Floats]) -> Flo
 
 def _flip_basis(at: Floats, ratio: Floats, knots: Sequence[Floats]) -> Floats:
     """Return hat functions (n, knots) of ambiguity, side and viewing angle."""
-    with np.errstate(divide="ignore"):
-        return hat_basis(np.column_stack([np.log(ratio), at]), knots)
+    return hat_basis(np.column_stack([np.log(np.maximum(ratio, 1e-300)), at]), knots)
 
 
 def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:

@@ -239,7 +239,6 @@ def _scaled(_: Observations, points: Floats, spread: Floats) -> Sequence[Floats]
 # All causes; prior weights follow how often public questions turned out to be each.
 AGREE = "agree"
 FLIPS = "flips"
-UNITS_TAKEN = "units"
 STRAIGHT = "z_for_range"
 CAUSES = (
     Cause(AGREE, "the numbers agree with what is expected", 4.0, "nothing to test"),
@@ -251,7 +250,7 @@ CAUSES = (
           "compare the file's image size with the image's",
           lambda _: ratios(FOCAL_RATIOS, 0.4, (0, 0, 1)),
           lambda _, points, spread: [points * spread * [0.0, 0.0, 1.0]]),
-    Cause(UNITS_TAKEN, "units taken for one another (m, cm, mm, inch, foot)", 1.0,
+    Cause("units", "units taken for one another (m, cm, mm, inch, foot)", 1.0,
           "print size and tvec with their units", _unit_ways, _scaled),
     Cause(STRAIGHT, "z taken for the straight distance", 1.5,
           "compare the tape with sqrt(x² + y² + z²)", lacks=_straight),
@@ -435,7 +434,7 @@ def rank(rows: Observations) -> list[Explanation]:
     """Return all explanations of observations, by posterior probability."""
     found = [cause for cause in CAUSES if not cause.lacks(rows)]
     total = sum(cause.prior for cause in found)
-    paired = [cause for cause in found if cause.name not in {AGREE, UNITS_TAKEN}]
+    paired = [cause for cause in found if cause.name not in {AGREE, "units"}]
     explanations = [
         explain(rows, causes, math.log(
             PAIRS_PRIOR ** (len(causes) - 1) * math.prod(cause.prior / total for cause in causes)))

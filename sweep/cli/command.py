@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import errno
 import inspect
 import io
@@ -29,6 +30,7 @@ from sweep.errors import (
 from sweep.messages import notice, plain, quoted
 
 if TYPE_CHECKING:
+    from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
     from sweep.report.table import Findings
 
@@ -299,13 +301,6 @@ AS_MODULE = ("sweep", "__main__.py")
 MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
 
-OTHER_FORMATS = {
-    ".jpg", ".jpeg", ".svg", ".pdf", ".gif", ".tif", ".tiff", ".bmp", ".webp", ".html", ".toml",
-    ".zarr", ".csv", ".json",
-}
-"""Suffixes of files that a PNG image would not be taken for."""
-
-
 def say(text: str = "") -> None:
     """Print lines without control characters, whosever names they quote."""
     print("\n".join(plain(line, len(line)) for line in text.split("\n")))
@@ -392,23 +387,41 @@ def check_png(output: str) -> None:
     StoreError
         If it cannot be.
     """
-    if Path(output).suffix.lower() in OTHER_FORMATS:
+    if Path(output).suffix.lower() not in {"", ".png"}:
         raise ArgumentError("output", output, "expected a file that ends in .png")
     library.output_file.check_output_file(Path(output))
 
 
-def write_png(output: str, image: Any) -> None:
-    """Write an image (h, w) or (h, w, 3), blue-green-red, as a PNG file.
+def listed(texts: Sequence[str], more: str) -> list[str]:
+    """Return the first lines of many, and a line on the others, if there are more."""
+    return [*texts[:MAX_LINES], *([more] if len(texts) > MAX_LINES else [])]
 
-    Raises
-    ------
-    StoreError
-        If the file cannot be written.
-    """
-    import cv2  # noqa: PLC0415
 
-    _, encoded = cv2.imencode(".png", image)
-    library.output_file.write_output_file(Path(output), encoded.tobytes())
+def executed(
+    pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
+) -> Summary:
+    """Run a pipeline into a store, after lines on stderr on what it was made of."""
+    announce_compilation(pipeline)
+    for line in lines:
+        notice(line)
+    SESSION.stopped = CONTINUES
+    with library.progress.progress_display() as display:
+        return library.runner.execute(
+            pipeline, store, workers=workers, overwrite=overwrite, progress=display)
+
+
+def summarised(
+    summary: Summary, line: str, notes: Sequence[str] = (), then: str = "", **numbers: Any
+) -> Findings:
+    """Return what became of a run: ``line``, the dataset, warnings, and what to do next."""
+    again = [] if summary.computed_blocks or summary.retried else [
+        f"{summary.store} is already finished; --overwrite recomputes it"
+        + (" and --retry-failed what failed" if summary.failures and "retry_failed" in SESSION.flags
+           else "")]
+    return findings(
+        [*notes, *again, line, f'xarray.open_zarr("{summary.data}")', *summary.warnings],
+        dataclasses.asdict(summary) | numbers, int(summary.nothing_computed),
+        then or summary.advice or f"sweep report {quoted(summary.store)}")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -17,10 +17,11 @@ from sweep.cli.command import (
     check_png,
     command,
     findings,
+    listed,
     precision_settings,
     read_pipeline,
     store_of,
-    write_png,
+    summarised,
 )
 from sweep.errors import ArgumentError
 from sweep.execution import BLOCK_TASK
@@ -28,6 +29,7 @@ from sweep.isolation.child_process import Child
 from sweep.messages import byte_count, duration, plain, quoted
 
 if TYPE_CHECKING:
+    from sweep.evaluation.inspection import SceneInspection
     from sweep.execution.forecast import Forecast
     from sweep.execution.progress import Progress
     from sweep.execution.status import Summary
@@ -103,28 +105,25 @@ def run(
             overwrite=overwrite, retry_failed=retry_failed, yes=yes, time_limit_s=time_limit_s,
             progress=report, child=child)
     rate = summary.computed_scenes / max(summary.seconds, 1e-3)
-    lines = [
-        f"camera: {read.facts.camera_line}", *_again(summary, retry_failed=retry_failed),
-        f"{_poses(summary)}, {summary.detected_line}"
-        + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else ""),
-        f'xarray.open_zarr("{summary.data}")', *summary.warnings]
-    then = summary.advice or f"sweep report {quoted(summary.store)}"
-    if read.requirements and not summary.advice:
-        then, notes = _requiring_command(read, summary.store)
-        lines += notes
-    return findings(lines, summary, int(summary.nothing_computed), then)
-
-
-def _again(summary: Summary, *, retry_failed: bool) -> list[str]:
-    """Return a line on a store that there was before."""
+    speed = f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else ""
+    notes = [f"camera: {read.facts.camera_line}"]
     if summary.retried:
-        return [f"{summary.retried:,} failed cells tried again, {summary.recovered:,} computed now"]
-    if summary.computed_blocks:
-        return []
-    if retry_failed:
-        return [f"{summary.store}: no cell failed or crashed; nothing is tried again"]
-    failed = " and --retry-failed what failed" if summary.failures else ""
-    return [f"{summary.store} is already finished; --overwrite recomputes it{failed}"]
+        notes.append(
+            f"{summary.retried:,} failed cells tried again, {summary.recovered:,} computed now")
+    elif retry_failed and not summary.computed_blocks:
+        notes.append(f"{summary.store}: no cell failed or crashed; nothing is tried again")
+    then = ""
+    if read.requirements and not summary.advice:
+        # A store keeps the requirements that it was made with: others are given.
+        words, stored = [], library.lifecycle.open_store(summary.store).pipeline
+        if (stored.requirements, stored.require_per) != (read.requirements, read.require_per):
+            per = ",".join(_conditions(read))
+            words = [*read.requirements, *(["--per", per] if per else [])]
+            notes.append("the store keeps the requirements that it was made with; the last line "
+                         "has the new ones")
+        then = quoted("sweep", "require", summary.store, *words)
+    return summarised(
+        summary, f"{_poses(summary)}, {summary.detected_line}{speed}", notes, then)
 
 
 def _poses(summary: Summary) -> str:
@@ -136,20 +135,6 @@ def _poses(summary: Summary) -> str:
         f"{settled:,} of {summary.conditions:,} conditions settled with {summary.needed:,} poses "
         f"({summary.poses:,} with all trials)"
     )
-
-
-def _requiring_command(pipeline: Pipeline, url: str) -> tuple[str, list[str]]:
-    """Return the command that decides on the pipeline's requirements, and a line on it.
-
-    A store keeps those that it was made with: others are given.
-    """
-    stored = library.lifecycle.open_store(url).pipeline
-    if (stored.requirements, stored.require_per) == (pipeline.requirements, pipeline.require_per):
-        return f"sweep require {quoted(url)}", []
-    per = _conditions(pipeline)
-    return quoted("sweep", "require", url, *pipeline.requirements,
-                  *(["--per", ",".join(per)] if per else [])), [
-        "the store keeps the requirements that it was made with; the next line has the new ones"]
 
 
 def _conditions(pipeline: Pipeline) -> list[str]:
@@ -297,8 +282,7 @@ def show(
     check_png(output)
     single = library.pipeline.cell(read, ",".join(at))
     scene = library.inspection.inspect_scene(single, whole_frame=full)
-    write_png(output, scene.image if plain else library.scenes.draw_scene(
-        scene, library.pipeline.coordinates_text(read, single)))
+    _write_image(output, scene.image, None if plain else scene, read, single)
     return findings(
         [f"{output}: {scene.detection.name}, {scene.estimate.name}"],
         {"output": output, "detection": scene.detection, "estimate": scene.estimate,
@@ -348,8 +332,12 @@ def repro(
         cells.append(again)
         lines += [""] if lines else []
         lines += _cell_lines(again)
+        if output is not None and again.image is not None:
+            _write_image(output, again.image, None if plain else again.inspection,
+                         again.pipeline, again.cell_pipeline)
         if output is not None:
-            lines.append(_written_image(again, output, plain=plain))
+            lines.append("no image: rendering failed" if again.image is None
+                         else f"{output}: image of the cell")
         lines.append(_verdict(again))
     status = int(any(each.difference for each in cells))
     shown = ("at", "stored", "recomputed", "difference", "exact", "seconds", "failures", "changes")
@@ -378,17 +366,16 @@ def _cell_lines(again: Reproduction) -> Iterator[Any]:
         yield from (plain(line, 1000) for line in failure.text.strip().splitlines())
 
 
-def _written_image(again: Reproduction, output: str, *, plain: bool) -> str:
-    """Write the image of a cell; return a line on it."""
-    if again.image is None:
-        return "no image: rendering failed"
-    image = again.image
-    if again.inspection is not None and not plain:
-        image = library.scenes.draw_scene(
-            again.inspection,
-            library.pipeline.coordinates_text(again.pipeline, again.cell_pipeline))
-    write_png(output, image)
-    return f"{output}: image of the cell"
+def _write_image(
+    output: str, image: Any, scene: SceneInspection | None, pipeline: Pipeline, cell: Pipeline
+) -> None:
+    """Write the image of a cell as PNG, with what was found in its scene unless that is None."""
+    import cv2  # noqa: PLC0415
+
+    if scene is not None:
+        image = library.scenes.draw_scene(scene, library.pipeline.coordinates_text(pipeline, cell))
+    library.output_file.write_output_file(
+        Path(output), cv2.imencode(".png", image)[1].tobytes())
 
 
 def _verdict(again: Reproduction) -> str:
@@ -451,10 +438,9 @@ def status(store: str) -> Findings:
         rows["time left"] = duration(state.seconds_left)
     lines = [f"{state.title}: {what}", *(f"  {name:11} {text}" for name, text in rows.items())]
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
-        lines += [f"  {kind:11} --at {quoted(cell.at)}  {cell.stage}: {plain(cell.reason, 300)}"
-                  for cell in cells[:MAX_LINES]]
-        if len(cells) > MAX_LINES:
-            lines.append(f"  {kind:11} and more; --json lists the first 1,000")
+        lines += listed(
+            [f"  {kind:11} --at {quoted(cell.at)}  {cell.stage}: {plain(cell.reason, 300)}"
+             for cell in cells], f"  {kind:11} and more; --json lists the first 1,000")
     then = state.advice or f"sweep report {quoted(store)}"
     if not state.finished:
         then = f"sweep {'status' if state.being_written else 'run'} {quoted(store)}"
@@ -490,11 +476,10 @@ def verify(
     unstable = [each for each in report.damage if each.where == report.unstable]
     damaged = [each for each in report.damage if each not in unstable]
     lines = []
-    for what, listed in (("repaired", report.repaired), ("damaged", damaged)):
-        lines += [f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}"
-                  for damage in listed[:MAX_LINES]]
-        if len(listed) > MAX_LINES:
-            lines.append(f"{what:9} and {len(listed) - MAX_LINES:,} more; --json lists all")
+    for what, damages in (("repaired", report.repaired), ("damaged", damaged)):
+        lines += listed(
+            [f"{what:9} {plain(each.where, 300)}: {plain(each.what, 300)}" for each in damages],
+            f"{what:9} and {len(damages) - MAX_LINES:,} more; --json lists all")
     lines += [plain(each.what, 600) for each in unstable]
     if report.left_over:
         lines.append(f"{len(report.left_over):,} files do not belong to the store, such as "
@@ -515,13 +500,5 @@ def verify(
     elif report.damage:
         then = f"sweep run {url} --overwrite", "computes all of it again"
     else:
-        then = f"sweep {_following(store, finished=report.finished)} {url}", ""
+        then = f"sweep {'report' if report.finished else 'status'} {url}", ""
     return findings(lines, report, int(bool(report.damage)), *then)
-
-
-def _following(url: str, *, finished: bool) -> str:
-    """Return the command to go on with after a sound store."""
-    if finished:
-        return "report"
-    is_written = library.lock.is_written(library.lifecycle.open_store(url).storage)
-    return "status" if is_written else "run"

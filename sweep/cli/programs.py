@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shlex
 import sys
@@ -16,41 +15,18 @@ from sweep.cli.command import (
     SESSION,
     announce_compilation,
     command,
+    executed,
     findings,
     quiet_matplotlib,
     read_pipeline,
+    summarised,
 )
 from sweep.errors import ArgumentError
 from sweep.messages import byte_count, notice, quoted
 
 if TYPE_CHECKING:
     from sweep.conformance.check import ConformanceReport
-    from sweep.execution.status import Summary
-    from sweep.experiment.pipeline import Pipeline
     from sweep.report.table import Findings
-
-
-def _run_prepared(
-    pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
-) -> Summary:
-    """Run a pipeline into a store, after lines on stderr on what it was made of."""
-    announce_compilation(pipeline)
-    for line in lines:
-        notice(line)
-    SESSION.stopped = CONTINUES
-    with library.progress.progress_display() as display:
-        return library.runner.execute(
-            pipeline, store, workers=workers, overwrite=overwrite, progress=display)
-
-
-def _summary(summary: Summary, line: str, **numbers: Any) -> Findings:
-    """Return what became of a run: ``line``, the dataset, warnings, and what to do next."""
-    again = [] if summary.computed_blocks else [
-        f"{summary.store} is already finished; --overwrite measures it again"]
-    return findings(
-        [*again, line, f'xarray.open_zarr("{summary.data}")', *summary.warnings],
-        dataclasses.asdict(summary) | numbers, int(summary.nothing_computed),
-        summary.advice or f"sweep report {quoted(summary.store)}")
 
 
 @command("pipelines/photographs/README.md", {
@@ -92,12 +68,12 @@ def photos(
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
         name=name, overwrite=overwrite)
-    summary = _run_prepared(
+    summary = executed(
         prepared.pipeline, store or str(Path(home) / f"{prepared.pipeline.name}.zarr"),
         prepared.lines, workers, overwrite=overwrite)
     count = prepared.pipeline.size(library.parameters.Stage.detection)
     each = f" with {count} detector settings" if count > 1 else ""
-    return _summary(
+    return summarised(
         summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
         f"{summary.detected_line}{each}", photographs=prepared.lines)
 
@@ -282,10 +258,10 @@ def score(
         conventions=library.answers.Conventions.of(pixel_center, corner_order, frame),
         doubled=doubled, beside=beside, settings=settings)
     with scored.withdrawn_if_refused():
-        summary = _run_prepared(
+        summary = executed(
             scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
             overwrite=overwrite)
-    return _summary(
+    return summarised(
         summary, f"{summary.poses:,} poses, {summary.detected_line}", answers=scored.lines)
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from sweep.analysis.dataset import DRAWS, computed_scenes
 from sweep.analysis.decisions import Answer, answers
@@ -105,14 +106,12 @@ def choice_costs(
         for k in members:
             index = [_position(axes[name].values, found[k].alternative[name]) for name in settings]
             column = int(np.ravel_multi_index(index, lengths)) if settings else 0
-            ms = ends[0][rows, column]
-            if np.isnan(ms).all():
-                continue
-            worst = int(np.nanargmax(ms))
-            at = conditions[worst]
-            median, low, high = (float(end[rows, column][worst]) for end in ends)
-            out[k] = Cost(
-                median, low, high, {name: axes[name].values[i] for name, i in at.items()})
+            of_one = np.array([end[rows, column] for end in ends])
+            if not np.isnan(of_one[0]).all():
+                worst = int(np.nanargmax(of_one[0]))
+                ms, low, high = of_one[:, worst].tolist()
+                out[k] = Cost(ms, low, high, {
+                    name: axes[name].values[i] for name, i in conditions[worst].items()})
     return out
 
 
@@ -139,7 +138,7 @@ SECONDS = 20.0
 """Time limit of the measurement of costs, in seconds."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Choice:
     """What a search found.
 
@@ -153,12 +152,6 @@ class Choice:
         How many conditions there are.
     answers, costs
         Of each alternative; a cost is None where it was not measured.
-    best
-        The number of the alternative that is chosen; None if none meets everything.
-    next
-        The number of the alternative that would be better and fails; None if there is none.
-    front
-        Numbers of the alternatives than which no other is as good and cheaper.
     poses, cells, most_trials
         Poses that were computed; scenes of the grid without its trials, and the most trials that
         one of them took: their product is what a grid of equally many trials takes.
@@ -172,9 +165,6 @@ class Choice:
     conditions: int
     answers: tuple[Answer, ...]
     costs: tuple[Cost | None, ...]
-    best: int | None
-    next: int | None
-    front: tuple[int, ...]
     poses: int
     cells: int
     most_trials: int
@@ -184,6 +174,37 @@ class Choice:
     def grid_poses(self) -> int:
         """Poses of a grid with as many trials everywhere as the cell that took most."""
         return self.cells * self.most_trials
+
+    def rank(self, k: int, *, possible: bool = False) -> tuple[float, float]:
+        """Return what is smaller for a better alternative: the value that is sought, then the cost.
+
+        ``possible``: with the last value that it may have.
+        """
+        answer, cost = self.answers[k], self.costs[k]
+        value = (answer.possible if possible and answer.is_open else answer.value) or 0.0
+        return -value if self.rule.largest else value, math.inf if cost is None else cost.ms
+
+    @cached_property
+    def best(self) -> int | None:
+        """The number of the alternative that is chosen; None if none meets everything."""
+        good = [k for k, answer in enumerate(self.answers) if answer.met and self.within_budget(k)]
+        return min(good, key=self.rank, default=None)
+
+    @cached_property
+    def next(self) -> int | None:
+        """The number of the alternative that would be better and fails; None if there is none."""
+        if self.best is None or self.rule.along:
+            return None if self.best is None or self.answers[self.best].next is None else self.best
+        cheaper = [k for k, answer in enumerate(self.answers)
+                   if not answer.met and self.rank(k) < self.rank(self.best)]
+        return max(cheaper, key=self.rank, default=None)
+
+    @cached_property
+    def front(self) -> tuple[int, ...]:
+        """Numbers of the alternatives than which no other is as good and cheaper."""
+        known = [k for k, answer in enumerate(self.answers) if answer.met and self.costs[k]]
+        value, ms = np.array([self.rank(k) for k in known]).reshape(-1, 2).T
+        return tuple(itertools.compress(known, pareto_front(ms, value)))
 
     @property
     def is_undecided(self) -> bool:
@@ -204,11 +225,7 @@ class Choice:
         open_cost = answer.met and not self.within_budget(k)
         if too_dear or not (answer.is_open or open_cost):
             return False
-        if self.best is None:
-            return True
-        value = answer.possible if answer.is_open else answer.value
-        chosen = _rank(self.answers[self.best].value, self.costs[self.best], self.rule)
-        return _rank(value, cost, self.rule) < chosen
+        return self.best is None or self.rank(k, possible=True) < self.rank(self.best)
 
     def within_budget(self, k: int) -> bool:
         """Return whether an alternative's cost is within the budget, with its interval."""
@@ -253,15 +270,10 @@ def search_choice(
     if len(found) > 1 or pipeline.budget_ms is not None:
         costs = choice_costs(
             pipeline, rule, found, limit_s, stage or (lambda _what, _share: None))
-    poses, count, most = _poses(results)
-    good = [k for k, answer in enumerate(found) if answer.met and (
-        pipeline.budget_ms is None
-        or ((cost := costs[k]) is not None and cost.high <= pipeline.budget_ms))]
-    best = min(good, key=lambda k: _rank(found[k].value, costs[k], rule), default=None)
+    trials = computed_scenes(results).sum(DRAWS).compute()
     return Choice(
-        summary.store, rule, pipeline.budget_ms, cells.decision.shape[2], found, tuple(costs), best,
-        _next(found, costs, rule, best), _front(found, costs, rule), poses, count, most,
-        tuple(summary.warnings))
+        summary.store, rule, pipeline.budget_ms, cells.decision.shape[2], found, tuple(costs),
+        int(trials.sum()), trials.size, int(trials.max()), tuple(summary.warnings))
 
 
 def chosen_by(pipeline: Pipeline) -> StoppingRule:
@@ -271,41 +283,3 @@ def chosen_by(pipeline: Pipeline) -> StoppingRule:
         return rule
     example = 'smallest = "size_m", max_trials = 5000'
     raise refusal([f"{pipeline.source}: expected what is chosen: [{SEARCH}] {example}"])
-
-
-def _rank(value: float | None, cost: Cost | None, rule: StoppingRule) -> tuple[float, float]:
-    """Return what is smaller for a better answer: the value that is sought, then the cost."""
-    value = 0.0 if value is None else -value if rule.largest else value
-    return value, math.inf if cost is None else cost.ms
-
-
-def _next(
-    found: Sequence[Answer], costs: Sequence[Cost | None], rule: StoppingRule, best: int | None
-) -> int | None:
-    """Return the alternative whose next value fails, or is undecided, nearest to the answer."""
-    if best is None:
-        return None
-    if rule.along:
-        return best if found[best].next is not None else None
-    chosen = _rank(found[best].value, costs[best], rule)
-    cheaper = [k for k, answer in enumerate(found)
-               if not answer.met and _rank(answer.value, costs[k], rule) < chosen]
-    return max(cheaper, key=lambda k: _rank(found[k].value, costs[k], rule), default=None)
-
-
-def _front(
-    found: Sequence[Answer], costs: Sequence[Cost | None], rule: StoppingRule
-) -> tuple[int, ...]:
-    """Return the alternatives than which no other is as good and cheaper."""
-    known = [(k, cost) for k, cost in enumerate(costs) if found[k].met and cost is not None]
-    if not known:
-        return ()
-    values = np.array([_rank(found[k].value, cost, rule)[0] for k, cost in known])
-    on_front = pareto_front(np.array([cost.ms for _, cost in known]), values - values.min() + 1.0)
-    return tuple(k for (k, _), is_on in zip(known, on_front, strict=True) if is_on)
-
-
-def _poses(results: xr.Dataset) -> tuple[int, int, int]:
-    """Return the poses that were computed, the scenes without trials, and the most trials."""
-    trials = computed_scenes(results).sum(DRAWS).compute()
-    return int(trials.sum()), trials.size, int(trials.max())

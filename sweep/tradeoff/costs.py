@@ -219,12 +219,12 @@ class Costs:
     estimation
         (R, C, D, E) seconds a frame, those without a detection included.
     frames
-        (C,) images that were measured.
+        (C,) images that were measured, NaN if no scene is visible.
     """
 
     detection: Floats
     estimation: Floats
-    frames: NDArray[np.int64]
+    frames: Floats
 
     @property
     def total(self) -> Floats:
@@ -237,17 +237,6 @@ class Costs:
         total = self.total
         with np.errstate(invalid="ignore"):
             return np.asarray(total / total[:, :, :1, :1])
-
-
-@dataclass(frozen=True, slots=True)
-class _Condition:
-    """The scenes of a condition, ready to be measured."""
-
-    batch: SceneBatch
-    searches: list[SearchResult]
-    """The result of each detector setting, with the image that it searches of each scene."""
-    sources: list[DetectionSource]
-    """What finds targets in an image, of each detector setting."""
 
 
 @single_threaded()
@@ -273,43 +262,35 @@ def measure(
         Called after each round with the share of the time limit that is used.
     """
     started = time.perf_counter()
-    settings, estimating = pipeline.experiment.detectors, pipeline.experiment.estimators
-    configurations = _Configurations(estimating, [build(each) for each in estimating])
-
-    def prepared_with(most: int) -> list[_Condition]:
-        chosen = []
-        for indices in conditions:
+    settings = pipeline.experiment.detectors
+    estimators = [(setting, build(setting)) for setting in pipeline.experiment.estimators]
+    shape = (len(conditions), len(settings), 1 + len(estimators))
+    # How long a round takes, of few scenes: estimates once more, their code is compiled before.
+    parts, frames, detected_share = _prepared(
+        pipeline, conditions, estimators, TRIAL_SCENES, interrupts)
+    spent = np.zeros(len(parts))
+    for number, part in enumerate(parts):
+        for _ in range(2 if number % shape[2] else 1):
             interrupts.check()
-            chosen.append(_prepare(pipeline, indices, most))
-        return chosen
-
-    prepared = prepared_with(TRIAL_SCENES)
-    search_s, estimation_s = configurations.round_s(prepared, interrupts)
+            begun = time.perf_counter()
+            part()
+            spent[number] = time.perf_counter() - begun
+    search_s = max(spent[:: shape[2]].sum(), 1e-6)
+    estimation_s = spent.sum() - spent[:: shape[2]].sum()
     left_s = limit_s - (time.perf_counter() - started) - (1 + LEAST_ROUNDS) * estimation_s
     # Beside the rounds, each scene is rendered and searched once.
     most = max(int(TRIAL_SCENES * left_s / ((3 + LEAST_ROUNDS) * search_s)), 1)
-    if any(len(condition.batch.scenes) == TRIAL_SCENES for condition in prepared) or most == 1:
-        prepared = prepared_with(most)
-    parts, detected_share = configurations.parts(prepared)
-    shape = (len(prepared), len(settings), len(estimating))
-    frames = np.array([len(condition.batch.scenes) for condition in prepared])
-    visible = np.array([len(condition.searches[0].images) > 0 for condition in prepared])
+    parts, frames, detected_share = _prepared(pipeline, conditions, estimators, most, interrupts)
 
     def costs(seconds: Floats) -> Costs:
-        each = seconds.reshape(-1, *shape[:2], 1 + shape[2])
-        # A condition without a visible scene has no costs.
-        count = np.where(visible, frames, np.nan)[:, None]
-        estimation = each[..., 1:] / BATCH * detected_share[..., None]
-        return Costs(
-            each[..., 0] / count, np.where(visible[:, None, None], estimation, np.nan),
-            np.where(visible, frames, 0),
-        )
-
-    def ratios(seconds: Floats) -> Floats:
-        return costs(seconds).ratio
+        each = seconds.reshape(-1, *shape)
+        share = np.where(np.isnan(frames)[:, None], np.nan, detected_share)[..., None]
+        return Costs(each[..., 0] / frames[:, None], each[..., 1:] / BATCH * share, frames)
 
     left_s = max(limit_s - (time.perf_counter() - started), 0.1)
-    return costs(time_in_turns(parts, ratios, left_s, interrupts, progress, clock_of(settings)))
+    return costs(time_in_turns(
+        parts, lambda seconds: costs(seconds).ratio, left_s, interrupts, progress,
+        clock_of(settings)))
 
 
 def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
@@ -322,53 +303,31 @@ def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
     return time.process_time
 
 
-@dataclass(frozen=True, slots=True)
-class _Configurations:
-    """The estimators, ready to be timed, and their settings."""
+def _prepared(
+    pipeline: Pipeline, conditions: Sequence[Sequence[Indices]],
+    estimators: Sequence[tuple[EstimatorSetting, PoseEstimator]], most: int,
+    interrupts: Interrupts,
+) -> tuple[list[Callable[[], Any]], Floats, Floats]:
+    """Return what is timed: the search of all scenes of a condition, then each estimator.
 
-    settings: Sequence[EstimatorSetting]
-    estimators: Sequence[PoseEstimator]
-
-    def parts(
-        self, conditions: Sequence[_Condition]
-    ) -> tuple[list[Callable[[], Any]], Floats]:
-        """Return what is timed, and the (C, D) share of scenes with a detection.
-
-        For each condition and detector setting: the search of all scenes, then each estimator.
-        """
-        parts: list[Callable[[], Any]] = []
-        detected_share = np.zeros((len(conditions), len(conditions[0].sources)))
-        for c, condition in enumerate(conditions):
-            batch = condition.batch
-            for d, (source, found) in enumerate(
-                zip(condition.sources, condition.searches, strict=True)
-            ):
-                parts.append(partial(_search_all, source, found.images))
-                rows = np.flatnonzero(found.flags == DetectionStatus.detected)
-                detected_share[c, d] = len(rows) / len(batch.scenes)
-                for setting, estimate in zip(self.settings, self.estimators, strict=True):
-                    detections = detections_for(
-                        setting, batch, found,
-                        np.resize(rows, BATCH if len(rows) else 0),
-                    )
-                    parts.append(partial(_estimate_all, estimate, detections))
-        return parts, detected_share
-
-    def round_s(
-        self, conditions: Sequence[_Condition], interrupts: Interrupts
-    ) -> tuple[float, float]:
-        """Return the seconds of all searches, and of all estimates; code is compiled before."""
-        parts, _ = self.parts(conditions)
-        spent = [0.0, 0.0]
-        for number, part in enumerate(parts):
-            interrupts.check()
-            kind = int(number % (1 + len(self.estimators)) > 0)
-            if kind:
-                part()
-            begun = time.perf_counter()
-            part()
-            spent[kind] += time.perf_counter() - begun
-        return max(spent[0], 1e-6), spent[1]
+    With it, of C conditions and D detector settings, (C,) frames, at most ``most``, NaN if no
+    scene is visible, and the (C, D) share of them with a detection.
+    """
+    parts: list[Callable[[], Any]] = []
+    frames, detected_share = [], []
+    for indices in conditions:
+        interrupts.check()
+        batch, searches = _searched(pipeline, indices, most)
+        count = len(batch.scenes)
+        frames.append(count if len(searches[0].images) else np.nan)
+        for source, found in zip(detection_sources(batch), searches, strict=True):
+            rows = np.flatnonzero(found.flags == DetectionStatus.detected)
+            detected_share.append(len(rows) / count)
+            rows = np.resize(rows, BATCH if len(rows) else 0)
+            parts.append(partial(_search_all, source, found.images))
+            parts += [partial(_estimate_all, estimate, detections_for(setting, batch, found, rows))
+                      for setting, estimate in estimators]
+    return parts, np.array(frames), np.reshape(detected_share, (len(conditions), -1))
 
 
 def _search_all(source: DetectionSource, images: Mapping[int, Grey]) -> None:
@@ -385,51 +344,33 @@ def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
             estimator(detections)
 
 
-def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Condition:
+def _searched(
+    pipeline: Pipeline, indices: Sequence[Indices], most: int
+) -> tuple[SceneBatch, list[SearchResult]]:
     """Render a condition's visible scenes, and search each once with each setting.
 
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
     count = len(indices[0]) if indices else 1
-    experiment = pipeline.experiment
-    batch = scenes_at(experiment, indices)
+    batch = scenes_at(pipeline.experiment, indices)
     rows = np.flatnonzero(batch.visible)
     if 0 < len(rows) < count:
-        return _prepare(pipeline, [index[rows] for index in indices], most)
+        return _searched(pipeline, [index[rows] for index in indices], most)
     if count > most:
         chosen = (2 * np.arange(most) + 1) * count // (2 * most)
-        return _prepare(pipeline, [index[chosen] for index in indices], most)
-    wanted = np.full((count, len(experiment.detectors)), len(rows) > 0)
-    searches, _ = detections_of(batch, wanted, [], keep=True)
-    return _Condition(batch, searches, detection_sources(batch))
+        return _searched(pipeline, [index[chosen] for index in indices], most)
+    wanted = np.full((count, len(pipeline.experiment.detectors)), len(rows) > 0)
+    return batch, detections_of(batch, wanted, [], keep=True)[0]
 
 
 # --------------------------------------------------------------------------------------------------
 # The cost of each renderer, and how far its images differ from a reference's.
 
-@dataclass(frozen=True, slots=True)
-class RendererCosts:
-    """The costs of K renderers in R rounds; NaN if no scene is visible.
-
-    Attributes
-    ----------
-    seconds
-        (R, K) seconds an image.
-    grey_rms, grey_max
-        (K,) RMS and largest difference from the reference's images, in grey levels, over the pixels
-        that the marker covers there.
-    """
-
-    seconds: Floats
-    grey_rms: Floats
-    grey_max: Floats
-
-
 @single_threaded()
 def measure_renderers(
     pipeline: Pipeline, samples: Sequence[Sequence[Indices]], reference: int, limit_s: float,
     interrupts: Interrupts,
-) -> RendererCosts:
+) -> tuple[Floats, Floats, Floats]:
     """Measure K renderers on the same scenes.
 
     Parameters
@@ -444,39 +385,31 @@ def measure_renderers(
         Time limit in seconds.
     interrupts
         Checked between two measurements.
+
+    Returns
+    -------
+    (R, K) seconds an image in R rounds; (K,) RMS and (K,) largest difference from the reference's
+    images, in grey levels, over the pixels that the marker covers there. NaN if no scene is
+    visible.
     """
     batches = [scenes_at(pipeline.experiment, indices) for indices in samples]
-    scenes = [batch.scenes for batch in batches]
     rows = np.flatnonzero(batches[reference].visible)
+    if not len(rows):
+        unknown = np.full(len(batches), np.nan)
+        return unknown[None], unknown, unknown
     boxes = [batch.boxes[rows] for batch in batches]
     windows = np.concatenate(
         [np.min([box[:, :2] for box in boxes], axis=0),
-         np.max([box[:, 2:] for box in boxes], axis=0)],
-        axis=1,
-    )
-    if not len(rows):
-        unknown = np.full(len(scenes), np.nan)
-        return RendererCosts(unknown[None], unknown, unknown)
-    images = [
-        render_all(each, rows, box, windows) for each, box in zip(scenes, boxes, strict=True)
-    ]
-    rms, largest = np.zeros(len(scenes)), np.zeros(len(scenes))
-    inner = boxes[reference] - np.tile(windows[:, :2], 2)
-    for k in range(len(scenes)):
-        differences = [
-            (image.astype(np.float64) - true)[top:bottom, left:right].ravel()
-            for image, true, (left, top, right, bottom) in zip(
-                images[k], images[reference], inner.tolist(), strict=True
-            )
-        ]
-        difference = np.concatenate(differences)
-        rms[k], largest[k] = np.sqrt(np.mean(difference**2)), np.abs(difference).max()
-    parts = [
-        partial(render_all, each, rows, box, windows)
-        for each, box in zip(scenes, boxes, strict=True)
-    ]
+         np.max([box[:, 2:] for box in boxes], axis=0)], axis=1)
+    parts = [partial(render_all, batch.scenes, rows, box, windows)
+             for batch, box in zip(batches, boxes, strict=True)]
+    images = [part() for part in parts]
+    inner = (boxes[reference] - np.tile(windows[:, :2], 2)).tolist()
+    differences = [np.concatenate([
+        (image.astype(np.float64) - true)[top:bottom, left:right].ravel()
+        for image, true, (left, top, right, bottom) in zip(
+            of_one, images[reference], inner, strict=True)]) for of_one in images]
     seconds = time_in_turns(
-        parts, lambda spent: np.asarray(spent / spent[:, reference : reference + 1]), limit_s,
-        interrupts,
-    )
-    return RendererCosts(seconds / len(rows), rms, largest)
+        parts, lambda spent: np.asarray(spent / spent[:, [reference]]), limit_s, interrupts)
+    return (seconds / len(rows), np.sqrt([np.mean(each**2) for each in differences]),
+            np.array([np.abs(each).max() for each in differences]))

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, renderer_bias
 from sweep.analysis.comparisons import corners_of
@@ -220,7 +219,7 @@ def _trade(
         "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
         "rounds": len(total),
-        "frames": int(costs.frames.sum()),
+        "frames": int(np.nansum(costs.frames)),
         "sampled": sum(len(sample[0]) if sample else 1 for sample in samples),
         "covariance": "of the solvers with the corners' noise as it was measured under each "
                       "condition; of photometric from its likelihood",
@@ -231,9 +230,9 @@ def _trade(
 def _without_crashed(
     pipeline: Pipeline, results: xr.Dataset, samples: Sequence[Sequence[Indices]]
 ) -> list[list[Indices]]:
-    """Return samples with other scenes in place of those that crashed their process in the run.
+    """Return samples without the scenes that crashed their process in the run.
 
-    Samples are paired: a scene that is replaced in one is replaced in all.
+    Samples are paired: a scene that is left out of one is left out of all.
 
     Raises
     ------
@@ -245,17 +244,12 @@ def _without_crashed(
     for indices in samples:
         at = {name: xr.DataArray(index, dims="cell")
               for name, index in zip(names, indices, strict=True)}
-        for name, flag in (
-            ("detection", DetectionStatus.crashed),
-            ("estimate", EstimateStatus.crashed),
-        ):
-            crashed = results[name].isel(at) == flag
+        for name, status in (("detection", DetectionStatus), ("estimate", EstimateStatus)):
+            crashed = results[name].isel(at) == status.crashed
             dead |= crashed.any([dim for dim in crashed.dims if dim != "cell"]).to_numpy()
     if dead.all():
         raise StoreError("each scene that would be timed crashed its process in the run")
-    alive = np.resize(np.flatnonzero(~dead), len(dead))
-    rows = np.where(dead, alive, np.arange(len(dead)))
-    return [[index[rows] for index in indices] for indices in samples]
+    return [[index[~dead] for index in indices] for indices in samples]
 
 
 def _add(
@@ -328,35 +322,29 @@ def _corner_noise_scale(
     points have the noise of its corners, all others that of markers' corners.
     """
     searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
+    axes = pipeline.axes_of(Stage.estimation)
+    estimators = pipeline.experiment.estimators
 
     def measured(name: str) -> xr.DataArray:
         error = results[name].astype(np.float64)
         over = [dim for dim in error.dims if dim not in (*per, *searched)]
         return (error**2).mean(over).compute()
 
-    axes = pipeline.axes_of(Stage.estimation)
-    assumed = np.array(
-        [
-            np.nan if setting.corner_noise_px is None else setting.corner_noise_px
-            for setting in pipeline.experiment.estimators
-        ]
-    )
-    estimators = pipeline.experiment.estimators
-    from_images = np.array([build(setting).needs_images for setting in estimators])
-    shape = [len(axis) for axis in axes]
-    names = [axis.name for axis in axes]
-
-    def over_estimators(values: NDArray[Any]) -> xr.DataArray:
-        return xr.DataArray(values.reshape(shape), dims=names,
-                            coords={name: results[name] for name in names})
+    def over_estimators(values: Sequence[Any], kind: type) -> xr.DataArray:
+        names = [axis.name for axis in axes]
+        return xr.DataArray(
+            np.array(values, dtype=kind).reshape([len(axis) for axis in axes]), dims=names,
+            coords={name: results[name] for name in names})
 
     noise = measured(corners_of(results))
-    chessboard = np.array([setting.points == "chessboard" for setting in estimators])
-    if chessboard.any():
+    chessboard = [setting.points == "chessboard" for setting in estimators]
+    if any(chessboard):
         noise = noise.where(
-            ~over_estimators(chessboard), measured("chessboard_corner_error_px"))
-    scale = over_estimators(assumed) ** 2 / noise
-    return scale.where(~over_estimators(from_images), 1.0)
+            ~over_estimators(chessboard, bool), measured("chessboard_corner_error_px"))
+    # None, an estimator without such a noise, is NaN.
+    assumed = over_estimators([setting.corner_noise_px for setting in estimators], float)
+    from_images = over_estimators([build(setting).needs_images for setting in estimators], bool)
+    return (assumed**2 / noise).where(~from_images, 1.0)
 
 
 def _renderers(
@@ -368,16 +356,15 @@ def _renderers(
         sample_scenes(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
     ])
     reference = names.index(REFERENCE)
-    costs = measure_renderers(pipeline, samples, reference, limit_s, interrupts)
+    seconds, rms, largest = measure_renderers(pipeline, samples, reference, limit_s, interrupts)
     changed = renderer_bias(results, REFERENCE).compute()
     _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
-         median_interval(1e3 * costs.seconds))
+         median_interval(1e3 * seconds))
     _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
-         any_process_interval(costs.seconds / costs.seconds[:, [reference]]))
+         any_process_interval(seconds / seconds[:, [reference]]))
     for name, meaning, values in (
-        ("grey_rms", "RMS difference of the marker's pixels from the exact image's",
-         costs.grey_rms),
-        ("grey_max", "largest difference from the exact image", costs.grey_max),
+        ("grey_rms", "RMS difference of the marker's pixels from the exact image's", rms),
+        ("grey_max", "largest difference from the exact image", largest),
     ):
         changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
     changed.attrs = {"title": pipeline.heading, "reference": REFERENCE}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,7 +29,6 @@ from sweep.measure.intrinsics import (
     calibrate,
 )
 from sweep.measure.solver import GuardedPoints
-from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, transform_points
@@ -44,13 +43,6 @@ POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_
 
 _AT_CORNER = 0.8
 """Share of the way from the principal point to the frame's corner."""
-
-
-class _Views(NamedTuple):
-    """The views of one condition: points (k, 3) of the board in metres, and their pixels (k, 2)."""
-
-    objects: list[Floats]
-    pixels: list[Floats]
 
 
 @describes
@@ -136,42 +128,39 @@ def camera_calibrations(
         )
     dims = [dim for dim in axes_of(results, Stage.scene, Stage.detection) if dim != DRAWS]
     shape = [results.sizes[dim] for dim in dims]
-    grid = (*shape, len(counts), sets)
-    flags = np.zeros(grid, dtype=np.uint8)
-    used = np.zeros(grid, dtype=np.int64)
-    rms = np.full(grid, np.nan)
-    errors, std = (np.full((*grid, len(INTRINSICS)), np.nan) for _ in range(2))
-    position = np.full((*grid, len(DIRECTIONS), 3), np.nan)
+    rows = []
     for index in itertools.product(*map(range, shape)):
-        at = dict(zip(dims, index, strict=True))
-        seen, camera, frame = _views(results, pipeline, at, name)
-        truth = _numbers(camera)
-        for k, count in enumerate(counts):
-            for number in range(sets):
-                chosen = slice(number * counts[-1], number * counts[-1] + count)
-                one = calibrate(
-                    seen.objects[chosen], [each + offset_px for each in seen.pixels[chosen]],
-                    frame, coefficients,
-                )
-                cell = (*index, k, number)
-                flags[cell], used[cell], rms[cell] = one.status, one.views, one.rms_px
-                errors[cell], std[cell] = one.values - truth, one.std
-                if one.status == CalibrationStatus.calibrated:
-                    position[cell] = _position_errors(one, camera, frame, target_m)
-    inner = (*dims, "views", "set")
+        objects, pixels, camera, frame = _views(
+            results, pipeline, dict(zip(dims, index, strict=True)), name)
+        truth = np.concatenate([camera.view[0], camera.lenses[0, :5]])  # as INTRINSICS
+        for count, number in itertools.product(counts, range(sets)):
+            chosen = slice(number * counts[-1], number * counts[-1] + count)
+            one = calibrate(objects[chosen], [each + offset_px for each in pixels[chosen]],
+                            frame, coefficients)
+            position = _position_errors(one, camera, frame, target_m) if (
+                one.status == CalibrationStatus.calibrated) else np.full((2, 3), np.nan)
+            rows.append((
+                np.uint8(one.status), one.views, one.rms_px, one.values - truth, one.std, position))
+    grid = (*dims, "views", "set")
+    outputs: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
+        "calibration": ((), cf_attributes(
+            "what became of the calibration", flags=CalibrationStatus)),
+        "used_views": ((), cf_attributes("views with enough of the board")),
+        "rms_px": ((), cf_attributes("root mean square of the residuals", "px")),
+        "intrinsic_error": (("intrinsic",), cf_attributes("estimated minus true", "px, 1")),
+        "intrinsic_std": (("intrinsic",), cf_attributes(
+            "standard deviation that OpenCV reports", "px, 1")),
+        "position_error_m": (("direction", "xyz"), cf_attributes(
+            f"error of the position of a target at {target_m:g} m, camera frame", "m")),
+    }
+    variables = {}
+    for (label, (inner, attributes)), column in zip(
+            outputs.items(), zip(*rows, strict=True), strict=True):
+        values = np.array(column)
+        variables[label] = ((*grid, *inner), values.reshape(
+            (*shape, len(counts), sets, *values.shape[1:])), attributes)
     return xr.Dataset(
-        {
-            "calibration": (inner, flags, cf_attributes(
-                "what became of the calibration", flags=CalibrationStatus)),
-            "used_views": (inner, used, cf_attributes("views with enough of the board")),
-            "intrinsic_error": ((*inner, "intrinsic"), errors, cf_attributes(
-                "estimated minus true", "px, 1")),
-            "intrinsic_std": ((*inner, "intrinsic"), std, cf_attributes(
-                "standard deviation that OpenCV reports", "px, 1")),
-            "rms_px": (inner, rms, cf_attributes("root mean square of the residuals", "px")),
-            "position_error_m": ((*inner, "direction", "xyz"), position, cf_attributes(
-                f"error of the position of a target at {target_m:g} m, camera frame", "m")),
-        },
+        variables,
         coords={
             **{dim: results[dim] for dim in dims if dim in results.coords},
             "views": counts, "set": np.arange(sets), "intrinsic": list(INTRINSICS),
@@ -273,48 +262,35 @@ def _points_of(results: xr.Dataset, points: str | None) -> str:
 
 def _views(
     results: xr.Dataset, pipeline: Pipeline, at: dict[str, int], name: str
-) -> tuple[_Views, Cameras, tuple[int, int]]:
-    """Return the views of a condition, its camera, and the frame's width and height."""
-    axes = pipeline.experiment.scene_axes
-    trials = np.arange(results.sizes.get(DRAWS, 1), dtype=np.intp)
-    indices = [
-        trials if axis.name == DRAWS else np.full(len(trials), at[axis.name], dtype=np.intp)
-        for axis in axes
-    ]
-    values = pipeline.experiment.scene_values(indices)
-    cameras = build_cameras(values, len(trials))
-    frame = tuple(
-        int(values[key].broadcast(len(trials))[0]) for key in ("width_px", "height_px")
-    )
-    boards: list[Board] = values["board"].listed(len(trials))
+) -> tuple[list[Floats], list[Floats], Cameras, tuple[int, int]]:
+    """Return the views of a condition, its camera, and the frame's width and height.
+
+    Of each view there are the points (k, 3) of the board that were found, in metres, and their
+    pixels (k, 2).
+    """
+    count = results.sizes.get(DRAWS, 1)
+    values = pipeline.experiment.scene_values([
+        np.arange(count, dtype=np.intp) if axis.name == DRAWS
+        else np.full(count, at[axis.name], dtype=np.intp)
+        for axis in pipeline.experiment.scene_axes])
+    cameras = build_cameras(values, count)
+    width, height = (int(values[key].broadcast(count)[0]) for key in ("width_px", "height_px"))
     cell = results.isel({dim: k for dim, k in at.items() if dim in results.dims})
-    rotation = rotation_of_vector(_by_trial(cell["true_rvec"], ("xyz",)))
-    translation = _by_trial(cell["true_tvec_m"], ("xyz",))
-    variable = POINTS[name]
-    inner = ("chessboard_corner", "xy") if name == "chessboard" else ("marker", "corner", "xy")
-    error = _by_trial(cell[variable], inner).reshape(len(trials), -1, 2).astype(np.float64)
-    seen = _Views([], [])
-    for k, board in enumerate(boards):
+    if DRAWS not in cell.dims:
+        cell = cell.expand_dims(DRAWS)
+    rotation, translation, errors = (
+        cell[each].transpose(DRAWS, ...).values
+        for each in ("true_rvec", "true_tvec_m", POINTS[name]))
+    errors = errors.reshape(count, -1, 2).astype(np.float64)
+    objects, pixels = [], []
+    for k, board in enumerate(values["board"].listed(count)):
         known = board.chessboard_m if name == "chessboard" else board.corners_m.reshape(-1, 3)
-        found = np.flatnonzero(np.isfinite(error[k, : len(known)]).all(axis=1))
-        truth = cameras.take(np.array([k])).project(
-            transform_points(known[None], rotation[k : k + 1], translation[k : k + 1])
-        )[0]
-        seen.objects.append(known[found])
-        seen.pixels.append(truth[found] + error[k, found])
-    return seen, cameras.take(np.array([0])), (frame[0], frame[1])
-
-
-def _by_trial(array: xr.DataArray, inner: tuple[str, ...]) -> Any:
-    """Return an array's values, by trial first."""
-    if DRAWS not in array.dims:
-        array = array.expand_dims(DRAWS)
-    return array.transpose(DRAWS, *inner).values
-
-
-def _numbers(camera: Cameras) -> Floats:
-    """Return the true numbers (9,) of a camera, as :data:`INTRINSICS` orders them."""
-    return np.concatenate([camera.view[0], camera.lenses[0, :5]])
+        found = np.flatnonzero(np.isfinite(errors[k, : len(known)]).all(axis=1))
+        truth = cameras.take(np.array([k])).project(transform_points(
+            known[None], rotation_of_vector(rotation[k : k + 1]), translation[k : k + 1]))[0]
+        objects.append(known[found])
+        pixels.append(truth[found] + errors[k, found])
+    return objects, pixels, cameras.take(np.array([0])), (width, height)
 
 
 def _position_errors(

@@ -75,43 +75,43 @@ class PairedUnits:
 
     Attributes
     ----------
-    first, second
+    sides
         Their arrays; units of the same index belong together if they are ``paired``.
     single
         Whether each unit of theirs has one marker.
     paired
         Whether the simulation is the photographs' twin.
-    configurations, sizes, coordinates
-        Names of the configurations' dimensions, their lengths and coordinates.
-    binning
-        The edges of the bins.
-    binned
-        The photographs' dataset, with what is binned.
+    coordinates
+        Coordinates of the configurations by the names of their dimensions.
+    binning, bin_coordinates
+        The edges of the bins, and the bins' coordinates.
     values
         What is binned of both: name -> (units, rows).
     """
 
-    first: Arrays
-    second: Arrays
-    single: tuple[bool, bool]
+    sides: Sequence[Arrays]
+    single: Sequence[bool]
     paired: bool
-    configurations: tuple[str, ...]
-    sizes: Mapping[str, int]
-    coordinates: Mapping[str, Any]
+    coordinates: Mapping[str, xr.Variable]
     binning: Binning
-    binned: xr.Dataset
-    values: tuple[Mapping[str, Floats], Mapping[str, Floats]]
+    bin_coordinates: Mapping[str, Any]
+    values: Sequence[Mapping[str, Floats]]
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """Names of the configurations' dimensions."""
+        return tuple(self.coordinates)
 
     def within(self, inside: Sequence[Masks]) -> list[Arrays]:
         """Return the arrays of both with the masks (units, rows) of the markers that count."""
         return [{**side, INSIDE: mask[None, None]}
-                for side, mask in zip((self.first, self.second), inside, strict=True)]
+                for side, mask in zip(self.sides, inside, strict=True)]
 
-    def bins(self) -> Iterator[tuple[Masks, Masks]]:
+    def bins(self) -> Iterator[tuple[Masks, ...]]:
         """Yield which markers (units, rows) of both lie in each combination of bins."""
-        shapes = [side["detection"].shape[2:4] for side in (self.first, self.second)]
-        for first, second in zip(*map(self.binning.masks, self.values), strict=True):
-            yield np.broadcast_to(first, shapes[0]), np.broadcast_to(second, shapes[1])
+        shapes = [side["detection"].shape[2:4] for side in self.sides]
+        for masks in zip(*map(self.binning.masks, self.values), strict=True):
+            yield tuple(map(np.broadcast_to, masks, shapes))
 
 
 def paired_units(
@@ -140,7 +140,7 @@ def paired_units(
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
     binning, _ = read_bins(first, names, bins)
-    single = (not of_photographs(first), not of_photographs(second))
+    single = [not of_photographs(side) for side in (first, second)]
     arrays = []
     for side, one in zip((first, second), single, strict=True):
         columns = pose_arrays(side, ERROR_INPUTS) | {
@@ -159,13 +159,11 @@ def paired_units(
         arrays = [{name: array[:, :, kept] for name, array in arrays[0].items()},
                   {name: _gathered(array, trials[kept]) for name, array in arrays[1].items()}]
         _blur_truth(arrays[1])
-        single = (False, False)
+        single = [False, False]
     values = [{name: side.pop(f"{PREFIX}{name}")[0, 0] for name in binning.edges}
               for side in arrays]
-    return PairedUnits(
-        arrays[0], arrays[1], single, paired, names,
-        {name: first.sizes[name] for name in names},
-        {name: first[name].variable for name in names}, binning, first, (values[0], values[1]))
+    return PairedUnits(arrays, single, paired, {name: first[name].variable for name in names},
+                       binning, binning.coordinates(first), values)
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -301,7 +299,7 @@ BY_PHOTOGRAPH = Design(Unit.photograph)
 """A photograph, or a scene of a simulation, is the draw."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Compared:
     """What is compared: a rate, or a quantile of the errors (...) of solved poses.
 
@@ -310,26 +308,22 @@ class Compared:
 
     name: str
     meaning: str
-    units: str = "1"
-    ratio: bool = False
-    rate: Rate[Poses] | None = None
-    error: Callable[[Poses], Floats] | None = None
+    units: str
+    rate: Rate[Poses] = DETECTION_RATE
+    error: Callable[[Poses], Floats] = QUANTITIES[0].norm
     percent: int = 50
+    ratio: bool = False
 
 
-RATES = tuple(Compared(name=rate.name, meaning=rate.meaning, rate=rate)
-              for rate in (DETECTION_RATE, FLIP_RATE))
+RATES = tuple(Compared(rate.name, rate.meaning, "1", rate) for rate in (DETECTION_RATE, FLIP_RATE))
 
 QUANTILES = (
-    Compared(name="range_bias_percent", meaning="median depth error of the true depth, solved",
-             units="percent", error=lambda poses: poses.range_percent[..., 0]),
-    *(
-        Compared(
-            name=quantity.named(statistic), units=quantity.units, ratio=True, error=quantity.norm,
-            meaning=f"{percent} % quantile of the absolute {quantity.words}, solved",
-            percent=percent)
-        for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()
-    ),
+    Compared("range_bias_percent", "median depth error of the true depth, solved", "percent",
+             error=lambda poses: poses.range_percent[..., 0]),
+    *(Compared(quantity.named(statistic),
+               f"{percent} % quantile of the absolute {quantity.words}, solved", quantity.units,
+               error=quantity.norm, percent=percent, ratio=True)
+      for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()),
 )
 """What is compared, in the order of the table."""
 
@@ -398,17 +392,16 @@ def simulation_gap(
     """
     pair = paired_units(photographs, simulated, bins)
     gaps = [_gap(pair, mask) for mask in pair.bins()]
-    shape = (*(pair.sizes[name] for name in pair.configurations), *pair.binning.shape)
+    shape = (*map(len, pair.coordinates.values()), *pair.binning.shape)
     dims = (*pair.configurations, *pair.binning.edges)
     variables: dict[str, Any] = {}
     for name, attributes in _attributes().items():
         values = np.stack([gap[name] for gap in gaps], axis=-1)  # (..., configurations, bins)
         own = ("source", *dims) if values.ndim == 3 else dims
         variables[name] = (own, values.reshape((*values.shape[:-2], *shape)), attributes)
-    coordinates = {
-        **pair.coordinates, **pair.binning.coordinates(pair.binned), "source": list(SOURCES),
-    }
-    return xr.Dataset(variables, coordinates, {"paired": int(pair.paired)})
+    return xr.Dataset(
+        variables, {**pair.coordinates, **pair.bin_coordinates, "source": list(SOURCES)},
+        {"paired": int(pair.paired)})
 
 
 def _attributes() -> dict[str, dict[str, Any]]:
@@ -424,7 +417,7 @@ def _attributes() -> dict[str, dict[str, Any]]:
     return {output.name: output.attributes() for output in outputs}
 
 
-def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> Variables:
+def _gap(pair: PairedUnits, inside: Sequence[Masks]) -> Variables:
     """Return the variables of one bin: (sources, configurations) or (configurations,)."""
     arrays = pair.within(inside)
     sides = [Poses(each) for each in arrays]
@@ -434,14 +427,11 @@ def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> Variables:
     }
     table["units"] = np.stack([side.looked_for.any(axis=(1, 3)).sum(axis=1) for side in sides])
     for each in RATES:
-        if each.rate is not None:
-            table |= _rates(each.rate, arrays)
+        table |= _rates(each.rate, arrays)
     counts = [None if single else unit_counts(side.looked_for.shape[2])
               for side, single in zip(sides, pair.single, strict=True)]
-    if pair.paired:
-        counts = [counts[0], counts[0]]
     for each in QUANTILES:
-        table |= _quantiles(each, sides, counts)
+        table |= _quantiles(each, sides, counts[:1] * 2 if pair.paired else counts)
     return table
 
 
@@ -460,7 +450,7 @@ def _quantiles(each: Compared, sides: Sequence[Poses], counts: Sequence[Any]) ->
     """Return a quantile of both, its gap, and their intervals; ``counts`` are of the bootstrap."""
     intervals, replicates, units = [], [], []
     for side, drawn in zip(sides, counts, strict=True):
-        errors = each.error(side) if each.error else np.empty(0)
+        errors = each.error(side)
         used = side.solved & np.isfinite(errors)
         units.append(used.any(axis=(1, 3)).sum(axis=1))
         interval = quantile_intervals(

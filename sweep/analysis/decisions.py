@@ -490,7 +490,9 @@ def detection_limit(
                 long_name=f"{meaning}, per module", units="px")}
         if along[0] != "side_px":
             out[f"{along[0]}{end}"] = value
-    return xr.Dataset({name: each.drop_vars(along, errors="ignore") for name, each in out.items()})
+    # Others along the axis, such as the distance of a side, are not those of the answer.
+    return xr.Dataset({name: each.drop_vars(along, errors="ignore").reset_coords(drop=True)
+                       for name, each in out.items()})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -914,12 +916,10 @@ class WantedPrecision:
     @property
     def relative_to(self) -> str:
         """What the half-width is a share of; empty for a rate."""
-        if self.requirable.is_rate:
-            return ""
-        return "RMSE" if self._spread else "value"
+        return "" if self.requirable.is_rate else "RMSE" if self.spread else "value"
 
     @property
-    def _spread(self) -> Requirable | None:
+    def spread(self) -> Requirable | None:
         """Of a bias the standard deviation; else None."""
         return requirables().get(self.name.replace("_bias_", "_sd_")) \
             if "_bias_" in self.name else None
@@ -930,12 +930,7 @@ class WantedPrecision:
         Their intervals are to be those of stores whose sampling was stopped.
         """
         parts = self.requirable.computed(prefix, LEVEL)
-        return parts + self._spread.computed(f"{prefix}of ", LEVEL)[:1] if self._spread else parts
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """The dataset's variables that it is computed of."""
-        return tuple(dict.fromkeys(self.requirable.variables))
+        return parts + self.spread.computed(f"{prefix}of ", LEVEL)[:1] if self.spread else parts
 
     @property
     def least_draws(self) -> int:
@@ -978,23 +973,20 @@ class WantedPrecision:
         with np.errstate(all="ignore"):
             half = (high - low) / 2.0
             if not what.is_rate:
-                scale = abs(value)
-                if self._spread:
-                    scale = xr.apply_ufunc(
-                        np.hypot, value, table[f"{prefix}of {self._spread.name}"])
+                scale = abs(value) if self.spread is None else xr.apply_ufunc(
+                    np.hypot, value, table[f"{prefix}of {self.spread.name}"])
                 half = (half / scale).where(half != 0.0, 0.0)
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
         half = half.where(low != np.inf, 0.0)
-        narrow = (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS))
-        reached = xr.full_like(used, Reached.not_reached)
-        for where, flag_ in (
-            (self._too_rare(used, draws, table["run"], total), Reached.too_rare),
-            (narrow, Reached.reached), (table["looked_for"] == 0, Reached.not_applicable),
-            (table["run"] == 0, Reached.not_run),
-        ):
-            reached = reached.where(~where, flag_)
-        return xr.Dataset({"value": value, "half_width": half, "reached": reached.astype(np.uint8),
-                           "used": used, "draws": draws})
+        reached = np.select(
+            [table["run"] == 0, table["looked_for"] == 0,
+             (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS)),
+             self._too_rare(used, draws, table["run"], total)],
+            [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
+            Reached.not_reached)
+        return xr.Dataset({
+            "value": value, "half_width": half, "used": used, "draws": draws,
+            "reached": used.copy(data=reached.astype(np.uint8))})
 
     def _too_rare(
         self, used: xr.DataArray, draws: xr.DataArray, run: xr.DataArray, total: xr.DataArray

@@ -269,55 +269,50 @@ def named(name: str) -> Requirable:
             return known[candidate]
     head, _, tail = short.rpartition("_")
     stem = head if tail in UNITS else short
-    same = [other for other in known if other.rpartition("_")[0] == stem]
-    if same and (ending := same[0].rpartition("_")[2]) in UNITS:
-        problem = f"its unit is {UNITS[ending]}: write {same[0]}"
-        raise ValueError(problem)
-    if f"{stem}_rate" in known:
+    ending = next((other.rpartition("_")[2] for other in known
+                   if other.rpartition("_")[0] == stem), "")
+    kinds = [other for other in known if other.startswith(f"{stem}_") and any(
+        f"_{each}_" in other for each in STATISTICS)]
+    if ending in UNITS:
+        problem = f"its unit is {UNITS[ending]}: write {stem}_{ending}"
+    elif f"{stem}_rate" in known:
         problem = f"is a share from 0 to 1: write {stem}_rate"
-        raise ValueError(problem)
-    if kinds := [other for other in known if other.startswith(f"{stem}_") and any(
-            f"_{each}_" in other for each in STATISTICS)]:
+    elif kinds:
         problem = f"which statistic of it? There are {', '.join(kinds)}"
-        raise ValueError(problem)
-    counted = {"looked_for", "detected", "count", "draws"}
-    if short in counted:
-        raise ValueError("is a count, which has no interval; expected a rate or an error")
-    hint = nearest(short, [*known])
-    raise ValueError(f"{name}: nothing of this name has an interval{hint}" + (
-        "" if hint else f"; there are {', '.join(_examples())} and the other variables of "
-        "error_statistics, in the guide sweep/analysis/README.md"))
+    elif short in {"looked_for", "detected", "count", "draws"}:
+        problem = "is a count, which has no interval; expected a rate or an error"
+    else:
+        hint = nearest(short, [*known]) or (
+            f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
+            "the guide sweep/analysis/README.md")
+        problem = f"{name}: nothing of this name has an interval{hint}"
+    raise ValueError(problem)
 
 
-def _examples() -> tuple[str, ...]:
-    return ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "range_p95_percent",
+EXAMPLES = ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "range_p95_percent",
             "position_rmse_m", "yaw_bias_deg", "x_sd_m")
 
 
 def fault_of(what: Requirable, given: RequirementText) -> str:
     """Return what is wrong with a limit and its unit; empty if nothing is."""
     limit, more = given.limit, given.relation in (">=", ">")
-    if given.unit:
-        return _wrong_unit(what, given)
-    if what.is_rate and not 0.0 <= limit <= 1.0:
-        share = f": write {limit / 100:g} for {limit:g} %" if 2.0 <= limit <= 100.0 else ""
-        return f"a share is from 0 to 1{share}"
-    if limit < 0.0:
-        sign = " (of a bias the absolute value is required)" if what.signed else ""
-        return f"{what.name} is never negative{sign}: expected a limit above 0"
-    if limit > what.largest:
-        return f"{what.name} is never above {what.largest:g} {what.units}"
-    if more and limit == 0.0:
-        return "holds always: expected a limit above 0"
-    if not more and limit == what.largest:
-        return f"holds always: expected a limit below {what.largest:g}"
-    if more and what.is_rate and limit == 1.0:
-        return "no number of draws can show a rate of 1: write 0.99, for instance"
-    if not more and limit == 0.0:
-        low = 0.01 if what.is_rate else None
-        return "no number of draws can show 0: expected a limit above it" + (
-            f", such as {low}" if low else "")
-    return ""
+    share = f": write {limit / 100:g} for {limit:g} %" if 2.0 <= limit <= 100.0 else ""
+    sign = " (of a bias the absolute value is required)" if what.signed else ""
+    example = ", such as 0.01" if what.is_rate else ""
+    faults = (
+        (given.unit, _wrong_unit(what, given)),
+        (what.is_rate and not 0.0 <= limit <= 1.0, f"a share is from 0 to 1{share}"),
+        (limit < 0.0, f"{what.name} is never negative{sign}: expected a limit above 0"),
+        (limit > what.largest, f"{what.name} is never above {what.largest:g} {what.units}"),
+        (more and limit == 0.0, "holds always: expected a limit above 0"),
+        (not more and limit == what.largest,
+         f"holds always: expected a limit below {what.largest:g}"),
+        (more and what.is_rate and limit == 1.0,
+         "no number of draws can show a rate of 1: write 0.99, for instance"),
+        (not more and limit == 0.0,
+         f"no number of draws can show 0: expected a limit above it{example}"),
+    )
+    return next((text for is_so, text in faults if is_so), "")
 
 
 def _wrong_unit(what: Requirable, given: RequirementText) -> str:
@@ -472,7 +467,7 @@ RELATIONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operat
 
 
 def parse_requirements(
-    texts: str | Requirement | Iterable[str | Requirement]
+    texts: str | Iterable[str | Requirement]
 ) -> tuple[Requirement, ...]:
     """Return the requirements of some texts.
 
@@ -496,8 +491,8 @@ def parse_requirements(
     >>> [each.text for each in parse_requirements(["detection>=0.99", "yaw_bias_deg < 0.1"])]
     ['detection_rate >= 0.99', 'yaw_bias_deg < 0.1']
     """
-    listed = [texts] if isinstance(texts, str | Requirement) else list(texts)
-    given = [each.text if isinstance(each, Requirement) else each for each in listed]
+    given = [texts] if isinstance(texts, str) else [
+        each.text if isinstance(each, Requirement) else each for each in texts]
     requirements, faults = read_requirements(given)
     if not given:
         faults.append(("[]", "expected at least one, such as 'detection >= 0.95'"))

@@ -317,4 +317,4 @@ def _precision(
     def open_cells(dataset: xr.Dataset) -> xr.DataArray:
         return ~precision_table(dataset, wanted, per, trials=rule.ends[-1])["settled"]
 
-    return [name for each in wanted for name in each.variables], open_cells
+    return [name for each in wanted for name in each.requirable.variables], open_cells

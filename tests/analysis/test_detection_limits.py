@@ -88,6 +88,12 @@ def test_a_limit_for_each_size_has_the_same_side():
     np.testing.assert_allclose(answer["side_px_per_module"], FX * SIZE_M / 6)
 
 
+def test_an_axis_of_sides_may_have_their_distances():
+    results = dataset({"side_px": [10.0, 20.0, 40.0]}, [0.2, 0.5, 1.0]).assign_coords(
+        distance_m=("side_px", [4.0, 2.0, 1.0]))
+    assert detection_limit(results)["side_px"] == 40.0
+
+
 def test_a_rate_that_is_never_reached_has_an_infinite_side():
     answer = detection_limit(dataset({"distance_m": [1.0, 2.0]}, [0.5, 0.2]))
     assert [float(answer[name]) for name in ("side_px", "side_px_low", "side_px_high")] == [

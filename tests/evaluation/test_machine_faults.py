@@ -1,4 +1,4 @@
-"""Exceptions that say nothing about a scene: they are raised, and never become its flag."""
+"""Faults of a machine are raised, and never become a scene's flag; threads are the caller's."""
 
 import errno
 import pickle
@@ -13,7 +13,9 @@ from support import machine_faults
 from support.blocks import run_cells
 from sweep.errors import MachineFaultError, StoreError
 from sweep.evaluation.block import warm_up
+from sweep.evaluation.inspection import inspect_scene
 from sweep.evaluation.machine_faults import machine_fault
+from sweep.experiment.pipeline import cell
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 4}}
@@ -72,3 +74,22 @@ def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(p
             warm_up(PIPELINE)
     finally:
         machine_faults.clear()
+
+# The caller's number of OpenCV threads is its own again after a call.
+
+
+@pytest.fixture
+def two_threads():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    yield
+    cv2.setNumThreads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("call", [
+    lambda: run_cells(PIPELINE, [np.arange(1)]), lambda: inspect_scene(cell(PIPELINE, "trial=0")),
+])
+def test_a_call_leaves_the_number_of_threads_as_it_was(call):
+    call()
+    assert cv2.getNumThreads() == 2

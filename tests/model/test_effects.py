@@ -99,9 +99,14 @@ which is up to 0.2 of narrow spreads."""
 @pytest.mark.parametrize("lens", [(), LENSES[1]], ids=len)
 @lengths(1, 20)
 def test_blur_is_the_gaussian_of_the_exact_marker(count, sigma, lens, claim):
+    given = {"blur_px": sigma, "distortion": lens}
+    # Beyond a metre, too, and cut by each of the frame's sides.
+    cut = [scene(size_m=3.0, tilt_deg=30.0, azimuth_deg=40.0, roll_deg=20.0, bearing_x_deg=x,
+                 bearing_y_deg=y, background=90.0, **given)
+           for x, y in ((20.0, 14.0), (-20.0, -14.0))]
     worst = max(
         np.abs(frame_of(value) - FineImage(value, math.ceil(6 * sigma)).seen(sigma)).max()
-        for value in poses(count, 1, max_tilt=60, blur_px=sigma, distortion=lens)
+        for value in (*cut, *poses(count, 1, max_tilt=60, **given))
     )
     claim("blur of 0.1 to 5 px", "a Gaussian of exact images of 16 times the resolution", worst,
           "grey levels")

@@ -161,21 +161,6 @@ def test_a_board_of_one_marker_is_that_marker_to_the_bit(settings, kind):
         np.testing.assert_array_equal(board, single)
 
 
-@pytest.mark.parametrize("name", first_of(reversed(KINDS), 1))
-def test_a_warped_board_has_the_levels_of_its_exact_image(name, tmp_path):
-    pose = ["distance_m=0.3", "tilt_deg=30", "azimuth_deg=70", "roll_deg=30"]
-    path = tmp_path / "behind.png"
-    cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8))
-    for behind in ([], [f"background='{path}'"]):
-        exact, warped = (
-            image_of([*pose, *behind, renderer], text=board_of(name)).astype(float)
-            for renderer in ("renderer='exact'", "renderer='warp'")
-        )
-        # Interpolation takes a point of each pixel, not its mean: right on average alone.
-        assert abs((exact - warped).mean()) < 2
-        assert np.abs(cv2.blur(exact - warped, (7, 7))).max() < 45
-
-
 @pytest.mark.parametrize("settings", [["blur_px=0.8", "bayer=RGGB"], ["tilt_deg=60"]])
 @pytest.mark.parametrize("z", [0.0, 0.004])
 def test_markers_outside_the_frame_widen_no_window(settings, z):

@@ -108,6 +108,9 @@ SETTINGS = [
     {"minMarkerDistanceRate": 0.0}, {"markerBorderBits": 2},
     {"perspectiveRemovePixelPerCell": 10, "validBitIdThreshold": 0.2},
     {"detectInvertedMarker": True}, {"useAruco3Detection": True},
+    # cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %.
+    {"cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
+     "relativeCornerRefinmentWinSize": 100.0},
     *({"cornerRefinementMethod": "apriltag", name: value} for name, value in {
         "aprilTagQuadSigma": 2.0, "aprilTagQuadDecimate": 2.0, "aprilTagMinWhiteBlackDiff": 100,
         "aprilTagMinClusterPixels": 100, "minDistanceToBorder": 0,
@@ -130,15 +133,6 @@ PROCESSING = [
 @lengths(10, 100)
 def test_window_finds_what_the_frame_holds_under_any_setting_and_processing(count, setting, scene):
     compared(visible_scenes(count, settings=scene), DetectorSetting(**setting))
-
-
-def test_window_leaves_room_for_a_wide_refinement():
-    """cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %."""
-    whole = ["bearing_x_deg=0", "bearing_y_deg=0", "side_px={geom=[12, 200, 12]}"]
-    compared(visible_scenes(40, settings=whole), DetectorSetting(
-        cornerRefinementMethod="subpix", cornerRefinementWinSize=40,
-        relativeCornerRefinmentWinSize=100.0,
-    ))
 
 
 def paired(*settings):

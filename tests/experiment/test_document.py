@@ -141,12 +141,6 @@ def zipped_pipeline(axes, **sections):
     return sweep.Pipeline.from_dict(POSE | sections | {"axes": axes})
 
 
-def refused(axes, **sections):
-    with pytest.raises(PipelineError) as refusal:
-        zipped_pipeline(axes, **sections)
-    return str(refusal.value).removeprefix("pipeline: ")
-
-
 def test_members_come_in_every_form_of_an_axis():
     grid = zipped_pipeline({
         "lens": {"zip": {
@@ -189,14 +183,6 @@ def test_pairs_are_checked_and_not_their_product():
     zipped_pipeline({"tag": {"zip": {"dictionary": ["DICT_4X4_50", "DICT_4X4_100"],
                               "marker_id": [49, 99]}}})
     zipped_pipeline({"frame": {"zip": {"width_px": [100_000, 100], "height_px": [100, 100_000]}}})
-
-
-def test_a_million_rows_are_read_and_a_row_more_is_not():
-    def many(count):
-        return {"zip": {name: {"linspace": [1, 9, count]} for name in ("fx_px", "fy_px")}}
-
-    assert len(zipped_pipeline({"lens": many(100_000)}).axes[0]) == 100_000
-    assert "at most 1,000,000 values, all axes together" in refused({"lens": many(500_001)})
 
 
 def test_a_cell_is_named_by_values_a_label_or_a_number():

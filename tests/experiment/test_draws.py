@@ -58,15 +58,6 @@ def assert_same(table, expected):
         np.testing.assert_array_equal(table[name], expected[name], err_msg=name)
 
 
-def test_draws_do_not_depend_on_the_order_of_axes():
-    head, lines = DRAWN.split("[axes]\n")
-    axes = lines.splitlines()
-    expected = drawn()
-    for order in ([3, 2, 1, 0], [1, 3, 0, 2]):
-        text = head + "[axes]\n" + "\n".join(axes[i] for i in order)
-        assert_same(drawn(text=text), expected)
-
-
 def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid():
     expected = drawn()
     cut = {name: column[1:2, 2:, 0:1] for name, column in expected.items()}

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import sweep
 from support.documents import LENS, any_document
-from support.here import calls_here
 from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
 from sweep.evaluation.variables import GEOMETRY
-from sweep.experiment.parameters import IN_CAMERA, WORLD
+from sweep.experiment.parameters import WORLD
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import module_count
@@ -209,23 +207,6 @@ def test_a_fixed_pose_has_the_same_draws_in_whichever_way_it_is_given(given, sam
     roll = {"roll_deg": 33} if "roll_deg" not in given else {}
     assert (key_draws(place | given) != key_draws({"distance_m": 0.6} | given)).all()
     assert roll == {} or (key_draws(place | given) != key_draws(place | given | roll)).all()
-
-
-def test_coordinates_are_what_was_given_and_none_that_has_no_meaning(tmp_path):
-    pose = {"distance_m": 0.3, "yaw_deg": 10, "pitch_deg": 5, "roll_deg": {"uniform": [20, 40]},
-            "frame_x": {"uniform": [0, 1]}}
-    with calls_here():
-        results = sweep.run({"pose": pose, "axes": {"y_m": [0, 0.01], "trial": 2}},
-                            store=str(tmp_path / "given.zarr"))
-    coordinates = {name for name in (*IN_CAMERA, *WORLD) if name in results.coords}
-    assert coordinates == {"distance_m", "yaw_deg", "pitch_deg", "roll_deg", "frame_x", "y_m"}
-    turns = results.roll_deg.to_numpy().ravel()
-    assert turns.min() > 20
-    expected = Rotation.from_euler(
-        "YXZ", np.column_stack([np.full(4, 10), np.full(4, 5), turns]), degrees=True
-    ).as_matrix() @ FLIP
-    found = Rotation.from_rotvec(results.true_rvec.to_numpy().reshape(-1, 3)).as_matrix()
-    np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
 # Rules and choices

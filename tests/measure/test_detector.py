@@ -37,16 +37,11 @@ def opencv_fields(parameters):
     }
 
 
-def test_every_field_of_the_installed_opencv_is_declared():
-    assert set(opencv_fields(cv2.aruco.DetectorParameters())) <= set(FIELDS)
-    assert set(FIELDS) - set(opencv_fields(cv2.aruco.DetectorParameters())) == (
-        DetectorSetting.missing_fields()
-    )
-
-
-def test_defaults_are_opencvs():
-    held = opencv_fields(cv2.aruco.DetectorParameters())
-    for name in set(FIELDS) - DetectorSetting.missing_fields():
+def test_fields_and_defaults_are_those_of_the_installed_opencv():
+    held, missing = opencv_fields(cv2.aruco.DetectorParameters()), DetectorSetting.missing_fields()
+    assert set(held) <= set(FIELDS)
+    assert set(FIELDS) - set(held) == missing
+    for name in set(FIELDS) - missing:
         ours = REFINEMENTS[FIELDS[name]] if name == "cornerRefinementMethod" else FIELDS[name]
         assert type(ours) is type(held[name]) or isinstance(ours, float)
         assert ours == pytest.approx(held[name], rel=1e-7)  # some are float32 of OpenCV's
@@ -155,22 +150,17 @@ def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(diction
         )
 
 
-@st.composite
-def boxes_in_frames(draw):
-    width, height = draw(st.integers(1, 5000)), draw(st.integers(1, 5000))
-    x = sorted(draw(st.tuples(st.integers(0, width), st.integers(0, width))))
-    y = sorted(draw(st.tuples(st.integers(0, height), st.integers(0, height))))
-    empty = x[0] == x[1] or y[0] == y[1]
-    box = [0, 0, 0, 0] if empty else [x[0], y[0], x[1], y[1]]
-    return np.array([box]), np.array([[width, height]])
-
-
 @lengths(150, 2000)
 def test_windows_hold_the_box_and_its_margin_and_stay_in_the_frame(count):
+    sizes = st.integers(1, 5000)
+
     @settings(derandomize=True, deadline=None, max_examples=count)
-    @given(boxes_in_frames(), st.integers(0, 100))
-    def check(scene, margin):
-        (box,), (frame,) = scene
+    @given(st.tuples(sizes, sizes), st.lists(st.floats(0, 1), min_size=4, max_size=4),
+           st.integers(0, 100))
+    def check(size, shares, margin):
+        frame = np.array(size)
+        box = np.sort((np.reshape(shares, (2, 2)) * frame).astype(int), axis=0).ravel()
+        box *= (box[:2] < box[2:]).all()  # else empty
         (window,) = windows(box[None], frame[None], np.array([[margin]]))
         start, stop = window[:2], window[2:]
         assert (start >= 0).all()

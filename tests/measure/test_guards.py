@@ -244,11 +244,6 @@ def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
         off = degrees_between(estimates.alternative_rotation, view.mirrored)
         assert off.max() < 1e-3
         assert (estimates.alternative_reprojection_px >= estimates.reprojection_px - 1e-6).all()
-    tilted = degrees_between(view.mirrored, view.rotation) > 1
-    assert tilted.sum() > 100
-    for rotation, flipped in ((view.rotation, False), (view.mirrored, True)):
-        error = pose_error(rotation, view.translation, view.rotation, view.translation)
-        assert (error.flipped[tilted] == flipped).all()
 
 
 # Solvers of boards: right, or flagged; never nonsense, never a warning.
@@ -384,19 +379,6 @@ def test_exact_points_give_the_pose_at_any_size_distance_and_tilt(count, name, l
                 most = 0.3 if solver.solver == "ap3p" else 0.05
                 assert degrees_off(found, rotation) < most, context
     assert seen >= 10 * count
-
-
-@pytest.mark.parametrize("solver", ["ippe", "sqpnp"])
-def test_what_opencv_cannot_solve_is_solved_by_another_method(solver):
-    board, unsolved = BOARDS["charuco"], 0
-    for k, span_px in itertools.product(range(12), (1.0, 100.0)):
-        rotation = turned(0.0, 0.0, 0.5 * k)
-        asked = detections(board, sighted(board, rotation, np.array([0, 0, 0.15 * 600 / span_px])))
-        plain, guarded = (PointSolver(solver, each, 0.25, None, "markers", "none")
-                          for each in (False, True))
-        unsolved += plain(asked).status[0] != EstimateStatus.solved
-        assert degrees_off(judged(guarded, asked), rotation) < 0.05
-    assert unsolved > 0
 
 
 def garbage(board, rng):

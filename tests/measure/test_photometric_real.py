@@ -35,7 +35,6 @@ GRID = Grid(
 VIEW = np.array([600.0, 610.0, 159.5, 119.5])
 LENS = (-0.2, 0.05, 0.001, -0.001)
 TONED = PhotometricReal(refined=False, spread_free=True, tone=True)
-PLAIN = PhotometricReal(refined=False, spread_free=True, tone=False)
 
 
 def rotation(tilt, azimuth, roll):
@@ -250,27 +249,3 @@ def test_misfit_is_the_shift_of_the_markers_parts():
         assert (estimates.misfit_px > 0.25 * std).all()
         assert (estimates.misfit_px < 2 * std).all()
     assert (estimates.status == EstimateStatus.not_explained).any()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("distance", "tilt", "image"), [
-    (1.8, 10, None), (0.5, 80, None), (0.25, 0, None), (0.42, 30, 0), (0.42, 30, 255),
-    (0.42, 30, "random"),
-])
-def test_extremes_and_images_without_a_marker_give_a_pose_or_say_why_not(distance, tilt, image):
-    """Sides of 10 px, tilts of 80 degrees, markers that the frame cuts; black, white and noise."""
-    rng = np.random.default_rng(7)
-    pose = BoardPose(rotation(tilt, 70, 25), np.array([0.0, 0.0, distance]))
-    shown = photograph(CHARUCO, pose, rng)
-    if image is not None:
-        shown = (rng.integers(0, 256, shown.shape) if image == "random" else shown * 0 + image)
-    found = detections(CHARUCO, [5, 6], shown.astype(np.uint8), pose, rng, error_px=0.1)
-    estimates = (TONED if image == "random" else PLAIN)(found)
-    known = np.isin(estimates.status, (EstimateStatus.solved, EstimateStatus.not_explained))
-    assert np.isfinite(estimates.translation[known]).all()
-    if image is None:
-        near = np.abs(np.linalg.norm(estimates.translation, axis=1) / distance - 1) < 0.1
-        assert near[known].all()
-        assert known.any()
-    elif image != "random":
-        assert not (estimates.status == EstimateStatus.solved).any()

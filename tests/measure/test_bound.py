@@ -20,7 +20,15 @@ from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
+from sweep.measure.likelihood import (
+    BACKGROUND_MARGIN_PX,
+    MAX_MIRROR_DISTANCE,
+    bounds,
+    is_before_camera,
+    marker_view,
+    state_of,
+)
+from sweep.model.board import single_marker
 from sweep.model.board_kinds import BoardMarker, Charuco, Markers, with_distractors
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_boxes, marker_exposure
@@ -465,6 +473,21 @@ EXTREMES = [
 def test_extremes_are_given_or_flagged_without_a_warning(given, unknown_blur):
     value = scene(**({"side_px": 60.0, "roll_deg": 13.0, "azimuth_deg": 20.0} | given))
     checked(Reference(value, unknown_blur).found())
+
+
+def test_a_marker_is_before_the_camera_where_its_whole_outline_is_and_faces_it():
+    rng, found = np.random.default_rng(9), []
+    optics, corner = build_scenes(scene(), 1).cameras.optics(0), np.zeros(2, dtype=np.int64)
+    view = marker_view(single_marker("DICT_4X4_50", 3, 1.0), 0.1, optics, corner, 1.0)
+    # Of 6 modules, with a quiet zone of one.
+    outline = 0.05 * 8 / 6 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    for turn in Rotation.random(300, rng=rng):
+        position = rng.uniform([-0.03, -0.03, 0.02], [0.03, 0.03, 0.08])
+        facing = turn.as_matrix()[:, 2] @ position < 0
+        found.append(facing and (turn.apply(outline) + position)[:, 2].min() > 0)
+        state = state_of(turn.as_matrix(), position, 0.0, np.zeros(3))
+        assert is_before_camera(state, view) == found[-1]
+    assert 0.1 < np.mean(found) < 0.9
 
 
 def test_pose_that_hangs_on_a_level_seen_in_two_pixels_has_no_bound():

@@ -169,7 +169,10 @@ class Experiment:
         Beside them the settings of the plug-in that they name; None for what is built in.
         """
         grid = self.grid
-        for values in grid.rows([p.name for p in grid.parameters.values() if p.section == section]):
+        # What is drawn has no value on the grid, and its default here.
+        defaults = {p.name: p.default for p in grid.parameters.values() if p.section == section}
+        for row in grid.rows(list(defaults)):
+            values = defaults | row
             plugin = grid.plugin(section, values[NAMED_BY[section].name])
             yield values, None if plugin is None else PluginSetting(
                 plugin, tuple((each.name, values[each.name]) for each in plugin.settings),

@@ -149,12 +149,6 @@ class DetectorSetting:
         0.49, "share of a module's pixels from which its bit is uncertain", 0, 1
     )
 
-    @classmethod
-    def missing_fields(cls) -> set[str]:
-        """Return the fields that the installed OpenCV does not have."""
-        parameters = cv2.aruco.DetectorParameters()
-        return {f.name for f in dataclasses.fields(cls) if not hasattr(parameters, f.name)}
-
 
 ALIGNMENT_PX = 4
 """Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide."""
@@ -304,7 +298,7 @@ def completed(
     if setting.refineDetectedMarkers and rejected:
         refining = _refining(board.dictionary, of_markers)
         corners, ids, rejected, _ = refining.refineDetectedMarkers(
-            image, _opencv_board(board), list(corners), ids, list(rejected)
+            image, opencv_board(board), list(corners), ids, list(rejected)
         )
         corners, rejected = list(corners), list(rejected)
     output = SearchOutput(corners, ids, rejected)
@@ -330,28 +324,20 @@ def _refining(dictionary: str, of_markers: DetectorSetting) -> Any:
 def _interpolating(board: Board, min_markers: int, of_markers: DetectorSetting) -> Any:
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = min_markers
-    return cv2.aruco.CharucoDetector(
-        charuco_board(board), parameters, opencv_parameters(of_markers)
-    )
+    charuco: Any = opencv_board(board)
+    return cv2.aruco.CharucoDetector(charuco, parameters, opencv_parameters(of_markers))
 
 
 @lru_cache(maxsize=64)
-def _opencv_board(board: Board) -> Any:
+def opencv_board(board: Board) -> cv2.aruco.Board:
+    """Return a board as OpenCV has it: a ``cv2.aruco.CharucoBoard`` if it has a chessboard."""
+    dictionary, squares = opencv_dictionary(board.dictionary), board.chessboard
     ids = np.array(board.marker_ids, dtype=np.int32)
-    if board.chessboard is not None:
-        return charuco_board(board)
-    corners: Any = board.corners_m.astype(np.float32)
-    return cv2.aruco.Board(corners, opencv_dictionary(board.dictionary), ids)
-
-
-def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return a ChArUco board as OpenCV has it; ValueError for another board."""
-    squares = board.chessboard
     if squares is None:
-        raise ValueError("the board has no chessboard")
+        corners: Any = board.corners_m.astype(np.float32)
+        return cv2.aruco.Board(corners, dictionary, ids)
     charuco = cv2.aruco.CharucoBoard(
-        (squares.squares_x, squares.squares_y), squares.square_m, squares.marker_m,
-        opencv_dictionary(board.dictionary), np.array(board.marker_ids, dtype=np.int32),
+        (squares.squares_x, squares.squares_y), squares.square_m, squares.marker_m, dictionary, ids
     )
     charuco.setLegacyPattern(squares.legacy_pattern)
     return charuco

@@ -143,29 +143,38 @@ class Estimates:
 
     Numbers are NaN if there is no pose, and those of the alternative if there is no other planar
     solution.
+
+    Attributes
+    ----------
+    status
+        (N,) :class:`sweep.measure.flags.EstimateStatus`.
+    rotation, translation
+        (N, 3, 3), and (N, 3) in metres.
+    reprojection_px
+        (N,) RMS over the corners.
+    alternative_rotation, alternative_reprojection_px
+        (N, 3, 3) and (N,), the same of the other planar solution.
+    covariance
+        (N, 6, 6) of the errors, as the estimator predicts it: turn about the camera's x, y and z in
+        radians, position along them in metres.
+    residual_ratio
+        (N,) variance of the pixels' residuals relative to that of noise and rounding.
+    misfit_px
+        (N,) standard deviation in px of the shifts of a marker's parts that the residuals show.
+    point_count
+        (N,) points of the target that the pose was estimated from.
     """
 
     status: NDArray[np.uint8]
-    """(N,) :class:`sweep.measure.flags.EstimateStatus`"""
     rotation: Floats
-    """(N, 3, 3)"""
     translation: Floats
-    """(N, 3) in metres"""
     reprojection_px: Floats
-    """(N,) RMS over the corners"""
     alternative_rotation: Floats
-    """(N, 3, 3) of the other planar solution"""
     alternative_reprojection_px: Floats
-    """(N,) RMS over the corners of the other planar solution"""
     covariance: Floats
-    """(N, 6, 6) of the errors, as the estimator predicts it: turn about the camera's x, y and z in
-    radians, position along them in metres"""
     residual_ratio: Floats
-    """(N,) variance of the pixels' residuals relative to that of noise and rounding"""
     misfit_px: Floats
-    """(N,) standard deviation in px of the shifts of a marker's parts that the residuals show"""
     point_count: Floats
-    """(N,) points of the target that the pose was estimated from"""
 
     @staticmethod
     def none(count: int, status: EstimateStatus) -> Estimates:
@@ -247,18 +256,23 @@ def credible_estimates(
 
 @dataclass(frozen=True, slots=True)
 class PoseError:
-    """Errors of N poses, estimated against true, in the camera frame; NaN if not solved."""
+    """Errors of N poses, estimated against true, in the camera frame; NaN if not solved.
+
+    Attributes
+    ----------
+    translation_m, rotation_rad
+        (N, 3), and (N, 3) rotation vector of R_est · R_trueᵀ.
+    rotation_angle_rad, normal_angle_rad
+        (N,) its length, the geodesic angle, and the angle between the true and estimated normals.
+    flipped
+        (N,) nearer to the mirror of the truth than to the truth.
+    """
 
     translation_m: Floats
-    """(N, 3)"""
     rotation_rad: Floats
-    """(N, 3) rotation vector of R_est · R_trueᵀ"""
     rotation_angle_rad: Floats
-    """(N,) its length: the geodesic angle"""
     normal_angle_rad: Floats
-    """(N,) angle between the true and the estimated normal"""
     flipped: NDArray[np.bool_]
-    """(N,) nearer to the mirror of the truth than to the truth"""
 
 
 def rotation_difference(rotation: Floats, other: Floats) -> Floats:
@@ -424,12 +438,8 @@ def squared_deviations(
     Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4.2).
     NaN if an input is NaN or a covariance is singular.
     """
-    deviations = np.full(len(covariance), np.nan)
-    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    if len(known):
-        error = np.concatenate([rotation_error[known], translation_error[known]], axis=1)
-        deviations[known] = _squared_deviations(error, covariance[known])
-    return deviations
+    error = np.concatenate([rotation_error, translation_error], axis=1)
+    return np.asarray(_squared_deviations(error, np.ascontiguousarray(covariance)))
 
 
 @compiled

@@ -399,15 +399,13 @@ def _squares_of_pixels(
     pixels: Pixels, state: Floats, work: Work, information: Floats, gradient: Floats
 ) -> float:
     """As :func:`squared_residuals`, by the exact image."""
-    spread_free = len(gradient) > POSE
-    if not state[GREY_LEVELS].any():
-        # Slopes need levels.
-        curvature(
+    spread_free, explained = len(gradient) > POSE, 0.0
+    # Slopes need levels.
+    for _ in range(1 if state[GREY_LEVELS].any() else 2):
+        explained = curvature(
             pixels.levels, state, pixels.marker, work, spread_free, information, gradient
         )
-    return pixels.square_sum - curvature(
-        pixels.levels, state, pixels.marker, work, spread_free, information, gradient
-    )
+    return pixels.square_sum - explained
 
 
 MODELS[Pixels] = _squares_of_pixels

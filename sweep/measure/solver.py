@@ -131,8 +131,7 @@ def both_planar_solutions(
     corners: Floats, cameras: Cameras, size_m: Floats
 ) -> tuple[Floats, Floats]:
     """Return IPPE's rotations (N, 2, 3, 3) and translations (N, 2, 3), guarded; NaN if missing."""
-    corners = np.ascontiguousarray(corners, dtype=np.float64)
-    return _guarded(corners, cameras, size_m, cv2.SOLVEPNP_IPPE)
+    return square_poses(corners, cameras, size_m, "ippe", guarded=True)
 
 
 def _plain(

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.board import Board, Print, edges_on_sheet, target_edges
-from sweep.model.coverage import MarkerEdges
-from sweep.model.marker import BLACK, OUTSIDE, marker_corners, module_count, overhang
+from sweep.model.coverage import MarkerEdges, joined
+from sweep.model.marker import BLACK, OUTSIDE, marker_corners, module_count, overhang, square_edges
 from sweep.typing import Floats, Integers
 
 
@@ -110,13 +110,9 @@ def clipped(edges: MarkerEdges, low: float, high: float, beyond: int) -> MarkerE
             ends, sides = _split(ends, sides, axis, limit)
             ends = ends.copy()
             ends[:, axis::2] = keep(ends[:, axis::2], limit)
-    square = np.array([
-        [low, low, low, high], [high, low, high, high], [low, low, high, low],
-        [low, high, high, high],
-    ])
     if beyond != OUTSIDE:
-        codes = [[beyond, OUTSIDE], [OUTSIDE, beyond], [OUTSIDE, beyond], [beyond, OUTSIDE]]
-        ends, sides = np.concatenate([ends, square]), np.concatenate([sides, codes])
+        square = square_edges(low, high, beyond, OUTSIDE)
+        ends, sides = joined([MarkerEdges(ends, sides), square])
     border = np.zeros(len(ends), dtype=bool)
     kept_ends, kept_sides = [], []
     for axis in range(2):

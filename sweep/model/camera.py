@@ -280,12 +280,7 @@ class Column:
 
     def broadcast(self, count: int, dtype: DTypeLike = np.float64) -> NDArray[Any]:
         """Return a contiguous array (count,) of the values; None becomes NaN."""
-        column = np.asarray(self.values, dtype=dtype)
-        if column.shape == (count,):
-            return np.ascontiguousarray(column)
-        spread = np.empty(count, dtype=column.dtype)
-        spread[...] = column
-        return spread
+        return np.full(count, np.asarray(self.values, dtype=dtype))
 
     def listed(self, count: int) -> list[Any]:
         """Return the values as a list of ``count``."""

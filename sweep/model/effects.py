@@ -255,6 +255,27 @@ def _noisy_by_level(levels: Floats, patch: Patch) -> Floats:
     return np.asarray(levels + np.interp(levels, table[::2], table[1::2]) * noise)
 
 
+def _shift(label: str, name: str, meaning: str, length_px: float) -> Effect:
+    """Return an effect that shifts the image from point to point, anew for each frame."""
+    return Effect(label, "edges", {
+        f"{name}_px": drawn(
+            0.0, f"standard deviation, right and down, of shifts of the image that vary {meaning}",
+            0, 1000,
+        ),
+        f"{name}_length_px": drawn(
+            length_px, "distance at which the correlation of these shifts has fallen to 0.61", 1,
+            1e6,
+        ),
+    }, needs={f"{name}_length_px": (f"{name}_px",)}, random=True, outline="curved")
+
+
+def _tone(name: str, default: float, meaning: str, low: float, high: float) -> Effect:
+    """Return one of the effects that make up the camera's response."""
+    return Effect(name, "response", {
+        f"tone_{name}": drawn(default, meaning, low, high),
+    }, worsens=("uneven light",), apply=_toned)
+
+
 EFFECTS: tuple[Effect, ...] = (
     Effect("printed size", "edges", {
         "marker_scale": drawn(
@@ -339,27 +360,14 @@ EFFECTS: tuple[Effect, ...] = (
         },
         spread_px=_defocus_px, by_depth=True,
     ),
-    Effect("image shift", "edges", {
-        "geometry_px": drawn(
-            0.0, "standard deviation, right and down, of shifts of the image that vary slowly "
-            "over the frame, as of a lens that its model does not describe; drawn anew for "
-            "each frame", 0, 1000,
-        ),
-        "geometry_length_px": drawn(
-            100.0, "distance at which the correlation of these shifts has fallen to 0.61", 1,
-            1e6,
-        ),
-    }, needs={"geometry_length_px": ("geometry_px",)}, random=True, outline="curved"),
-    Effect("ragged edges", "edges", {
-        "edge_px": drawn(
-            0.0, "standard deviation, right and down, of shifts of the image that vary from "
-            "one module to the next, as a screen's raster, compression and a camera's colour "
-            "filter lead to; drawn anew for each frame, beside geometry_px", 0, 1000,
-        ),
-        "edge_length_px": drawn(
-            4.0, "distance at which the correlation of these shifts has fallen to 0.61", 1, 1e6
-        ),
-    }, needs={"edge_length_px": ("edge_px",)}, random=True, outline="curved"),
+    _shift(
+        "image shift", "geometry", "slowly over the frame, as of a lens that its model does not "
+        "describe; drawn anew for each frame", 100.0,
+    ),
+    _shift(
+        "ragged edges", "edge", "from one module to the next, as a screen's raster, compression "
+        "and a camera's colour filter lead to; drawn anew for each frame, beside geometry_px", 4.0,
+    ),
     Effect("sharpening", "edges", {
         "sharpening": drawn(
             0.0, "amount of unsharp masking in the camera: the exact image plus so many times "
@@ -428,24 +436,18 @@ EFFECTS: tuple[Effect, ...] = (
         needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
         reach_px=sensor.REACH_PX, apply=_demosaiced,
     ),
-    Effect("gamma", "response", {
-        "tone_gamma": drawn(
-            1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
-            "below 1 dark areas are lifted", 0.1, 10,
-        ),
-    }, worsens=("uneven light",), apply=_toned),
-    Effect("toe", "response", {
-        "tone_toe": drawn(
-            0.0, "compression of the lower half of the scale towards black: the response has "
-            "the slope 1 - tone_toe at black", -1, 1,
-        ),
-    }, worsens=("uneven light",), apply=_toned),
-    Effect("knee", "response", {
-        "tone_knee": drawn(
-            0.0, "compression of the upper half of the scale towards white: the response has "
-            "the slope 1 - tone_knee at white", -1, 1,
-        ),
-    }, worsens=("uneven light",), apply=_toned),
+    _tone(
+        "gamma", 1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
+        "below 1 dark areas are lifted", 0.1, 10,
+    ),
+    _tone(
+        "toe", 0.0, "compression of the lower half of the scale towards black: the response has "
+        "the slope 1 - tone_toe at black", -1, 1,
+    ),
+    _tone(
+        "knee", 0.0, "compression of the upper half of the scale towards white: the response has "
+        "the slope 1 - tone_knee at white", -1, 1,
+    ),
     Effect("noise by level", "response", {
         "noise_table": parameter(
             (), "standard deviation of Gaussian noise over the level in the image: level, "

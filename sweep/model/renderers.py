@@ -206,15 +206,11 @@ def _draw(
     images = np.empty(stops[-1], dtype=np.uint8)
     box = boxes[:, 2:] - boxes[:, :2]
     scratch = np.zeros(int(((box[:, 0] + 2) * box[:, 1]).max()))
-    table, spans = board.edge_table(scenes.targets.boards)
     cameras = scenes.cameras
     coverage.draw_greys(
-        coverage.Canvas(images, starts, windows, boxes, scratch),
-        coverage.DrawnScenes(
-            table, spans, scenes.targets.number, scenes.levels, scenes.plane, cameras.view,
-            cameras.lenses, cameras.distorted,
-        ),
-        rows,
+        images, starts, windows, boxes, scratch, rows, *board.edge_table(scenes.targets.boards),
+        scenes.targets.number, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
+        cameras.distorted,
     )
     heights = size[:, 1].tolist()
     return [

@@ -18,7 +18,7 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import scenes_at, searched_windows
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.detectors import Detector, charuco_board
+from sweep.measure.detectors import Detector, opencv_board
 from sweep.model.renderers import render_all
 
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
@@ -142,7 +142,7 @@ def drawn(target, corners_m):
     bitmap = np.full(size[::-1], 255, np.uint8)
     if target.chessboard is not None:
         squares = target.chessboard
-        charuco = charuco_board(target).generateImage(
+        charuco = opencv_board(target).generateImage(
             tuple(round(count * squares.square_m * px_per_m)
                   for count in (squares.squares_x, squares.squares_y)))
         top, left = (np.array(bitmap.shape) - charuco.shape) // 2
@@ -158,7 +158,7 @@ def drawn(target, corners_m):
 
 def charuco_detector(target):
     """Return the detector of a board's chessboard corners, or None."""
-    return None if target.chessboard is None else cv2.aruco.CharucoDetector(charuco_board(target))
+    return None if target.chessboard is None else cv2.aruco.CharucoDetector(opencv_board(target))
 
 
 def user_loop(block, margin_px=None):

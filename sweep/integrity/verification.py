@@ -236,11 +236,13 @@ def check_scenes(
 
 
 def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Scene]:
-    """Draw needed scenes, each with the same probability, without repetitions."""
+    """Draw needed scenes, each with the same probability, without repetitions, or all."""
     generator = np.random.default_rng()
     sizes = np.array([receipt.scenes_needed for receipt in sound.values()])
-    if not sizes.any():
-        return []
+    needed = {number: np.flatnonzero(scenes_needed(store, store.blocks[number]))
+              for number in sound} if count >= sizes.sum() else {}
+    if needed or not sizes.any():
+        return [(number, row) for number, rows in needed.items() for row in rows.tolist()]
     numbers = generator.choice(np.array(list(sound)), size=count, p=sizes / sizes.sum())
     return sorted({
         (number, int(generator.choice(np.flatnonzero(scenes_needed(store, store.blocks[number])))))

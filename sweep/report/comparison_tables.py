@@ -24,10 +24,10 @@ from sweep.report.table import (
     Findings,
     Table,
     Value,
-    axis_label,
     coordinate,
     group_cells,
     plural,
+    table_of,
 )
 from sweep.tradeoff.pareto import configuration_label
 from sweep.typing import Floats
@@ -138,28 +138,19 @@ def calibration_table(summary: xr.Dataset) -> Table:
     dims = [str(dim) for dim in summary["calibrated"].dims if dim not in INNER]
     numbers = [str(each) for each in summary["intrinsic"].values
                if np.isfinite(summary["coverage"].sel(intrinsic=each)).any()]
-    groups = itertools.product(*(group_cells(summary, dim) for dim in (*dims, "views")))
-    statistics = [Column("", name) for name in ("bias", "rmse", "mean_std", "coverage")]
     depth = 1e3 * summary["position_rmse_m"].sel(xyz="z", drop=True)
-    rows = []
-    for group, (_, one) in zip(groups, each_cell(
-            summary.assign(depth_mm=depth), [*dims, "views"]), strict=True):
-        for name in numbers:
-            cell = one.sel(intrinsic=name)
-            rows.append([
-                *group, name, int(one["calibrated"]), int(one["tried"]),
-                *(column.cells(cell)[0] for column in statistics),
-                *Column("", "depth_mm").cells(one)])
+    depths = {f"z in the {where}, mm": depth.sel(direction=where, drop=True)
+              for where in summary["direction"].values.tolist()}
+    columns = [Column("calibrated", "calibrated"), Column("tried", "tried"), Column("bias", "bias"),
+               Column("RMSE", "rmse"), Column("reported sd", "mean_std"),
+               Column("coverage", "coverage"), *(Column(name, name) for name in depths)]
     caption = (
         f"Calibrations from the {summary.attrs['points']} points of a board: estimated minus "
         "true, px or 1; share of reported 95 % intervals that hold the truth; error of the depth "
         f"of a target at {summary.attrs['target_m']:g} m"
     )
-    return Table.of(caption, [
-        *(axis_label(summary, dim) for dim in dims), "views", "number", "calibrated", "tried",
-        "bias", "RMSE", "reported sd", "coverage",
-        *(f"z in the {where}, mm" for where in summary["direction"].values.tolist()),
-    ], rows, stub=len(dims) + 2)
+    shown = summary.sel(intrinsic=numbers).assign(depths).rename(intrinsic="number")
+    return table_of(shown, caption, [*dims, "views", "number"], columns)
 
 
 def calibration_findings(summary: xr.Dataset, store: str) -> Findings:

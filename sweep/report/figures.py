@@ -252,7 +252,7 @@ def _outcomes(data: ReportData) -> Figure:
     happened = summary.sel(outcome=[name for name in count_of if name not in excluded])
     share = Column("share, %", "share", 100)
     return figure(
-        data, happened.assign(looked_for=total.broadcast_like(happened["count"])),
+        data, happened.assign(looked_for=total),
         {"outcome": None, **groups}, "failures", "Outcomes of the poses",
         "Shares of the poses looked for" + (f", by {data.words(names[0])}" if names else "")
         + ": solved, or the flag that says why not."
@@ -368,9 +368,6 @@ def _bound(data: ReportData) -> Figure | None:
 USUAL = 0.2
 """The threshold that many programs use."""
 
-FRONTAL_DEG = 5.0
-"""Viewing angle up to which a pose hardly differs from its mirror."""
-
 CONDITIONS = 8
 """The most sizes, or angles, that are told apart."""
 
@@ -388,13 +385,9 @@ KEPT_AT_USUAL = (
 
 
 def _ambiguity(data: ReportData) -> Figure | None:
-    """Return the figure if any pose has another solution, any is a flip, not all are frontal."""
+    """Return the figure if any pose has another solution, and any is a flip."""
     if not all(name in data.results for name in (
             "reprojection_error_px", "alternative_reprojection_error_px")):
-        return None
-    if "viewing_angle_deg" in data.results and not data.once(
-            "largest angle", data.results[["viewing_angle_deg"]].max
-    )["viewing_angle_deg"] > FRONTAL_DEG:
         return None
     pooled = grouped(data, ambiguity)
     curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values
@@ -518,8 +511,8 @@ def precision_table(table: xr.Dataset) -> Table:
     known = reached.isin((Reached.reached, Reached.not_reached))
     counts = {each.name: (reached == each).sum(pooled) for each in Reached}
     return table_of(
-        xr.Dataset({"wanted": table["wanted"].broadcast_like(counts["reached"]),
-                    "widest": table["half_width"].where(known).max(pooled), **counts}),
+        xr.Dataset(counts | {"wanted": table["wanted"],
+                             "widest": table["half_width"].where(known).max(pooled)}),
         f"Precision of {run.size:,} conditions, which took {int(run.min()):,} to "
         f"{int(run.max()):,} poses each: conditions by what was reached; of rates the "
         "half-width of the interval, of others relative to the value (bias: to the RMSE)",

@@ -242,17 +242,6 @@ MIN_FLIP_DEG = 5.0
 Index = dict[str, int]
 
 
-def _failures() -> Iterator[Flag]:
-    """Yield the flags of poses that are counted but not solved; those of both stages last."""
-    for flags, other in ((DetectionStatus, EstimateStatus), (EstimateStatus, DetectionStatus)):
-        ending = [flag for flag in flags if flag.counted and flag.ends]
-        ending.sort(key=lambda flag: flag.name in other.__members__)
-        yield from (flag for flag in ending if flag is not EstimateStatus.solved)
-
-
-FAILURES: tuple[Flag, ...] = tuple(_failures())
-
-
 def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
     """Yield a title and the index along each axis, for each kind of scene that occurs.
 
@@ -269,38 +258,31 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
     area = np.nan_to_num(area, nan=-1.0, posinf=-1.0)
     solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
     flipped = values("flipped") == Flipped.flipped
-
-    def first(order: NDArray[np.intp]) -> Index:
-        at = np.unravel_index(order[0], [results.sizes[dim] for dim in dims])
-        return dict(zip(dims, map(int, at), strict=True))
-
-    def largest(mask: NDArray[np.bool_], merit: NDArray[Any]) -> NDArray[np.intp]:
-        """Return the cell of a mask with the largest merit; none without cells."""
-        rows = np.flatnonzero(mask)
-        return rows[[np.argmax(merit[rows])]] if rows.size else rows
-
-    by_error = np.flatnonzero(solved)
-    middle = (by_error.size - 1) // 2
-    by_error = by_error[np.argpartition(error[by_error], middle)] if by_error.size else by_error
+    middle = np.quantile(error[solved], 0.5, method="lower") if solved.any() else math.nan
     kinds = {
-        "best: the smallest rotation error": largest(solved, -error),
-        "median rotation error of the solved": by_error[middle : middle + 1],
-        "worst: the largest rotation error": largest(solved, error),
-        "worst without a flip": largest(solved & ~flipped, error),
-        "flipped to the mirrored pose": largest(
-            solved & flipped & (error > MIN_FLIP_DEG), area),
+        "best: the smallest rotation error": (solved, -error),
+        "median rotation error of the solved": (solved, -np.abs(error - middle)),
+        "worst: the largest rotation error": (solved, error),
+        "worst without a flip": (solved & ~flipped, error),
+        "flipped to the mirrored pose": (solved & flipped & (error > MIN_FLIP_DEG), area),
     }
-    shown = set[str]()
-    for flag in FAILURES:
-        # A failure of the detection is flagged in the estimate, too: it is shown once.
-        flags = detection if isinstance(flag, DetectionStatus) else estimate
-        if flag.name not in shown and (rows := largest(flags == flag, area)).size:
-            shown.add(flag.name)
-            meaning = f"{flag.meaning[:1].lower()}{flag.meaning[1:]}".removesuffix(".")
-            kinds[f"{flag.name.replace('_', ' ')}: {meaning}"] = rows
-    for title, rows in kinds.items():
+    failures = dict[str, tuple[Flag, NDArray[Any]]]()
+    stages: tuple[tuple[type[Flag], NDArray[Any]], ...] = (
+        (DetectionStatus, detection), (EstimateStatus, estimate))
+    for flags, column in stages:
+        for flag in flags:
+            if flag.counted and flag.ends and flag is not EstimateStatus.solved:
+                # A failure of the detection is flagged in the estimate, too: it is shown once.
+                failures.setdefault(flag.name, (flag, column == flag))
+    for name, (failure, mask) in failures.items():
+        meaning = f"{failure.meaning[:1].lower()}{failure.meaning[1:]}".removesuffix(".")
+        kinds[f"{name.replace('_', ' ')}: {meaning}"] = mask, area
+    shape = [results.sizes[dim] for dim in dims]
+    for title, (mask, merit) in kinds.items():
+        rows = np.flatnonzero(mask)
         if rows.size:
-            yield title, first(rows)
+            at = np.unravel_index(rows[np.argmax(merit[rows])], shape)
+            yield title, dict(zip(dims, map(int, at), strict=True))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -400,14 +382,13 @@ def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:
 
 def result_text(scene: SceneInspection) -> str:
     """Return the flags and the errors of the pose, in words."""
-    parts = [scene.detection.name.replace("_", " "), f"area {number(scene.area_px)} px\u00b2"]
+    parts = [_flags_text(scene.detection, scene.estimate),
+             f"area {number(scene.area_px)} px\u00b2"]
     if "marker_detection" in scene.values:
         flags = scene.values["marker_detection"]
         counted = flags[~np.isin(flags, uncounted_values(DetectionStatus))]
         found = int((counted == DetectionStatus.detected).sum())
         parts.insert(1, f"{found} of {plural(len(counted), 'visible marker')}")
-    if scene.detection is DetectionStatus.detected and scene.estimate is not EstimateStatus.solved:
-        parts.append(scene.estimate.name.replace("_", " "))
     rotation = scene.errors["rotation_error_deg"]
     if math.isfinite(rotation):
         parts += [

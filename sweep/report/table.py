@@ -60,7 +60,7 @@ def coordinate(value: Any) -> str:
     >>> coordinate(0.30000000000000004), coordinate("exact")
     ('0.3', 'exact')
     """
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}".replace("inf", "\u221e") if isinstance(value, float) else str(value)
 
 
 def coordinates(values: Sequence[Any]) -> list[str]:
@@ -406,7 +406,7 @@ def table_of(
     caption
         What the table holds.
     dims
-        Dimensions of ``summary``, all of them.
+        Dimensions of the columns' variables, all of them; those that lack some are repeated.
     wanted
         The columns; one whose variable ``summary`` lacks is left out.
     sources
@@ -415,12 +415,16 @@ def table_of(
         Variable of ``summary`` without which, where it is 0, there is no row.
     """
     wanted = [each for each in wanted if each.variable in summary]
-    ordered = summary.transpose(*dims, ...)
+    names = dict.fromkeys(name for each in (*(each.variable for each in wanted), counted)
+                          for end in ("", "_low", "_high") if (name := f"{each}{end}") in summary)
+    # Without coordinates, which would not be repeated.
+    (ordered,) = xr.broadcast(xr.Dataset({name: summary[name].variable for name in names}))
+    ordered = ordered.transpose(*dims)
     cells = zip(*(each.cells(ordered) for each in wanted), strict=True)
-    names = itertools.product(*(group_cells(summary, dim) for dim in dims))
-    used = np.ravel(ordered[counted]) > 0 if counted in summary and dims else itertools.repeat(True)
+    groups = itertools.product(*(group_cells(summary, dim) for dim in dims))
+    used = np.ravel(ordered[counted]) > 0 if counted in ordered and dims else itertools.repeat(True)
     units = sources if sources is not None else summary
     return Table.of(
         caption, [*(axis_label(units, dim) for dim in dims), *(each.heading for each in wanted)],
-        [[*name, *row] for name, row, shown in zip(names, cells, used, strict=False) if shown],
+        [[*group, *row] for group, row, shown in zip(groups, cells, used, strict=False) if shown],
         stub=len(dims))

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         decisions,
         error_model_file,
         figure,
-        limit_figure,
         output_file,
         questions,
         report_data,

@@ -144,8 +144,8 @@ def limit(
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if figure is not None:
-        library.figure.write_figure([library.limit_figure.limit_figure(limits)], figure)
-    return library.limit_figure.limit_findings(limits)
+        library.figure.write_figure([library.decisions.limit_figure(limits)], figure)
+    return library.decisions.limit_findings(limits)
 
 
 @command("sweep/analysis/README.md", {

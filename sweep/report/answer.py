@@ -22,7 +22,17 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import DatasetError, StoreError
 from sweep.report.comparison import CARDS, COUNTED, Comparison, comparison
-from sweep.report.decisions import WORDS, condition_table, decision_table, valued
+from sweep.report.decisions import (
+    WORDS,
+    condition_table,
+    decision_table,
+    limit_interval,
+    limit_table,
+    limit_text,
+    limits_as_json,
+    valued,
+    values_met,
+)
 from sweep.report.error_model_file import error_model_tables
 from sweep.report.figures import (
     board_tables,
@@ -33,9 +43,6 @@ from sweep.report.figures import (
     signed_errors_table,
     threshold_tables,
 )
-from sweep.report.limit_figure import as_json as limits_as_json
-from sweep.report.limit_figure import interval_text as limit_interval
-from sweep.report.limit_figure import limit_table, limit_text, values_met
 from sweep.report.report_data import (
     CONFIGURATION,
     Configurations,

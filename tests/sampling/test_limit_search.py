@@ -13,7 +13,7 @@ from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import DetectionStatus
-from sweep.report.limit_figure import as_json, limit_table
+from sweep.report.decisions import limit_table, limits_as_json
 from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import (
     BEYOND,
@@ -138,7 +138,7 @@ def test_a_limit_that_is_not_decided_is_never_told_as_met():
     told = {False: 0, True: 0}
     for curve in rng.uniform(0.8, 1.0, (4, 1, 1)) * special.expit((SIDES - 12.0) / 2):
         limits = searched(curve, SIDES, "detection >= 0.9", 80, seed=6)
-        (listed,) = as_json(limits)["limits"]
+        (listed,) = limits_as_json(limits)["limits"]
         (row,) = limit_table(limits).shown_rows
         decision = limits["decision"].isel(tilt_deg=0)
         met = {name: isinstance(listed[name], float) and bool(

@@ -2,6 +2,8 @@
 
 import json
 import re
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,28 +12,27 @@ import tomlkit
 import sweep
 from sweep.cli import main
 from sweep.diagnosis.inference import next_measurement, rank
-from sweep.diagnosis.observations import read_observations
+from sweep.diagnosis.observations import CORNERS, read_observations
 from sweep.model.calibration import Calibration
 
 CAMERA = Calibration(1280, 720, 900.0, 900.0, 639.5, 359.5, (), (), ())
 AWAY = np.array([0.5, 1.0, 2.0])
-FLAT = {"tvec_x_m": [0.0, 0.2, -0.4], "tvec_y_m": [0.0, 0.0, 0.1], "x_m": [0.0, 0.2, -0.4]}
+FOLDER = Path(__file__).parents[2] / "pipelines" / "diagnose"
+CASES = runpy.run_path(str(FOLDER / "cases.py"))
 
 
 def first(found):
     return found.numbers["causes"][0]["causes"]
 
 
-def test_size_is_told_from_focal_length_off_the_axis():
-    straight = np.linalg.norm([[0, 0, 0.5], [0.2, 0, 1], [-0.4, 0.1, 2]], axis=1)
-    focal = sweep.diagnose({**FLAT, "tvec_z_m": 1.3 * AWAY, "tape_m": straight},
-                           camera=CAMERA, size_m=0.1, compared="range")
-    size = sweep.diagnose(
-        {"tvec_x_m": np.multiply(1.3, FLAT["tvec_x_m"]), "x_m": FLAT["x_m"],
-         "tvec_y_m": np.multiply(1.3, FLAT["tvec_y_m"]), "tvec_z_m": 1.3 * AWAY,
-         "tape_m": straight}, camera=CAMERA, size_m=0.1, compared="range")
-    assert (first(focal), first(size)) == (["focal_length"], ["size"])
-    assert focal.status == size.status == 0
+@pytest.mark.parametrize(("lateral", "cause"), [(1.0, "focal_length"), (1.3, "size")])
+def test_size_is_told_from_focal_length_off_the_axis(lateral, cause):
+    truth = np.array([[0, 0, 0.5], [0.2, 0, 1], [-0.4, 0.1, 2]])
+    x, y, z = (truth * [lateral, lateral, 1.3]).T
+    found = sweep.diagnose(
+        {"tvec_x_m": x, "tvec_y_m": y, "tvec_z_m": z, "x_m": truth[:, 0],
+         "tape_m": np.linalg.norm(truth, axis=1)}, camera=CAMERA, size_m=0.1, compared="range")
+    assert (first(found), found.status) == ([cause], 0)
 
 
 def test_on_the_axis_they_are_confounded_and_a_row_off_it_would_decide():
@@ -68,23 +69,22 @@ def test_next_measurement_is_where_predictions_differ():
 
 
 @pytest.mark.parametrize(("columns", "words"), [
-    ({"tvec_z_m": [1], "tape_m": [1], "rvec_x": [0.1]}, "rvec_x needs rvec_y beside it"),
-    ({"tvec_z_m": [1], "tape_m": [1], "corner2_x_px": [9]}, "corner2_x_px needs corner2_y"),
-    ({"tvec_z_m": [1], "tape_m": [1], "position_sd_m": [0.1]}, "needs x_m or y_m or z_m"),
-    ({"tvec_z_m": [1], "tape_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
+    ({"tvec_z_m": [1], "rvec_x": [0.1]}, "rvec_x needs rvec_y beside it"),
+    ({"tvec_z_m": [1], "corner2_x_px": [9]}, "corner2_x_px needs corner2_y_px beside it"),
+    ({"tvec_z_m": [1], "position_sd_m": [0.1]}, "needs x_m or y_m or z_m"),
+    ({"tvec_z_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
     ({"range_m": [1.0, 2.0], "tape_m": [1.0, ""]}, "row 2: expected tape_m"),
-    ({"rang_m": [1.0], "tape_m": [1.0]}, "range_m"),
-    ({"range_m": [1.0], "tape_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m"),
-    ({"range_m": [1.0], "tape_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
-    ({"range_m": [1e300], "tape_m": [1.0]}, "range_m = 1e+300: expected a number between"),
-    ({}, "no rows"), ({"range_m": [1.0] * 1001}, "1001 rows"),
+    ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "as long as each other"),
+    ({"range_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m = 0.0: expected a number between"),
+    ({"range_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
+    ({"range_m": [1e300]}, "range_m = 1e+300: expected a number between"),
+    ({"tape_m": []}, "no rows"), ({"tape_m": [1.0] * 1001}, "1001 rows"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
-    with pytest.raises(sweep.ArgumentError) as error:
-        sweep.diagnose(columns)
-    assert words in str(error.value)
+    with pytest.raises(sweep.ArgumentError, match=re.escape(words)) as error:
+        sweep.diagnose({"tape_m": [1.0]} | columns)
     assert "\n" not in str(error.value)
 
 
@@ -96,15 +96,14 @@ def test_impossible_units_and_missing_uncertainty_are_noted():
 
 
 def test_poses_are_solved_from_corners_in_the_cameras_image():
-    corners = {}
-    for k, (x, y) in enumerate([(-0.05, 0.05), (0.05, 0.05), (0.05, -0.05), (-0.05, -0.05)]):
-        corners[f"corner{k}_x_px"] = 639.5 + 900 * x / AWAY
-        corners[f"corner{k}_y_px"] = 359.5 - 900 * y / AWAY
-    rows = read_observations({**corners, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
+    square = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
+    corners = np.array([639.5, 359.5]) + 900 * square / AWAY[:, None, None]
+    columns = dict(zip(CORNERS, corners.reshape(-1, 8).T, strict=True))
+    rows = read_observations({**columns, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
     assert np.allclose(rows.said[:, 2], AWAY, atol=1e-6)
-    beyond = {name: values + 1500.0 for name, values in corners.items()}
+    columns["corner0_x_px"] = columns["corner0_x_px"] + 1500.0
     with pytest.raises(sweep.ArgumentError, match="1280 x 720"):
-        sweep.diagnose({**beyond, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
+        sweep.diagnose({**columns, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
 
 
 def test_poses_are_solved_from_images(tmp_path):
@@ -152,3 +151,14 @@ def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):
         sweep.diagnose(path)
 
 
+def test_public_cases_are_ranked_as_their_threads_found_out():
+    """The cause that a thread found out is ranked first, or second, and stands in the guide."""
+    answers = list(CASES["cases"]())
+    known = [(case["found"], [each["causes"] for each in found.numbers["causes"]])
+             for case, found in answers if case["found"]]
+    assert len(answers) >= 12
+    assert sum([found] == causes[0] for found, causes in known) >= 0.7 * len(known)
+    assert sum([found] in causes[:2] for found, causes in known) >= 0.9 * len(known)
+    guide = (FOLDER / "README.md").read_text()
+    for case, found in answers:
+        assert (CASES["row"](case, found) in guide) == bool(case["found"])

@@ -17,16 +17,9 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import to_json
-from sweep.tradeoff import costs as paired_timing
-from sweep.tradeoff import costs as scene_sample
+from sweep.tradeoff import costs
 from sweep.tradeoff import measurement as tradeoff
-from sweep.tradeoff.costs import (
-    LEAST_ROUNDS,
-    MIN_ROUNDS,
-    NARROW,
-    median_interval,
-    time_in_turns,
-)
+from sweep.tradeoff.costs import LEAST_ROUNDS, MIN_ROUNDS, median_interval, time_in_turns
 
 CAMERA = """
 seed = 3
@@ -76,7 +69,7 @@ trial = 12
 def _few_scenes():
     """Measure costs on few scenes: what is told is the same, and sooner."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_sample, "MAX_SCENES", 4)
+        patch.setattr(costs, "MAX_SCENES", 4)
         yield
 
 
@@ -119,20 +112,15 @@ size_m = [0.015, 0.015]
 
 @pytest.fixture(scope="module")
 def trade(store):
-    """What the command says of the store as JSON, told apart by side_px."""
-    return json.loads(told(
+    """What the command says of the store as JSON, told apart by side_px, and what it wrote."""
+    said = json.loads(told(
         store, "--per", "side_px", "--seconds", "0.2", "--budget-ms", "1e9", "--json"))
+    return said, group(store, "cost/tradeoff")
 
 
-def values(content, name):
-    """Return a variable of the JSON as an array: null is NaN."""
-    def number(value, flag):
-        if isinstance(value, list):
-            return [number(one, flag and flag[k]) for k, one in enumerate(value)]
-        return math.inf if flag == "infinite" else math.nan if value is None else value
-
-    stored = content["data_vars"][name]
-    return np.array(number(stored["data"], stored.get("data_flag")), dtype=float)
+def group(store, name=None):
+    with xr.open_zarr(store, group=name) as written:
+        return written.load()
 
 
 # From a store to what is printed.
@@ -142,51 +130,50 @@ def test_accuracy_is_that_of_plain_arithmetic_on_the_store(trade, store):
     """Its treatments are refinements by solvers, in order."""
     treatments = ("cornerRefinementMethod", "solver")
     dims = ("side_px", *treatments, "tilt_deg", "trial")
-    with xr.open_zarr(store) as results:
-        wide, = xr.broadcast(results.load())
+    wide, = xr.broadcast(group(store))
     seen = (wide["detection"] == DetectionStatus.detected).transpose(*dims, ...).values
     solved = (wide["estimate"] == EstimateStatus.solved).transpose(*dims, ...).values
     rotation = wide["rotation_error_deg"].transpose(*dims, ...).values
     seen, solved, rotation = (
         array.reshape(2, 6, 40, -1)[..., 0] for array in (seen, solved, rotation))
     mean = np.nanmean(np.where(solved, rotation.astype(float), np.nan) ** 2, axis=-1)
-    assert values(trade, "detection_rate") == pytest.approx(seen.mean(axis=-1))
-    assert values(trade, "solved_rate") == pytest.approx(solved.mean(axis=-1))
-    assert values(trade, "rotation_rmse_deg") == pytest.approx(np.sqrt(mean), rel=1e-6)
-    assert (values(trade, "detection_rate")[0] < 1).all()
-    assert np.isinf(values(trade, "rotation_p99_deg")[0]).all()
+    _, written = trade
+    assert written["detection_rate"].values == pytest.approx(seen.mean(axis=-1))
+    assert written["solved_rate"].values == pytest.approx(solved.mean(axis=-1))
+    assert written["rotation_rmse_deg"].values == pytest.approx(np.sqrt(mean), rel=1e-6)
+    assert (written["detection_rate"][0] < 1).all()
+    assert np.isinf(written["rotation_p99_deg"][0]).all()
 
 
 def test_costs_are_in_order(trade):
     """Ten iterations on the pixels cost twice one closed solution; it is some ten times."""
-    assert all("within 1e+09 ms a frame: " in line for line in trade["advice"])
-    estimation = values(trade, "estimation_ms").reshape(2, 2, 3)
+    said, written = trade
+    assert all("within 1e+09 ms a frame: " in line for line in said["advice"])
+    estimation = written["estimation_ms"].values.reshape(2, 2, 3)
     assert (estimation[..., 2] > 2 * estimation[..., 0]).all()
-    assert (values(trade, "cost_ratio").reshape(2, 2, 3)[..., 2] > 1).all()
-    total = values(trade, "detection_ms") + values(trade, "estimation_ms")
+    assert (written["cost_ratio"].values.reshape(2, 2, 3)[..., 2] > 1).all()
     # The median of a sum is not the sum of the medians.
-    assert values(trade, "cost_ms") == pytest.approx(total, rel=0.2)
+    assert written["cost_ms"].values == pytest.approx(
+        (written["detection_ms"] + written["estimation_ms"]).values, rel=0.2)
 
 
 def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trade):
-    with xr.open_zarr(store) as before, xr.open_zarr(store, group="cost") as cost:
-        results, spent = before.load(), cost.load()
+    results, spent = group(store), group(store, "cost")
     # Another dimension than in ``trade``, of which nothing is to be left.
-    assert "side_px" in trade["dims"]
+    assert "side_px" in trade[0]["dims"]
     printed = json.loads(told(
         store, "--seconds", "0.1", "--per", "tilt_deg", "--budget-ms", "1e-6", "--json"))
     assert "nothing fits 1e-06 ms a frame; the nearest is " in " ".join(printed.pop("advice"))
-    with xr.open_zarr(store, group="cost/tradeoff") as written:
-        assert written["cost_ms"].dims == ("tilt_deg", "treatment")
-        again = json.loads(to_json(written.load().to_dict()))
+    written = group(store, "cost/tradeoff")
+    assert written["cost_ms"].dims == ("tilt_deg", "treatment")
+    again = json.loads(to_json(written.to_dict()))
     for part in ("attrs", "dims", "data_vars"):
         assert again[part] == printed[part]
     assert {name: one["data"] for name, one in again["coords"].items()} == {
         name: one["data"] for name, one in printed["coords"].items()
     }
-    with xr.open_zarr(store) as after, xr.open_zarr(store, group="cost") as cost:
-        assert after.load().equals(results)
-        assert cost.load().identical(spent)
+    assert group(store).equals(results)
+    assert group(store, "cost").identical(spent)
     assert status(store).finished
     assert execute(Pipeline.from_text(TRADE, name="trade"), store, workers=1).computed_blocks == 0
 
@@ -195,27 +182,24 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
 
 def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(tmp_path):
     url = made(tmp_path, RENDERERS, "renderers")
-    content = json.loads(told(url, "--seconds", "0.2", "--json"))["renderers"]
-    order = content["coords"]["renderer"]["data"]
-    warp, exact, two, eight = (
-        order.index(name) for name in ("warp", "exact", "supersample-2", "supersample-8")
-    )
-    rms, largest = values(content, "grey_rms"), values(content, "grey_max")
-    assert rms[exact] == largest[exact] == 0
-    assert rms[two] > rms[eight] > 0
-    assert rms[warp] > 0
-    assert (largest >= rms).all()
-    for name in ("detection_disagreement", "corner_shift_rms_px", "range_bias_percent",
-                 "rotation_shift_deg"):
-        assert (values(content, name)[exact] == 0).all(), name
-        with xr.open_zarr(url, group="cost/renderers") as written:
-            assert np.array_equal(written[name], values(content, name), equal_nan=True)
-    assert (values(content, "corner_shift_rms_px")[[warp, two, eight]] > 0).all()
+    said = json.loads(told(url, "--seconds", "0.2", "--json"))["renderers"]
+    written = group(url, "cost/renderers")
+    assert json.loads(to_json(written.to_dict()))["data_vars"] == said["data_vars"]
+    exact, others = (written.sel(renderer=names) for names in (
+        "exact", ["warp", "supersample-2", "supersample-8"]))
+    warp, two, eight = others["grey_rms"].values
+    assert two > eight > 0
+    assert warp > 0
+    assert (written["grey_max"] >= written["grey_rms"]).all()
+    for name in ("grey_rms", "grey_max", "detection_disagreement", "corner_shift_rms_px",
+                 "range_bias_percent", "rotation_shift_deg"):
+        assert (exact[name] == 0).all(), name
+    assert (others["corner_shift_rms_px"] > 0).all()
     for end in ("", "_low", "_high"):
-        assert values(content, f"render_ratio{end}")[exact] == 1
-    assert (values(content, "render_ms") > 0).all()
+        assert exact[f"render_ratio{end}"] == 1
+    assert (written["render_ms"] > 0).all()
     # 64 samples a pixel against 4.
-    assert values(content, "render_ms")[eight] > 2 * values(content, "render_ms")[two]
+    assert others["render_ms"][2] > 2 * others["render_ms"][1]
 
 
 # What cannot be done.
@@ -266,7 +250,7 @@ class Clock:
 def clock(monkeypatch):
     one = Clock()
     fake = SimpleNamespace(thread_time=lambda: one.now, perf_counter=lambda: one.now)
-    monkeypatch.setattr(paired_timing, "time", fake)
+    monkeypatch.setattr(costs, "time", fake)
     return one
 
 
@@ -284,8 +268,8 @@ def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
         value, low, high = median_interval(to_first(seconds[:count]))
         return ((high - low) / value).max()
 
-    assert width(len(seconds)) <= NARROW
-    assert all(width(count) > NARROW for count in range(MIN_ROUNDS, len(seconds)))
+    assert width(len(seconds)) <= costs.NARROW
+    assert all(width(count) > costs.NARROW for count in range(MIN_ROUNDS, len(seconds)))
 
 
 @pytest.mark.parametrize(("limit", "most", "rounds"), [
@@ -293,7 +277,7 @@ def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
 def test_rounds_end_at_the_limit_but_not_before_there_are_enough(
     clock, monkeypatch, limit, most, rounds
 ):
-    monkeypatch.setattr(paired_timing, "MAX_ROUNDS", most)
+    monkeypatch.setattr(costs, "MAX_ROUNDS", most)
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + 2.0 * (call % 2))]
     # Rounds of 2 and 4 s by turns, the first of which warms up: 33 rounds take 98 s.
     assert len(time_in_turns(parts, to_first, limit, Interrupts())) == rounds

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from support.answers import rows_of
+from support.answers import TEXT, rows_of
 from support.blocks import run_cells
 from sweep import cli
 from sweep.errors import ArgumentError, StoreError
@@ -16,34 +16,12 @@ from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.experiment.pipeline import Pipeline
 
-TEXT = """
-title = "Exported"
-seed = 5
-[camera]
-width_px = 160
-height_px = 120
-fx_px = 150
-distortion = [0.01, 0.002, 0.001, -0.001]
-[marker]
-size_m = 0.05
-[pose]
-jitter_px = 0.5
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 128
-noise_grey = 2
-[detector]
-cornerRefinementMethod = "subpix"
-[axes]
-tilt_deg = [0, 50]
-distance_m = [0.1, 0.2, 0.3]
-trial = 3
-"""
-
 
 @pytest.fixture(scope="module")
 def pipeline():
-    return Pipeline.from_text(TEXT, name="exported")
+    return Pipeline.from_text(TEXT, [
+        "distance_m=[0.1, 0.2, 0.3]", "azimuth_deg={ uniform = [0, 360] }", "noise_grey=2",
+        'cornerRefinementMethod="subpix"'], name="exported")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +57,7 @@ def test_truth_is_what_opencv_projects_with_the_camera_file(exported):
         projected, _ = cv2.projectPoints(square, np.array(rvec), np.array(tvec), matrix, lens)
         np.testing.assert_allclose(corners_of(row), projected[:, 0], atol=1e-9)
         image = cv2.imread(str(folder / "images" / row["image"]), cv2.IMREAD_UNCHANGED)
-        assert image.shape == (height, width) == (120, 160)
+        assert image.shape == (height, width) == (160, 200)
         assert (float(row["fx_px"]), float(row["cx_px"])) == (matrix[0, 0], matrix[0, 2])
 
 
@@ -144,7 +122,7 @@ def test_camera_files_are_read_as_the_same_camera(exported, pipeline):
         })
         assert other.fixed["distortion"][:4] == pipeline.fixed["distortion"]
         assert [other.fixed[key] for key in ("width_px", "fx_px", "cx_px", "cy_px")] == [
-            160, 150, 79.5, 59.5]
+            200, 180, 99.5, 79.5]
 
 
 def test_an_interrupted_export_continues_and_damage_is_repaired(exported, pipeline, tmp_path):
@@ -177,7 +155,7 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
     exported, pipeline, tmp_path, monkeypatch
 ):
     (tmp_path / "notes.txt").write_text("mine")
-    other = Pipeline.from_text(pipeline.text.replace("seed = 5", "seed = 6"), name="exported")
+    other = Pipeline.from_text(pipeline.text, ["seed=6"], name="exported")
     for some, folder, options, line in (
         (pipeline, tmp_path, {}, r"holds notes\.txt, and no export"),
         (pipeline, tmp_path / "notes.txt", {}, "a file; choose a new folder"),
@@ -201,7 +179,7 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
 def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):
     (tmp_path / "p.toml").write_text(
         TEXT.replace("tilt_deg = [0, 50]", "bearing_x_deg = [0, 80]")
-        .replace("distance_m = [0.1, 0.2, 0.3]\ntrial = 3", "distance_m = [0.2]"))
+        .replace("distance_m = [0.1, 0.25]\ntrial = 3", "distance_m = [0.2]"))
     assert cli.main(["export", str(tmp_path / "p.toml"), str(tmp_path / "out")]) == 0
     assert "1 images" in capsys.readouterr().out
     assert len(truth(tmp_path / "out")) == 1

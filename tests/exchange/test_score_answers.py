@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import sweep
-from support.answers import answer, rows_of, write
+from support.answers import TEXT, answer, rows_of, write
 from support.blocks import run_cells
 from support.stores import by_hand
 from sweep import cli
@@ -23,53 +23,15 @@ from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.lifecycle import open_store
 
-MARKER = """
-title = "Scored"
-seed = 11
-[camera]
-width_px = 200
-height_px = 160
-fx_px = 180
-distortion = [0.05, -0.02, 0.001, 0.001]
-[marker]
-size_m = 0.05
-[pose]
-jitter_px = 0.5
-[scene]
-background = 128
-noise_grey = 4
-window = "full"
-[estimator]
-solver = "ippe"
-[axes]
-dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]
-tilt_deg = [0, 50]
-distance_m = [0.1, 0.25]
-trial = 3
-"""
-BOARD = """
-title = "Exchanged"
-seed = 3
-[camera]
-width_px = 320
-height_px = 240
-fx_px = 300
-[marker]
-size_m = 0.03
-dictionary = "DICT_4X4_50"
-[scene]
-noise_grey = 3
-background = 128
-window = "full"
-[estimator]
-solver = "iterative"
-guarded = false
-[axes]
-tilt_deg = [0, 40]
-distance_m = [0.25, 0.4]
-trial = 2
-"""
-SHEETS = BOARD + """[board]
+DICTIONARIES = 'dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]'
+MARKERS = TEXT.replace("[axes]", f"[axes]\n{DICTIONARIES}"), ['window="full"']
+OF_BOARD = [
+    'window="full"', "distortion=[]", 'dictionary="DICT_4X4_50"', 'solver="iterative"',
+    "guarded=false", "size_m=0.03", "distance_m=[0.15, 0.25]", "trial=2",
+]
+"""Settings of pipelines of boards."""
+
+SHEETS = """[board]
 kind = "markers"
 [[board.markers]]
 marker_id = 3
@@ -90,9 +52,11 @@ z_m = -0.01
 tilt_deg = -30
 """
 TARGETS = {
-    "marker": MARKER, "several planes": SHEETS,
-    "one plane": BOARD + '[board]\nkind = "grid"\nrows = 2\ncolumns = 3\ngap_m = 0.01\n',
+    "marker": MARKERS, "several planes": (TEXT + SHEETS, OF_BOARD),
+    "one plane": (
+        TEXT + '[board]\nkind = "grid"\nrows = 2\ncolumns = 3\ngap_m = 0.01\n', OF_BOARD),
 }
+"""Name -> text and settings of a pipeline."""
 
 
 def results_of(pipeline):
@@ -105,7 +69,7 @@ def results_of(pipeline):
 def exchanged(request, tmp_path_factory):
     """An export with the detections of the program that its README shows, and the run."""
     folder = tmp_path_factory.mktemp("targets") / "export"
-    pipeline = Pipeline.from_text(TARGETS[request.param], name="exchanged")
+    pipeline = Pipeline.from_text(*TARGETS[request.param], name="exchanged")
     export(pipeline, folder)
     answer(folder)
     return folder, results_of(pipeline)
@@ -115,14 +79,14 @@ def exchanged(request, tmp_path_factory):
 def exported(tmp_path_factory):
     """An export of markers with the detections of that program."""
     folder = tmp_path_factory.mktemp("score") / "export"
-    export(Pipeline.from_text(MARKER, name="scored"), folder)
+    export(Pipeline.from_text(*MARKERS, name="scored"), folder)
     answer(folder)
     return folder
 
 
 @pytest.fixture(scope="module")
 def ran():
-    return results_of(Pipeline.from_text(MARKER, name="scored"))
+    return results_of(Pipeline.from_text(*MARKERS, name="scored"))
 
 
 def found_rows(folder):
@@ -318,8 +282,8 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
             Conventions.of(*wrong)
 
 
-CAMERA = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
-"""The camera of `BOARD`."""
+CAMERA = np.array([[180, 0, 99.5], [0, 180, 79.5], [0, 0, 1.0]])
+"""The camera of boards."""
 
 
 @pytest.mark.parametrize("exchanged", ["one plane", "several planes"], indirect=True)
@@ -355,8 +319,8 @@ def test_poses_of_a_plain_opencv_loop_are_scored_as_those_of_a_run(exchanged, tm
 
 def test_truth_of_a_charuco_has_its_chessboard(tmp_path):
     board = '[board]\nkind = "charuco"\nsquares_x = 4\nsquares_y = 3\nsquare_m = 0.035\n'
-    settings = ['points="chessboard"', 'solver="iterative"', "size_m=0.025", "trial=1"]
-    export(Pipeline.from_text(BOARD + board, settings, name="charuco"), tmp_path / "out")
+    settings = [*OF_BOARD, 'points="chessboard"', "size_m=0.025", "trial=1"]
+    export(Pipeline.from_text(TEXT + board, settings, name="charuco"), tmp_path / "out")
     rows = rows_of(tmp_path / "out/truth_chessboard.csv")
     assert len(rows) == 4 * 6
     (truth, *_) = rows_of(tmp_path / "out/truth.csv")

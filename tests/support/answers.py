@@ -5,6 +5,21 @@ import csv
 import re
 import runpy
 
+TEXT = """
+title = "Exchanged"
+seed = 11
+camera = { width_px = 200, height_px = 160, fx_px = 180, distortion = [0.05, -0.02, 0.001, 0.001] }
+marker = { size_m = 0.05 }
+pose = { jitter_px = 0.5 }
+scene = { background = 128, noise_grey = 4 }
+estimator = { solver = "ippe" }
+[axes]
+tilt_deg = [0, 50]
+distance_m = [0.1, 0.25]
+trial = 3
+"""
+"""A pipeline of markers that is exported."""
+
 
 def answer(folder):
     """Run the README's script, which knows nothing of sweep, in an export's folder."""

@@ -6,12 +6,10 @@ import xarray as xr
 
 from sweep.analysis import (
     detection_rate,
-    error_statistics,
     per_marker,
     renderer_bias,
     store_differences,
 )
-from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 
 
@@ -55,13 +53,6 @@ def test_rates_of_markers_count_those_that_are_on_the_board_and_visible() -> Non
     squares = np.nanmean(boards["marker_corner_error_px"].to_numpy() ** 2, axis=(0, 1, 3, 4))
     found = (markers["corner_error_px"] ** 2).mean(["size_m", "trial", "corner", "xy"])
     np.testing.assert_allclose(found, squares, rtol=1e-5)
-
-
-def test_estimates_are_not_those_of_markers() -> None:
-    with pytest.raises(DatasetError, match="no variable estimate: a board's markers have"):
-        error_statistics(per_marker(_boards()))
-    with pytest.raises(DatasetError, match="the scenes show no boards"):
-        per_marker(_boards().drop_vars("marker_detection"))
 
 
 def test_corners_of_boards_are_paired_where_both_found_them() -> None:

@@ -15,7 +15,6 @@ from support.comparisons import holm, with_detected
 from support.lengths import lengths
 from support.small_datasets import perfect
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
-from sweep.analysis.intervals import clopper_pearson
 from sweep.measure.flags import Flipped
 
 # By simulation.
@@ -115,13 +114,6 @@ def test_rmse_of_rare_flips_is_covered(share, trials, count, covered):
     squares = stats.chi2(3)
     median = math.sqrt(squares.ppf(0.5 / (1 - share)) / 12)
     covered(answer, "rotation_median_deg", median, 0.93, 0.99)
-
-
-@pytest.mark.parametrize("n", [1, 5, 1000])
-def test_clopper_and_pearsons_interval_is_scipys(n):
-    some = np.unique(np.linspace(0, n, 51).astype(int))
-    scipys = [stats.binomtest(k, n).proportion_ci(method="exact") for k in some.tolist()]
-    np.testing.assert_allclose(np.transpose(clopper_pearson(some, n)), scipys, rtol=1e-9)
 
 
 @lengths(300, 10_000)

@@ -28,10 +28,9 @@ from support.small_datasets import (
     students,
     wilson,
 )
-from sweep.analysis import compare, detection_limit, detection_rate, marker_ranking
-from sweep.analysis.decisions import Reach
+from sweep.analysis import compare, marker_ranking
 from sweep.errors import DatasetError
-from sweep.measure.flags import DetectionStatus, Flipped
+from sweep.measure.flags import Flipped
 
 # Ranking of marker IDs.
 
@@ -261,21 +260,3 @@ def test_other_scenes_and_other_draws_are_not_compared():
                           (first.isel(trial=slice(5)), "trial"), (other_seed, "seed")):
         with pytest.raises(DatasetError, match=words):
             compare(first, second)
-
-
-# Limit of detection.
-
-
-@pytest.mark.parametrize("settings", [2, 3])
-def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
-    # Some of a draw's settings were not run: a draw is no whole number of poses.
-    trials = 60
-    results = perfect(np.random.default_rng(18), {
-        "regime": trials, "side_px": 2, "trial": trials, "cornerRefinementMethod": settings})
-    for missing in range(trials):
-        results["detection"].values[missing, :, :missing, 0] = DetectionStatus.not_run
-    assert (detection_rate(results, ["regime"])["detection_rate_high"] == 1).all()
-    alike = compare(results, results, ["regime"])
-    assert (alike["detection_difference"] == 0).all()
-    assert (alike["detection_difference_high"] > 0).all()
-    assert (detection_limit(results, per=["regime"])["reach"] == Reach.always).all()

@@ -17,7 +17,6 @@ from sweep.analysis import (
     precision_reached,
 )
 from sweep.analysis.decisions import Reached
-from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 TRIALS = 200
@@ -133,10 +132,3 @@ def test_what_was_reached_is_told_by_condition(stopped):
     np.testing.assert_allclose(
         table.half_width.isel(solver=0, quantity=0),
         (half.detection_rate_high - half.detection_rate_low) / 2)
-
-
-def test_wishes_that_cannot_be_are_refused(stopped, full):
-    with pytest.raises(ArgumentError, match="searches no precision"):
-        precision_reached(full)
-    with pytest.raises(ArgumentError, match="above 0 and below 1"):
-        precision_reached(stopped, {"detection_rate": 2.0})

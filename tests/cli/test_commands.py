@@ -16,8 +16,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from support.reports import command
 from sweep import cli, installation
@@ -215,16 +213,6 @@ def strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def back(value, flag=None):
-    """Return content without flags, from values and flags."""
-    if isinstance(value, dict):
-        return {name: back(item, value.get(f"{name}_flag"))
-                for name, item in value.items() if not name.endswith("_flag")}
-    if isinstance(value, list):
-        return [back(item, flag and flag[k]) for k, item in enumerate(value)]
-    return {"infinite": math.inf, "-infinite": -math.inf}.get(flag, value)
-
-
 def test_each_kind_of_value_has_one_form():
     found = strict(to_json({
         "array": np.array([[1.0, np.inf], [np.nan, 2.0]]), "path": Path("a"), "many": (1, True),
@@ -235,14 +223,3 @@ def test_each_kind_of_value_has_one_form():
         "path": "a", "many": [1, True], "flag": "detected", "number": 0.5,
         "low": None, "low_flag": "-infinite",
     }
-
-
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.dictionaries(st.sampled_from("abc"), st.recursive(
-    st.sampled_from([None, True, 3, 0.5, math.inf, -math.inf, "inf", ""]),
-    lambda inner: st.lists(inner, max_size=3)
-    | st.dictionaries(st.sampled_from("def"), inner, max_size=3),
-    max_leaves=6,
-)))
-def test_every_infinity_is_told_beside_its_number(content):
-    assert back(strict(to_json(content))) == content

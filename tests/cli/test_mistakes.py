@@ -10,7 +10,7 @@ from support.reports import command
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import SweepError
-from sweep.execution.forecast import Demand, FreeDisk, objections
+from sweep.execution.forecast import FreeDisk
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
@@ -125,22 +125,6 @@ def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
         "warning: nothing was detected: 2 no_candidate (No candidate at the marker)",
         f"look at it: sweep repro {url} --at side_px=2.0,trial=0 -o scene.png",
     ]
-
-
-@pytest.mark.parametrize(
-    ("demand", "free", "found"),
-    [
-        (Demand(2.5 * 86_400.0, 2, 10**9, 10), FreeDisk(10**10, 100),
-         ["takes about 2.5 days with 2 workers"]),
-        (Demand(5.0, 1, 2 * 10**10, 10), FreeDisk(10**10, 100),
-         ["writes 20 GB before compression, and 10 GB are free"]),
-        (Demand(5.0, 1, 1, 1000), FreeDisk(10**10, 100),
-         ["makes 1,000 files, and the disk has room for 100"]),
-        (Demand(5.0, 1, 10**15, 1000), None, []),
-    ],
-)
-def test_what_has_to_be_confirmed(demand, free, found):
-    assert objections(demand, free) == found
 
 
 def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(

@@ -10,7 +10,6 @@ import sweep
 from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, taken, terms_of
 from sweep import cli
 from sweep.analysis.simulation_gaps import QUANTILES, RATES
-from sweep.errors import ArgumentError
 from sweep.fitting.fit import LENGTHS, Residuals, shifts_of
 from sweep.fitting.folders import REPEATS, HeldOut
 
@@ -58,15 +57,6 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
     for name in absent:
         assert f"#   left out: {terms[name].name}: {terms[name].reason}\n" in plain.text
         assert name not in plain.found.scene
-
-
-@pytest.mark.parametrize(("change", "message"), [
-    ({"markers": 0}, "markers = 0: expected a whole number from 1 to 1000"),
-    ({}, "expected photographs"),
-])
-def test_bad_arguments_are_one_line(change, message, tmp_path):
-    with pytest.raises(ArgumentError, match=message):
-        sweep.fit(tmp_path, camera="calibrate", **change)
 
 
 def gap(simulated, photographs=1.0):

@@ -14,8 +14,8 @@ import sweep
 from support.flags_and_numbers import contradictions
 from support.here import calls_here
 from support.poison import Poison, poisoned, raising
-from support.store_files import edit_receipt, edit_root, editable, files, see_same
-from support.stores import by_hand
+from support.store_files import edit_receipt, edit_root, editable, files
+from support.stores import by_hand, same
 from sweep.cli import main
 from sweep.errors import StoreError, SweepError
 from sweep.execution.block_task import compute_block
@@ -174,7 +174,7 @@ def see_repaired(url, sound, wanted, here):
     assert (again.damage, again.left_over) == ([], [])
     assert again.files == len(files(url)) == len(files(sound))
     assert files(url) == files(sound)
-    see_same(url, sound)
+    assert same(url, sound)
 
 
 def edit_values(url, name, change, *, receipts_too=False):
@@ -284,7 +284,7 @@ def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, t
     close(open_store(str(url), "r+"))
     found = verify(str(url), 0)
     assert (found.damage, found.finished, found.files) == ([], True, len(files(sound)))
-    see_same(url, sound)
+    assert same(url, sound)
 
 
 ELSEWHERE = {

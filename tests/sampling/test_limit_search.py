@@ -117,22 +117,6 @@ def test_intervals_cover_the_limit(rate, shape, claim):
     assert float(limits["poses"].mean()) < len(SIDES) * 2400 / 3
 
 
-def test_a_store_of_equal_trials_has_limits_too():
-    rng = np.random.default_rng(9)
-    rates = np.array([[0.999, 0.999, 0.7, 0.1]])
-    pipeline = Pipeline.from_dict({"pose": {"jitter_px": 0.5, "side_px": 30}, "axes": {
-        "tilt_deg": [0], "noise_grey": [0, 5, 10, 15], "trial": 300}})
-    hits = rng.random((1, 4, 300)) < rates[..., None]
-    detection = np.where(hits, DetectionStatus.detected, DetectionStatus.rejected)
-    results = group_dataset(GroupResults(
-        pipeline, (0, 0), (1, 4), 1, 300, flags_of(detection))).assign_coords(side_px=30.0)
-    results.attrs["pipeline"] = pipeline.text
-    limits = requirement_limits(results, ["detection >= 0.9"], "noise_grey")
-    assert limits["value"].values.tolist() == [5.0]
-    assert limits["settled"].values.all()
-    assert limits["poses"].values.tolist() == [1200]
-
-
 def test_a_limit_that_is_not_decided_is_never_told_as_met():
     rng = np.random.default_rng(4)
     told = {False: 0, True: 0}

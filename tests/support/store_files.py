@@ -15,29 +15,6 @@ def files(url):
                   if path.is_file())
 
 
-def arrays(url):
-    """Return every array's values of a store by path, but for what is timed; with plain Zarr."""
-    group = zarr.open_group(str(url), mode="r", zarr_format=3, use_consolidated=False)
-    return {
-        path: np.asarray(member[...]) for path, member in group.members(max_depth=None)
-        if isinstance(member, zarr.Array) and not path.startswith(("cost/", "commits/"))
-    }
-
-
-def see_same(url, other):
-    """Assert that two stores hold the same values, bit for bit."""
-    ours, theirs = arrays(url), arrays(other)
-    assert ours.keys() == theirs.keys()
-    for path, values in ours.items():
-        there = theirs[path]
-        assert (values.dtype, values.shape) == (there.dtype, there.shape), path
-        if values.dtype.kind == "f":
-            bits = f"u{values.itemsize}"
-            assert (values.view(bits) == there.view(bits)).all(), path
-        else:
-            assert (values == there).all(), path
-
-
 def edit_root(url, change):
     """Change the attributes of the root, and make the checksum of them fit, as a forger would."""
     path = Path(url) / "zarr.json"

@@ -158,7 +158,7 @@ def test_differences_and_ratios_of_paired_errors_are_covered(cells, trials, coun
         covered(answer, f"{name}_rmse_ratio", 0.7)
 
 
-@lengths(300, 5000)
+@lengths(60, 1000)
 @pytest.mark.parametrize(("rates", "cells", "trials"), [
     ([0.3, 0.7, 0.9, 0.93, 0.96, 0.99], 1, 50),   # at the rate
     ([0.5, 0.8, 0.89, 0.92, 0.95, 0.97], 4, 25),  # just below it

@@ -15,30 +15,23 @@ from sweep.store.lifecycle import create_store
 
 TEXT = """
 seed = 5
-[pose]
-jitter_px = 0.5
-[require]
-all = ["detection >= 0.8"]
-per = ["side_px"]
-[axes]
-side_px = [11, 40]
-solver = ["ippe_square", "iterative"]
-trial = 60
+pose = { jitter_px = 0.5 }
+axes = { side_px = [11, 40], solver = ["ippe_square", "iterative"], trial = 60 }
 """
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("require")
-    pipeline = Pipeline.from_text(TEXT, name="two")
+    required = TEXT + '[require]\nall = ["detection >= 0.8"]\nper = ["side_px"]\n'
+    pipeline = Pipeline.from_text(required, name="two")
     create_store(str(folder / "begun.zarr"), pipeline, (2, 60))
     close(by_hand(str(folder / "two.zarr"), pipeline))
-    bare = TEXT.partition("[require]")[0] + "[axes]" + TEXT.partition("[axes]")[2]
-    close(by_hand(str(folder / "bare.zarr"), Pipeline.from_text(bare)))
+    close(by_hand(str(folder / "bare.zarr"), Pipeline.from_text(TEXT)))
     close(by_hand(str(folder / "drawn.zarr"), Pipeline.from_text(
         "[pose]\ndistance_m = { uniform = [0.1, 0.3] }\n[axes]\ntrial = 2\n")))
     close(by_hand(str(folder / "once.zarr"), Pipeline.from_text("[pose]\nside_px = 40\n")))
-    (folder / "other.toml").write_text(TEXT.replace("0.8", "0.01"))
+    (folder / "other.toml").write_text(required.replace("0.8", "0.01"))
     return folder
 
 
@@ -202,11 +195,8 @@ def test_a_pipeline_that_chooses_nothing_is_told_what_to_write(
 
 
 BOUND = """
-[scene]
-noise_grey = 2
-bound = "known_blur"
-[pose]
-jitter_px = 0.5
+scene = { noise_grey = 2, bound = "known_blur" }
+pose = { jitter_px = 0.5 }
 [axes]
 side_px = [8, 40]
 tilt_deg = [0, 89.9]

@@ -33,23 +33,11 @@ OF_BOARD = [
 
 SHEETS = """[board]
 kind = "markers"
-[[board.markers]]
-marker_id = 3
-x_m = 0.0
-y_m = 0.0
-[[board.markers]]
-marker_id = 8
-x_m = 0.04
-y_m = 0.0
-z_m = 0.01
-tilt_deg = 20
-[[board.markers]]
-marker_id = 5
-x_m = -0.04
-y_m = 0.0
-size_m = 0.02
-z_m = -0.01
-tilt_deg = -30
+markers = [
+    { marker_id = 3, x_m = 0.0, y_m = 0.0 },
+    { marker_id = 8, x_m = 0.04, y_m = 0.0, z_m = 0.01, tilt_deg = 20 },
+    { marker_id = 5, x_m = -0.04, y_m = 0.0, size_m = 0.02, z_m = -0.01, tilt_deg = -30 },
+]
 """
 TARGETS = {
     "marker": MARKERS, "several planes": (TEXT + SHEETS, OF_BOARD),

@@ -4,24 +4,12 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 
 from support.small_datasets import perfect
 from sweep.analysis.poses import viewing_angle_of
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
 
-TEXT = """seed = 1
-[camera]
-width_px = 1280
-height_px = 800
-fx_px = {fx}
-[marker]
-{size}
-[pose]
-azimuth_deg = {{ uniform = [0, 360] }}
-{distance}
-[axes]
-{axes}
-"""
 FX, SIZE_M = 900.0, 0.165
 
 READER = Path(__file__).parents[2] / "pipelines" / "pose_errors.py"
@@ -79,10 +67,13 @@ def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None, drawn=None)
     return results.assign_coords(
         {name: list(values) for name, values in axes.items()}
         | {name: (scene, each) for name, each in values.items()}
-    ).assign_attrs(pipeline=TEXT.format(
-        fx=FX, size="" if "size_m" in axes else f"size_m = {SIZE_M}",
-        distance="" if "distance_m" in axes else "distance_m = 1", axes="\n".join(
-            f"{name} = {values}" for name, values in listed.items()) + "\ntrial = 9"))
+    ).assign_attrs(pipeline=tomlkit.dumps({
+        "seed": 1, "camera": {"width_px": 1280, "height_px": 800, "fx_px": FX},
+        "marker": {} if "size_m" in axes else {"size_m": SIZE_M},
+        "pose": {"azimuth_deg": {"uniform": [0, 360]}} | (
+            {} if "distance_m" in axes else {"distance_m": 1}),
+        "axes": listed | {"trial": 9},
+    }))
 
 
 def power_law(distance, side, angle):  # noqa: ARG001

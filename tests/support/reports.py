@@ -10,26 +10,15 @@ from sweep.experiment.pipeline import Pipeline
 
 CAMERA = """
 seed = 7
-[camera]
-width_px = 160
-height_px = 120
-fx_px = 150
-[marker]
-size_m = 0.05
+camera = { width_px = 160, height_px = 120, fx_px = 150 }
+marker = { size_m = 0.05 }
 """
 
 FULL = f"""
 title = "All <axes> & \\"kinds\\" of $figures$"
 {CAMERA}
-[pose]
-jitter_px = 0.5
-azimuth_deg = {{ uniform = [0, 360] }}
-[scene]
-black = 40
-white = 220
-background = 120
-noise_grey = 4
-bound = "known_blur"
+pose = {{ jitter_px = 0.5, azimuth_deg = {{ uniform = [0, 360] }} }}
+scene = {{ black = 40, white = 220, background = 120, noise_grey = 4, bound = "known_blur" }}
 [axes]
 marker_id = [0, 7]
 side_px = [7, 40]

@@ -4,6 +4,7 @@ import itertools
 import math
 
 import numpy as np
+import tomlkit
 import xarray as xr
 from scipy import special
 
@@ -26,25 +27,6 @@ OF_DETECTION, OF_ESTIMATION = ("cornerRefinementMethod",), ("solver",)
 INNER = ("xyz", "pose_parameter", "corner", "xy")
 """Dimensions of the values of one pose."""
 
-TEXT = """seed = {seed}
-[camera]
-width_px = 640
-height_px = 480
-sensor_width_mm = 4.8
-sensor_height_mm = 3.6
-focal_length_mm = 4.0
-[marker]
-size_m = 0.04
-{dictionary}
-[pose]
-jitter_px = 0.5
-{size}
-[axes]
-{axes}
-"""
-FX = 4.0 / 4.8 * 640
-SIZE_M = 0.04
-
 ALL = {"dictionary": 2, "marker_id": 2, "tilt_deg": 2, "side_px": 2, "noise_grey": 2, "trial": 3,
        "cornerRefinementMethod": 2, "solver": 2}
 PLAIN = {"trial": 12, "distance_m": 3, "marker_id": 4}
@@ -62,14 +44,19 @@ def coordinates_of(sizes):
 
 def pipeline_text(sizes, seed=1):
     """Return the text of a pipeline with axes of these sizes."""
-    values = coordinates_of({name: size for name, size in sizes.items() if name != "regime"})
-    axes = [f"{name} = {len(some) if name == 'trial' else list(some)!r}".replace("'", '"')
-            for name, some in values.items()]
-    sized = "side_px" in values or "distance_m" in values
-    return TEXT.format(
-        seed=seed, axes="\n".join(axes), size="" if sized else "distance_m = 0.5",
-        dictionary="" if "dictionary" in values else 'dictionary = "DICT_5X5_50"',
-    )
+    axes = coordinates_of({name: size for name, size in sizes.items() if name != "regime"})
+    if "trial" in axes:
+        axes["trial"] = sizes["trial"]
+    return tomlkit.dumps({
+        "seed": seed,
+        "camera": {"width_px": 640, "height_px": 480, "sensor_width_mm": 4.8,
+                   "sensor_height_mm": 3.6, "focal_length_mm": 4.0},
+        "marker": {"size_m": 0.04} | (
+            {} if "dictionary" in axes else {"dictionary": "DICT_5X5_50"}),
+        "pose": {"jitter_px": 0.5} | (
+            {} if {"side_px", "distance_m"} & {*axes} else {"distance_m": 0.5}),
+        "axes": axes,
+    })
 
 
 def dims_of(sizes, stage):

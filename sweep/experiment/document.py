@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
-import itertools
-import operator
 import os
 import re
 import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -324,22 +321,9 @@ class Reading(Grid):
 
         Of numbers that vary by themselves the least and the largest.
         """
-        fixed = {name: self.fixed[name] for name in names if name in self.fixed}
-        for chosen in itertools.product(*(_rows(axis, names) for axis in self.axes_with(names))):
-            row = reduce(operator.or_, chosen, fixed)
+        for row in self.rows(names, ends=True):
             if len(row) == len(names):
                 yield tuple(row[name] for name in names)
-
-
-def _rows(axis: Axis, names: Collection[str]) -> list[dict[str, Any]]:
-    """Return the values of some parameters along an axis, each combination once."""
-    columns = {name: values for name, values in axis.columns.items() if name in names}
-    numbers, *others = columns.values()
-    if not others and all(type(value) in (int, float) for value in (
-            numbers[:1] if isinstance(numbers, range) else numbers)):
-        columns = dict.fromkeys(columns, sorted({min(numbers), max(numbers)}))
-    rows = dict.fromkeys(zip(*columns.values(), strict=True))
-    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def read_keys(

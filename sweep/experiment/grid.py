@@ -89,6 +89,16 @@ class Axis:
         return next(
             (i for i in rows if all(self.columns[name][i] == wanted[name] for name in names)), None)
 
+    def rows(self, parameters: Collection[str], *, ends: bool) -> list[dict[str, Any]]:
+        """Return the values of some parameters along it, each combination once (`Grid.rows`)."""
+        columns = {name: values for name, values in self.columns.items() if name in parameters}
+        numbers, *others = columns.values()
+        if ends and not others and all(type(value) in (int, float) for value in (
+                numbers[:1] if isinstance(numbers, range) else numbers)):
+            columns = dict.fromkeys(columns, sorted({min(numbers), max(numbers)}))
+        rows = dict.fromkeys(zip(*columns.values(), strict=True))
+        return [dict(zip(columns, row, strict=True)) for row in rows]
+
     @property
     def stage(self) -> Stage:
         """The first stage that the axis touches."""
@@ -350,12 +360,6 @@ def _checked(parameter: Parameter, value: Any) -> Any:
         raise ValueError(f"{expected} (not {shown(value)}){semicolon}{hint}") from None
 
 
-def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return the parameters' values at all combinations of axes, the last axis fastest."""
-    rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
-    return [reduce(operator.or_, chosen, {}) for chosen in itertools.product(*rows)]
-
-
 # --------------------------------------------------------------------------------------------------
 # What a document and the pipeline that is read from it have in common: values on a grid.
 
@@ -415,11 +419,15 @@ class Grid:
         """Return the axes along which some parameters vary, in the document's order."""
         return [axis for axis in self.axes if not axis.columns.keys().isdisjoint(parameters)]
 
-    def rows(self, parameters: Collection[str]) -> Iterator[dict[str, Any]]:
-        """Yield the values of some parameters at all combinations of their axes."""
+    def rows(self, parameters: Collection[str], *, ends: bool = False) -> Iterator[dict[str, Any]]:
+        """Yield the values of some parameters at all combinations of their axes, the last fastest.
+
+        One that is drawn, or at fault, has none. ``ends``: of numbers that vary by themselves the
+        least and the largest alone.
+        """
         fixed = {name: self.fixed[name] for name in parameters if name in self.fixed}
-        for chosen in combinations(self.axes_with(parameters)):
-            yield fixed | {name: chosen[name] for name in parameters if name in chosen}
+        rows = (axis.rows(parameters, ends=ends) for axis in self.axes_with(parameters))
+        return (reduce(operator.or_, chosen, fixed) for chosen in itertools.product(*rows))
 
     def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
         """Return the axes that bind to the given stages, in the document's order."""

@@ -13,7 +13,6 @@ from support.documents import any_document
 from support.lengths import lengths
 from sweep.errors import PipelineError, StoreError
 from sweep.experiment.document import document_text, read_document
-from sweep.experiment.grid import combinations
 from sweep.experiment.parameters import PARAMETERS, Stage
 from sweep.experiment.photographs import read_board
 from sweep.experiment.pipeline import (
@@ -151,7 +150,7 @@ def test_members_come_in_every_form_of_an_axis():
         }},
         "tilt_deg": [0, 30],
     })
-    (lens, tilt) = grid.axes
+    lens, _ = grid.axes
     assert (lens.name, len(lens), lens.stage, lens.unit) == ("lens", 3, Stage.scene, "")
     assert lens.values[1] == "800, 800, 1, 0.1, DICT_5X5_50, [0.1, 0.0, 0.0, 0.0]"
     assert lens.at(1) == {
@@ -164,7 +163,7 @@ def test_members_come_in_every_form_of_an_axis():
     assert grid.axis_of("fx_px") is lens
     assert grid.size(Stage.scene) == 6
     assert sweep.Pipeline.from_text(grid.to_toml()) == grid
-    assert [row["tilt_deg"] for row in combinations([lens, tilt])] == [0, 30] * 3
+    assert [row["tilt_deg"] for row in grid.rows(["fx_px", "tilt_deg"])] == [0, 30] * 3
 
 
 def test_draws_are_those_of_the_same_values_on_axes_of_their_own():

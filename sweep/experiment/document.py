@@ -17,6 +17,7 @@ import tomlkit
 import tomlkit.items
 
 from sweep.declaration import Declared, TablesError, check_table
+from sweep.experiment import parameters
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.grid import (
     MAX_LISTED,
@@ -28,16 +29,7 @@ from sweep.experiment.grid import (
     parse_distribution,
     trial_numbers,
 )
-from sweep.experiment.parameters import (
-    EFFECTS_KEY,
-    NAMED_BY,
-    PARAMETERS,
-    SECTIONS,
-    Parameter,
-    is_zip,
-    read_plugins,
-    section_of_settings,
-)
+from sweep.experiment.parameters import PARAMETERS, Parameter
 from sweep.messages import MAX_FAULTS, plain, refusal, shown, similar
 from sweep.model.image_file import read_regular
 from sweep.plugins.declared import DeclaredPlugin
@@ -207,17 +199,17 @@ HEADER = {
         Declared("title", (str,), "", "title", reads=_title),
         Declared("seed", (int,), 0, "seed of all draws", low=0, high=2**63 - 1),
         Declared("sampling", (str,), SAMPLINGS[0], "sampling", choices=SAMPLINGS),
-        Declared(EFFECTS_KEY, (list,), (), "plug-ins", reads=_effects),
+        Declared(parameters.EFFECTS_KEY, (list,), (), "plug-ins", reads=_effects),
     )
 }
 """Keys that stand above the sections."""
 
 
-def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
+def section_of(name: str, known: Mapping[str, Parameter] = PARAMETERS) -> str:
     """Return the section that a parameter belongs under; empty for an unknown name."""
     if name == TRIAL:
         return "axes"
-    return parameters[name].section if name in parameters else ""
+    return known[name].section if name in known else ""
 
 
 @dataclass(frozen=True)
@@ -337,7 +329,7 @@ def read_keys(
     """
     header, lines = check_table(
         HEADER, {key: value for key, value in document.items() if key in HEADER}, "")
-    plugins, faults = read_plugins(document, folder, stored)
+    plugins, faults = parameters.read_plugins(document, folder, stored)
     written: dict[str, tuple[str, Any]] = {}
     reading = Reading(
         seed=header["seed"], sampling=header["sampling"], title=header["title"], fixed={},
@@ -349,17 +341,17 @@ def read_keys(
     reading.tell(lines)
     for kind, key, name, expected in faults:
         reading.fault(key, name, expected)
-        reading.unread.add(section_of_settings(kind))
-        if kind in NAMED_BY:
-            reading.unread.add(NAMED_BY[kind].name)
-    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
+        reading.unread.add(parameters.section_of_settings(kind))
+        if kind in parameters.NAMED_BY:
+            reading.unread.add(parameters.NAMED_BY[kind].name)
+    known = [*HEADER, *parameters.SECTIONS, "axes", REQUIRE, SEARCH]
     for key, value in document.items():
         if key not in known:
             kind = "a section" if isinstance(value, dict) else "a key"
             reading.unknown_key("", key, known, f"; expected {kind} of {', '.join(known)}")
         elif key not in HEADER and not isinstance(value, dict):
             reading.fault(key, value, f"a table: [{key}]")
-    for section in SECTIONS:
+    for section in parameters.SECTIONS:
         for key, value in reading.table(section).items():
             _read_key(reading, section, key, value)
     _read_axes(reading)
@@ -374,7 +366,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
     path = f"{section}.{key}"
     parameter = reading.parameters.get(key)
     if parameter is None or parameter.section != section:
-        if is_zip(value):
+        if parameters.is_zip(value):
             reading.fault(path, value, "parameters that go together under [axes]")
         elif section not in reading.unread or section_of(key, reading.parameters):
             reading.unknown_key(section, key, [
@@ -394,7 +386,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
 def _read_axes(reading: Reading) -> None:
     quota = MAX_LISTED
     for key, value in reading.table("axes").items():
-        together = is_zip(value) and key not in (*reading.parameters, TRIAL)
+        together = parameters.is_zip(value) and key not in (*reading.parameters, TRIAL)
         axis = _read_axis(reading, key, value["zip"] if together else {key: value}, quota,
                           together=together)
         if axis is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment import draws
 from sweep.experiment.grid import TRIAL, Axis, Block, Grid
-from sweep.experiment.parameters import NAMED_BY, PARAMETERS, PHOTOGRAPHS, WORLD, Stage
+from sweep.experiment.parameters import NAMED_BY, PARAMETERS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure.detectors import (
@@ -257,7 +257,7 @@ class Experiment:
         values |= dict.fromkeys(draws.SHIFTS, Column.of(0.0))
         noisy = any(effect.switch in drawn or values[effect.switch].differs_from(effect.off)
                     for effect in self.effects if effect.random)
-        poses = {} if values[PHOTOGRAPHS].missing else recorded_poses(
+        poses = {} if values["photographs"].missing else recorded_poses(
             values, trials, grid.folder, simulated=grid.is_simulated)
         if grid.shows_photographs:
             return values | poses
@@ -654,7 +654,7 @@ class Facts:
     @property
     def notes(self) -> list[str]:
         """The lines that `sweep plan` and the start of a run print."""
-        if PHOTOGRAPHS in self.grid.given:
+        if "photographs" in self.grid.given:
             return []
         return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
 

@@ -15,16 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.parameters import (
-    ONE_VALUE,
-    PARAMETERS,
-    PHOTOGRAPHS,
-    SIMULATED,
-    STATED,
-    Parameter,
-    Stage,
-    parameters_with,
-)
+from sweep.experiment.parameters import ONE_VALUE, PARAMETERS, Parameter, Stage, parameters_with
 from sweep.messages import label, nearest, plain, shown
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.calibration import CalibrationError
@@ -250,10 +241,8 @@ def axis_values(
     if parameter.name in ONE_VALUE:
         raise ValueError(f"one value under [{parameter.section}]: it cannot be an axis")
     if form == "zip":
-        raise ValueError(
-            f"an axis of {parameter.name} alone; parameters that go together need a name of "
-            "your own, such as pair = { zip = { ... } }"
-        )
+        raise ValueError(f"an axis of {parameter.name} alone; parameters that go together need a "
+                         "name of your own, such as pair = { zip = { ... } }")
     if form in DISTRIBUTION_FORMS:
         raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
     known = [*AXIS_FORMS, "values"]
@@ -263,10 +252,8 @@ def axis_values(
         return _generated(parameter, form, ends, quota)
     if not isinstance(ends, list):
         raise ValueError(f"{form} = a list")  # noqa: TRY004  (a fault of the file)
-    if len(ends) > quota:
-        raise ValueError(TOO_MANY)
-    if not ends:
-        raise ValueError("at least one value")
+    if not 0 < len(ends) <= quota:
+        raise ValueError(TOO_MANY if ends else "at least one value")
     values = tuple(_checked(parameter, value) for value in ends)
     value, count = collections.Counter(values).most_common(1)[0]
     if count > 1 and not repeats:
@@ -276,15 +263,16 @@ def axis_values(
 
 def _generated(parameter: Parameter, form: str, ends: Any, quota: int) -> Sequence[Any]:
     """Return the values of a form that generates them; a ``range`` is not written out."""
-    integers = isinstance(ends, list) and all(type(e) is int and abs(e) < 2**62 for e in ends)
+    numbers = _are_numbers(ends, *((2, 3) if form == "range" else (3,)))
+    integers = numbers and all(type(end) is int and abs(end) < 2**62 for end in ends)
+    spaced: Any = {"linspace": np.linspace, "geom": np.geomspace}.get(form)
     count = 0
-    if not _are_numbers(ends, *((2, 3) if form == "range" else (3,))):
-        pass
-    elif form in ("linspace", "geom"):
-        count = ends[2] if type(ends[2]) is int and (form == "linspace" or min(ends) > 0) else 0
-    elif form == "range":
-        count = len(range(*ends)) if integers and 0 not in ends[2:] else 0
-    elif ends[2]:
+    if spaced is not None:
+        sound = numbers and type(ends[2]) is int and (form == "linspace" or min(ends) > 0)
+        count = ends[2] if sound else 0
+    elif integers and 0 not in ends[2:]:
+        count = len(range(*ends))
+    elif numbers and form == "arange" and ends[2]:
         steps = (float(ends[1]) - float(ends[0])) / ends[2]
         # Half-open also if the last step misses the stop only by rounding.
         count = math.ceil(min(max(steps, 0.0), 2.0 * MAX_VALUES) - 1e-9)
@@ -293,14 +281,8 @@ def _generated(parameter: Parameter, form: str, ends: Any, quota: int) -> Sequen
     whole = parameter.types == (int,)
     if count > (MAX_VALUES if whole and form == "range" else quota):
         raise ValueError(f"at most {MAX_VALUES:,} values" if form == "range" else TOO_MANY)
-    values: Any
-    if form in ("linspace", "geom"):
-        values = (np.linspace if form == "linspace" else np.geomspace)(*ends)
-    elif integers:
-        values = range(*ends)
-    else:
-        start, _, step = map(float, ends)
-        values = [start + step * i for i in range(count)]
+    values: Any = spaced(*ends) if spaced is not None else range(*ends) if integers else [
+        float(ends[0]) + float(ends[2]) * index for index in range(count)]
     # All are numbers: if the least and the largest are admitted, all are.
     for end in (values[0], values[-1]):
         _checked(parameter, end)
@@ -452,7 +434,7 @@ class Grid:
         """The error of the calibration that an estimator believes; None if none does."""
         if "calibration" not in self.values_of("believed"):
             return None
-        sd, covariance = (self.fixed[name] for name in STATED)
+        sd, covariance = self.fixed["calibration_sd"], self.fixed["calibration_covariance"]
         count = len(sd) or round(len(covariance) ** 0.5)
         return CalibrationError.of(sd, covariance, count - 4)
 
@@ -494,12 +476,12 @@ class Grid:
     @property
     def is_simulated(self) -> bool:
         """Whether images are simulated at the poses of photographs."""
-        return self.fixed.get(SIMULATED) is True
+        return self.fixed.get("simulated") is True
 
     @property
     def shows_photographs(self) -> bool:
         """Whether the images are photographs, not simulated at their poses."""
-        return PHOTOGRAPHS in self.given and not self.is_simulated
+        return "photographs" in self.given and not self.is_simulated
 
 
 # --------------------------------------------------------------------------------------------------

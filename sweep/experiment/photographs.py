@@ -20,7 +20,6 @@ from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
 from sweep.experiment.document import file_text, read_document, refusing
 from sweep.experiment.grid import TRIAL, Axis
-from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
@@ -198,7 +197,7 @@ def _board(document: str) -> Board:
 
 def along_photographs(axes: Iterable[Axis]) -> list[bool]:
     """Return of each axis whether its values are other photographs."""
-    return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
+    return [axis.name == TRIAL or "photographs" in axis.columns for axis in axes]
 
 
 def recorded_poses(
@@ -229,7 +228,7 @@ def recorded_poses(
         If a record cannot be read, or has no such photograph or marker.
     """
     count = len(trials)
-    names = values[PHOTOGRAPHS].listed(count)
+    names = values["photographs"].listed(count)
     records = {
         name: PHOTOGRAPH_RECORDS.read(Path(folder) / name)[0] for name in dict.fromkeys(names)}
     ids = {name: record.marker_id.tolist() for name, record in records.items()}

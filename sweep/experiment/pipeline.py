@@ -17,6 +17,7 @@ import tomlkit
 
 from sweep.declaration import Declared
 from sweep.errors import PluginError
+from sweep.experiment import parameters
 from sweep.experiment.document import (
     HEADER,
     REQUIRE,
@@ -34,25 +35,7 @@ from sweep.experiment.document import (
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
-from sweep.experiment.parameters import (
-    CHOICES,
-    FIELDS_OF_VIEW,
-    IN_CAMERA,
-    IN_MM,
-    NAMING,
-    PARAMETERS,
-    PHOTOGRAPHS,
-    RIVALS,
-    SECTIONS,
-    SIMULATED,
-    STATED,
-    WORLD,
-    Parameter,
-    Stage,
-    is_zip,
-    parameters_with,
-    read_plugins,
-)
+from sweep.experiment.parameters import PARAMETERS, STATED, WORLD, Parameter, Stage
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.sampling import (
     MAX_TRIALS,
@@ -65,6 +48,7 @@ from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal, shown
+from sweep.model import marker
 from sweep.model.board_kinds import (
     ARRANGING,
     NEEDED,
@@ -76,12 +60,6 @@ from sweep.model.board_kinds import (
 from sweep.model.calibration import MAX_BYTES, CalibrationError, calibration_of, read_tree
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular
-from sweep.model.marker import (
-    has_circles,
-    marker_count,
-    missing_package,
-    opencv_dictionary_names,
-)
 from sweep.model.scene import RENDERERS, is_renderer
 from sweep.model.sensor import MAX_LEVEL
 from sweep.plugins.declared import DeclaredPlugin
@@ -162,20 +140,20 @@ def _in_planes(*listed: Any) -> bool:
 
 SEVERAL_PLANES = "for prints with z_m or tilt_deg"
 
-OTHER_WAYS = (*IN_MM, *FIELDS_OF_VIEW)
+OTHER_WAYS = (*parameters.IN_MM, *parameters.FIELDS_OF_VIEW)
 """The ways to give a camera beside focal lengths in pixels, and beside a file."""
 
 PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
 """Parameter -> those of which one must be given beside it, or one of a rival way."""
 
 RECORDS: tuple[Check, ...] = (
-    *(absent((name,), _without(*others, *RIVALS.get(name, ())),
+    *(absent((name,), _without(*others, *parameters.RIVALS.get(name, ())),
              f"{' or '.join(others)} beside it", active=True)
       for name, others in PARTNERS.items()),
     apart(("marker_id", "dictionary"),
-          lambda marker_id, dictionary: marker_id >= marker_count(dictionary),
-          lambda _, dictionary: f"IDs from 0 to {marker_count(dictionary) - 1}, which is what "
-          f"{dictionary} has"),
+          lambda marker_id, dictionary: marker_id >= marker.marker_count(dictionary),
+          lambda _, dictionary: f"IDs from 0 to {marker.marker_count(dictionary) - 1}, which is "
+          f"what {dictionary} has"),
     apart(("noise_table",), _is_no_noise_table,
           "level, standard deviation, level, standard deviation, ...: levels that ascend from 0 "
           f"to {MAX_LEVEL:g}, deviations of at least 0"),
@@ -185,7 +163,7 @@ RECORDS: tuple[Check, ...] = (
           f"a frame of at most {MAX_PIXELS:,} pixels"),
     # Renderers.
     apart(("renderer", "dictionary"),
-          lambda renderer, dictionary: renderer != "exact" and has_circles(dictionary),
+          lambda renderer, dictionary: renderer != "exact" and marker.has_circles(dictionary),
           "exact for STag's markers, which have circles"),
     apart(("renderer", "kind", "distractors"),
           lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
@@ -207,11 +185,11 @@ RECORDS: tuple[Check, ...] = (
          "believed_focal_scale", "believed_distortion"), _is_calibrated,
         "no other belief about the camera beside believed = calibration; delete one of them"),
     # Photographs, which have their own poses and light.
-    absent((SIMULATED,), _without(PHOTOGRAPHS),
+    absent(("simulated",), _without("photographs"),
            "photographs beside it, whose poses are taken", active=True),
-    absent(("kind",), lambda reading: PHOTOGRAPHS in reading.given and reading.shows_boards,
+    absent(("kind",), lambda reading: "photographs" in reading.given and reading.shows_boards,
            "no board beside photographs, whose board `sweep photos` knows; delete it"),
-    apart(("believed", PHOTOGRAPHS), lambda believed, file: file and believed == "calibration",
+    apart(("believed", "photographs"), lambda believed, file: file and believed == "calibration",
           "truth, for photographs"),
     # Boards.
     absent(("points", "refine", "refineDetectedMarkers", "minMarkers"),
@@ -355,11 +333,11 @@ def photographs_alone(reading: Reading) -> None:
 
     Of images that are simulated at their poses, the poses and the markers alone.
     """
-    if PHOTOGRAPHS not in reading.given:
+    if "photographs" not in reading.given:
         return
-    simulated = any(reading.values_of(SIMULATED))
+    simulated = any(reading.values_of("simulated"))
     own = "poses" if simulated else "poses and light"
-    for name in reading.given - {PHOTOGRAPHS, SIMULATED}:
+    for name in reading.given - {"photographs", "simulated"}:
         if reading.parameters[name].section in ("pose", "pose" if simulated else "scene"):
             reading.refuse(
                 name, f"nothing beside photographs, which have their own {own}; delete it")
@@ -368,12 +346,12 @@ def photographs_alone(reading: Reading) -> None:
     if reading.recorded is not None:
         return
     sizes = {}
-    for name in dict.fromkeys(reading.values_of(PHOTOGRAPHS)):
+    for name in dict.fromkeys(reading.values_of("photographs")):
         path = Path(reading.folder) / name
         try:
             record, reading.files[name] = PHOTOGRAPH_RECORDS.read(path)
         except PluginError as error:
-            reading.refuse(PHOTOGRAPHS, str(error), name)
+            reading.refuse("photographs", str(error), name)
             continue
         sizes[name] = record.width_px, record.height_px
         for relative, known in zip(record.paths, record.digests, strict=True):
@@ -382,7 +360,7 @@ def photographs_alone(reading: Reading) -> None:
                 reading.note(plain(relative), "the photograph cannot be read" if found is None else
                              "the photograph is not the one that was recorded: its SHA-256 differs")
             reading.files[relative] = known
-    _have_the_frames_size(reading, PHOTOGRAPHS, sizes)
+    _have_the_frames_size(reading, "photographs", sizes)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -447,9 +425,9 @@ def targets_are_solved(reading: Reading) -> None:
 
 def each_in_one_way(reading: Reading) -> None:
     """Demand a distance, and each quantity of pose, camera and beliefs in one way."""
-    has_poses = PHOTOGRAPHS in reading.given
-    given = reading.given - reading.stated.keys() - {*(IN_CAMERA if has_poses else ())}
-    for choice in (*CHOICES, () if has_poses else (IN_CAMERA, WORLD)):
+    has_poses = "photographs" in reading.given
+    given = reading.given - reading.stated.keys() - {*(parameters.IN_CAMERA if has_poses else ())}
+    for choice in (*parameters.CHOICES, () if has_poses else (parameters.IN_CAMERA, WORLD)):
         ways = [names for way in choice if (names := [name for name in way if name in given])]
         for other in ways[1:]:
             reading.refuse(other[0], f"{', '.join(ways[0])} or {', '.join(other)}, not both; "
@@ -464,10 +442,10 @@ def what_is_installed(reading: Reading) -> None:
     A store's pipeline can be read without the packages of dictionaries.
     """
     for dictionary in reading.values_of("dictionary") if reading.recorded is None else ():
-        if (missing := missing_package(dictionary)) is not None:
+        if (missing := marker.missing_package(dictionary)) is not None:
             reading.refuse("dictionary", missing, dictionary)
     known: dict[str, tuple[str, ...]] = {
-        OPENCV: opencv_dictionary_names(),
+        OPENCV: marker.opencv_dictionary_names(),
         **{plugin.name: plugin.dictionaries for plugin in reading.plugins
            if plugin.kind == "detector" and plugin.dictionaries},
     }
@@ -492,7 +470,7 @@ def something_random_to_repeat(reading: Reading) -> None:
     random = ["jitter_px", *RANDOM, *(
         plugin.settings[0].name for plugin in reading.plugins
         if plugin.kind == "effect" and plugin.random)]
-    if trials > 1 and not drawn and PHOTOGRAPHS not in reading.given and not (
+    if trials > 1 and not drawn and "photographs" not in reading.given and not (
             _is_calibrated(reading) or any(map(reading.is_active, random))):
         reading.fault("axes.trial", trials, "something random to repeat: jitter_px above 0, noise, "
                       "or a distribution")
@@ -505,7 +483,7 @@ def something_random_to_repeat(reading: Reading) -> None:
 
 
 RESERVED = {
-    *VARIABLES, *LABELS, *HEADER, *SECTIONS, "axes", TRIAL,
+    *VARIABLES, *LABELS, *HEADER, *parameters.SECTIONS, "axes", TRIAL,
     *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
       for flag in flags),
     "block", "commits", "compared", "cost", "count", "draws", "failure", "failures", "image_x_px",
@@ -563,18 +541,18 @@ RULES: tuple[Callable[[Reading], None], ...] = (
 # Values that replace those of a pipeline document: ``--set`` changes it, ``--at`` fixes it.
 
 ALTERNATIVES: dict[str, Collection[str]] = {
-    **RIVALS, "camera_file": (*FILE_VALUES, *STATED, *OTHER_WAYS),
+    **parameters.RIVALS, "camera_file": (*FILE_VALUES, *STATED, *OTHER_WAYS),
     TRIAL: (MAX_TRIALS,), f"{SEARCH}.{MAX_TRIALS}": (TRIAL,),
 }
 """Parameter -> those that say the same in another way: choosing it drops them."""
 
 
 def parse_settings(
-    settings: Sequence[str], parameters: Mapping[str, Parameter] = PARAMETERS
+    settings: Sequence[str], known: Mapping[str, Parameter] = PARAMETERS
 ) -> dict[str, Any]:
     """Return the values that "key=value" settings give, by parameter or header key.
 
-    A parameter's name needs no section, and a bare word counts as a string. ``parameters`` are
+    A parameter's name needs no section, and a bare word counts as a string. ``known`` are
     those that the pipeline has, plug-ins' included.
 
     Raises
@@ -589,16 +567,16 @@ def parse_settings(
     """
     def read(key: str, written: str) -> dict[str, Any]:
         section, _, name = key.rpartition(".")
-        value, home = read_value(written), section_of(name, parameters)
+        value, home = read_value(written), section_of(name, known)
         if section in (REQUIRE, SEARCH):
             return {key: value}
         if home and section not in ("", home, "axes"):
             raise ValueError(f"{name} or {home}.{name}")
-        if not home and name not in HEADER and not is_zip(value):
+        if not home and name not in HEADER and not parameters.is_zip(value):
             raise LookupError(name)
         return {name: value}
 
-    return _assigned("--set", settings, read, [*parameters, TRIAL, *HEADER])
+    return _assigned("--set", settings, read, [*known, TRIAL, *HEADER])
 
 
 def _assigned(
@@ -633,7 +611,7 @@ def _assigned(
     return chosen
 
 
-def displaced_by(chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]) -> set[str]:
+def displaced_by(chosen: Mapping[str, Any], known: Mapping[str, Parameter]) -> set[str]:
     """Return the parameters that give way to chosen values.
 
     They are other ways to say the same, and parameters of boards that chosen kinds do not use.
@@ -647,19 +625,19 @@ def displaced_by(chosen: Mapping[str, Any], parameters: Mapping[str, Parameter])
     if "kind" in chosen:
         kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
         used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
-        names |= {name for name, each in parameters.items() if each.section == "board"} - used
+        names |= {name for name, each in known.items() if each.section == "board"} - used
     return names
 
 
 def apply_settings(
-    document: Any, chosen: Mapping[str, Any], parameters: Mapping[str, Parameter] = PARAMETERS
+    document: Any, chosen: Mapping[str, Any], known: Mapping[str, Parameter] = PARAMETERS
 ) -> None:
     """Write chosen values into a document, of plain tables or of tomlkit's.
 
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
     makes the parameter fixed or drawn. What the chosen values displace goes.
     """
-    displaced = displaced_by(chosen, parameters)
+    displaced = displaced_by(chosen, known)
     for table in document.values():
         if isinstance(table, dict):
             for name in table.keys() & displaced:
@@ -671,8 +649,8 @@ def apply_settings(
         home, _, key = name.rpartition(".")  # of a key of a section that has no parameters
         other = home
         if not home:
-            home, other = section_of(name, parameters) or "axes", "axes"
-            if name in parameters and _is_axis(value, parameters[name]):
+            home, other = section_of(name, known) or "axes", "axes"
+            if name in known and _is_axis(value, known[name]):
                 home, other = other, home
         if all(isinstance(document.get(table, {}), dict) for table in (home, other)):
             if other != home and key in document.get(other, {}):
@@ -821,12 +799,14 @@ class Pipeline(Grid):
         if settings:
             # Other settings may be of plug-ins that settings name.
             named = copy.deepcopy(document)
+            keys = [each.partition("=")[0].strip().rpartition(".")[2] for each in settings]
             apply_settings(named, parse_settings([
-                each for each in settings
-                if each.partition("=")[0].strip().rpartition(".")[2] in NAMING]))
-            parameters = parameters_with(tuple(read_plugins(named, str(folder), plugins)[0]))
-            chosen = parse_settings(settings, parameters)
-            apply_settings(document, chosen, parameters)
+                each for key, each in zip(keys, settings, strict=True)
+                if key in parameters.NAMING]))
+            declared, _ = parameters.read_plugins(named, str(folder), plugins)
+            known = parameters.parameters_with(tuple(declared))
+            chosen = parse_settings(settings, known)
+            apply_settings(document, chosen, known)
         reading = read_keys(document, source, str(folder), files, plugins)
         return _checked(reading, text, name, chosen)
 
@@ -949,7 +929,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
         document.pop(section, None)
     axes = document.get("axes", {})
-    for name in [name for name, value in axes.items() if name == TRIAL or is_zip(value)]:
+    for name in [name for name, value in axes.items() if name == TRIAL or parameters.is_zip(value)]:
         del axes[name]
     apply_settings(document, {
         name: list(value) if isinstance(value, tuple) else value for name, value in chosen.items()

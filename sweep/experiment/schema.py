@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.grid import MAX_DEVIATIONS, Axis, Grid
-from sweep.experiment.parameters import PHOTOGRAPHS, Stage, superseded
+from sweep.experiment.parameters import Stage, superseded
 from sweep.measure.flags import (
     BoundStatus,
     DetectionStatus,
@@ -496,5 +496,5 @@ def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
         common = tuple(each for each in SCHEMA if each.name not in NOT_OF_BOARDS) + tuple(
             dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
             if corners or "chessboard_corner" not in variable.inner)
-    photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
+    photographed = PHOTOGRAPH_SCHEMA if "photographs" in pipeline.given else ()
     return common + drawn_variables(pipeline) + photographed

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 
 from sweep.experiment.grid import Distribution
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
-from sweep.model import pose
+from sweep.model import camera, pose
 from sweep.model.board import along_sides
 from sweep.model.calibration import CalibrationError
 from sweep.model.camera import (
-    PER_SIDE,
     VIEW_PARAMETERS,
     Column,
-    Framing,
     canonical_distortion,
     intrinsics,
     map_columns,
@@ -308,7 +306,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     # What a scene gets must not depend on whether others have a lens.
     for curved in (False, True):
         rows = np.flatnonzero(cameras.distorted == curved)
-        points = along_sides(outline[rows], PER_SIDE if curved else 1)
+        points = along_sides(outline[rows], camera.PER_SIDE if curved else 1)
 
         def offsets(
             part: NDArray[np.intp], centre_xy: Floats, rows: NDArray[np.intp] = rows,
@@ -318,7 +316,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
             rotation = facing(rows[part], position)
             return pose.transform_points(points[part], rotation, np.zeros_like(position))
 
-        centres[rows] = Framing(
+        centres[rows] = camera.Framing(
             cameras.take(rows), frame[rows], depth[rows], offsets, share[rows], given[rows],
             margin[rows], shift[rows],
         ).centres()

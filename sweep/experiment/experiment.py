@@ -19,37 +19,26 @@ from sweep.experiment.grid import TRIAL, Axis, Block, Grid
 from sweep.experiment.parameters import NAMED_BY, PARAMETERS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
+from sweep.measure import detectors
 from sweep.measure.detectors import (
-    NOISE_MARGIN_PX,
     OPENCV,
     AnyDetectorSetting,
     BoardDetectorSetting,
     DetectorSetting,
-    full_frame_reason,
-    margin_px,
-    uneven_light_needs_frame,
 )
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.likelihood import BoundSetting
 from sweep.messages import label
+from sweep.model import camera, effects
 from sweep.model.board_kinds import ARRANGING, arranged_board
 from sweep.model.camera import (
     VIEW_PARAMETERS,
     Column,
-    are_square,
     canonical_distortion,
-    field_of_view_deg,
     intrinsics,
     map_columns,
 )
-from sweep.model.effects import (
-    EFFECTS,
-    Effect,
-    ScenePlugins,
-    checked_effect,
-    checked_renderer,
-    is_coded,
-)
+from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
@@ -511,13 +500,13 @@ class Facts:
         sides = sides[sides > 0]  # before the camera
         numbers = {
             "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
-            "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
-            "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
+            "cy_px": cy, "hfov_deg": camera.field_of_view_deg(width, fx),
+            "vfov_deg": camera.field_of_view_deg(height, fy), "aspect": fy / fx,
             "off_centre_x": (cx - (width - 1) / 2) / width,
             "off_centre_y": (cy - (height - 1) / 2) / height,
         }
         return {name: _ends(each) for name, each in numbers.items()} | {
-            "square": bool(np.all(are_square(fx, fy))),
+            "square": bool(np.all(camera.are_square(fx, fy))),
             "side_px": tuple(np.multiply(_ends(sides), self.grid.relative_sizes).tolist())
             if len(sides) else None,
             "boards": self.grid.shows_boards,
@@ -676,9 +665,9 @@ class Facts:
         noisy = any(effect.switch in random for effect in effects if effect.widens == "noise")
         coarse = any("noise" in effect.worsens for effect in on)
         around = f" px around the {grid.target_word}'s pixels" + (
-            f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
-        windows = {margin_px(each) for each in self.experiment.detectors
-                   if full_frame_reason(each) is None and not image
+            f", and {detectors.NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
+        windows = {detectors.margin_px(each) for each in self.experiment.detectors
+                   if detectors.full_frame_reason(each) is None and not image
                    and "full" not in grid.values_of("window")}
         assumptions = [
             name for name in PARAMETERS
@@ -714,11 +703,11 @@ class Facts:
     def _reasons_for_the_frame(self, on: Sequence[Effect], *, image: bool) -> list[str]:
         """Return why the whole frame is searched, given the effects that are on."""
         settings = self.experiment.detectors
-        reasons = sorted({reason for each in settings if (reason := full_frame_reason(each))})
+        reasons = sorted(filter(None, {*map(detectors.full_frame_reason, settings)}))
         gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
             [1.0, *self.grid.values_of("gain")])
         if any(effect.widens == "uneven light" for effect in on) and any(
-                uneven_light_needs_frame(setting, gain) for setting in settings):
+                detectors.uneven_light_needs_frame(setting, gain) for setting in settings):
             reasons.append("adaptiveThreshConstant is low for uneven light")
         if image:
             reasons.append("the background is an image: clutter near the "
@@ -730,8 +719,8 @@ class Facts:
         if drawn is not None:
             return Part(effect.label, True, f"{switch} is drawn: {drawn}", switch)
         values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
-        text = ", ".join(dict.fromkeys(map(label, values))) if is_coded(effect.off) or not values \
-            else _text(values)
+        coded = effects.is_coded(effect.off) or not values
+        text = ", ".join(dict.fromkeys(map(label, values))) if coded else _text(values)
         return Part(effect.label, bool(values), f"{switch} is {text or effect.off_text}", switch)
 
 

@@ -37,26 +37,14 @@ from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
 from sweep.experiment.parameters import PARAMETERS, STATED, WORLD, Parameter, Stage
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
-from sweep.experiment.sampling import (
-    MAX_TRIALS,
-    StoppingRule,
-    read_required,
-    read_search,
-)
+from sweep.experiment.sampling import MAX_TRIALS, StoppingRule, read_required, read_search
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal, shown
 from sweep.model import marker
-from sweep.model.board_kinds import (
-    ARRANGING,
-    NEEDED,
-    SINGLE,
-    arrangement_faults,
-    is_solid,
-    used_by,
-)
+from sweep.model.board_kinds import ARRANGING, NEEDED, SINGLE, arrangement_faults, is_solid, used_by
 from sweep.model.calibration import MAX_BYTES, CalibrationError, calibration_of, read_tree
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular

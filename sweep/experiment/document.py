@@ -355,9 +355,8 @@ def read_keys(
         for key, value in reading.table(section).items():
             _read_key(reading, section, key, value)
     _read_axes(reading)
-    for parameter in reading.parameters.values():
-        if parameter.name not in reading.given:
-            reading.fixed[parameter.name] = parameter.default
+    reading.fixed.update({name: each.default for name, each in reading.parameters.items()
+                          if name not in reading.given})
     return reading
 
 

@@ -16,13 +16,7 @@ from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
 from sweep.model import camera, pose
 from sweep.model.board import along_sides
 from sweep.model.calibration import CalibrationError
-from sweep.model.camera import (
-    VIEW_PARAMETERS,
-    Column,
-    canonical_distortion,
-    intrinsics,
-    map_columns,
-)
+from sweep.model.camera import VIEW_PARAMETERS, Column, canonical_distortion, intrinsics
 from sweep.model.coverage import mixed
 from sweep.model.marker import marker_corners, module_count, overhang
 from sweep.model.scene import build_cameras
@@ -402,7 +396,7 @@ def geometry_keys(
     for name, centre, length in (("cx_px", cx, "width_px"), ("cy_px", cy, "height_px")):
         if not values[name].missing:
             middle = Column.of((values[length].values - 1) / 2)
-            columns[name] = map_columns(
+            columns[name] = camera.map_columns(
                 lambda text, default: "" if text == default else text,
                 [key_texts(name, centre, None), key_texts(name, middle, None)])
     columns |= {
@@ -417,7 +411,7 @@ def geometry_keys(
 def hashed(texts: Sequence[Column], count: int) -> NDArray[np.uint64]:
     """Return a hash (count,) of the texts of each of ``count`` scenes; empty ones do not count."""
     used = [column for column in texts if column.differs_from("")]
-    joined = map_columns(lambda *each: "|".join(filter(None, each)), used or [Column.of("")])
+    joined = camera.map_columns(lambda *each: "|".join(filter(None, each)), used or [Column.of("")])
     return joined.map(_hash).broadcast(count, np.uint64)
 
 

@@ -542,12 +542,13 @@ class Facts:
     def camera_notes(self) -> Iterator[str]:
         """A line for each property of the camera that may surprise."""
         for axis in "xy":
+            centre = f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}"
             off = max(map(abs, self.camera[f"off_centre_{axis}"]))
-            where = "outside" if off > 0.5 else "far from the centre of"
-            doubt = "" if off > 0.5 else "; is it that of another frame size?"
-            if off > OFF_CENTRE:
-                yield (f"c{axis}_px = {_text(self.camera[f'c{axis}_px'])}: {where} the frame of "
-                       f"{self._frame}{doubt}")
+            if off > 0.5:
+                yield f"{centre}: outside the frame of {self._frame}"
+            elif off > OFF_CENTRE:
+                yield (f"{centre}: far from the centre of the frame of {self._frame}; is it that "
+                       "of another frame size?")
         x, y = (self.camera[name][0] / 2 for name in ("width_px", "height_px"))
         if (self.camera["cx_px"], self.camera["cy_px"]) == ((x, x), (y, y)):
             yield (f"cx_px = {x:g}, cy_px = {y:g}: half the frame; with pixel (0, 0) at the "
@@ -564,28 +565,23 @@ class Facts:
         return build_scenes(values, count)
 
     @cached_property
-    def views(self) -> dict[str, Floats]:
-        """Tilt to the image plane, angle to the line of sight, distance of the centre, (n,) each.
+    def view_ranges(self) -> dict[str, list[float]]:
+        """The least and the largest of three quantities of the scenes that are looked at.
 
-        Of the scenes that are looked at.
+        Tilt to the image plane, angle to the line of sight, distance of the centre.
         """
         rotation, translation = self._scenes.rotation, self._scenes.translation
         return {
-            "tilt_deg": np.degrees(angles_of_rotation(rotation)[0]),
-            "viewing_angle_deg": np.degrees(viewing_angle(rotation, translation)),
-            "range_m": np.linalg.norm(translation, axis=1),
+            "tilt_deg": [*_ends(np.degrees(angles_of_rotation(rotation)[0]))],
+            "viewing_angle_deg": [*_ends(np.degrees(viewing_angle(rotation, translation)))],
+            "range_m": [*_ends(np.linalg.norm(translation, axis=1))],
         }
-
-    @property
-    def view_ranges(self) -> dict[str, list[float]]:
-        """The least and the largest tilt, viewing angle and distance."""
-        return {name: list(_ends(numbers)) for name, numbers in self.views.items()}
 
     @property
     def pose_line(self) -> str:
         """The poses in one line."""
         count, _ = self._sample
-        tilt, angle, distance = (_text(numbers, 4) for numbers in self.views.values())
+        tilt, angle, distance = (_text(ends, 4) for ends in self.view_ranges.values())
         sample = f" ({count:,} poses looked at)" * (count < len(self.experiment.all_scenes))
         return f"tilt {tilt}°, viewing angle {angle}°, {distance} m away{sample}"
 
@@ -650,31 +646,27 @@ class Facts:
     @cached_property
     def parts(self) -> list[Part]:
         """Every optional part, active or not."""
-        grid, effects = self.grid, self.experiment.effects
-        on = [effect for effect in effects
-              if effect.switch in grid.distributions
-              or grid.any_value(effect.switch, effect.is_on)]
-        calibrated = grid.calibration is not None
+        grid, calibrated = self.grid, self.grid.calibration is not None
+        of_effects = [*map(self._effect, self.experiment.effects)]
+        on = [effect for effect, part in zip(self.experiment.effects, of_effects, strict=True)
+              if part.active]
         random = dict.fromkeys([
             *grid.distributions, *["jitter_px"] * grid.any_value("jitter_px", bool),
             *(each.switch for each in on if each.random),
-            *["the believed calibration"] * calibrated,
-        ])
+            *["the believed calibration"] * calibrated])
         lens = any(map(canonical_distortion, grid.values_of("distortion")))
         image = grid.any_value("background", lambda value: isinstance(value, str))
-        noisy = any(effect.switch in random for effect in effects if effect.widens == "noise")
+        noisy = any(effect.switch in random for effect in on if effect.widens == "noise")
         coarse = any("noise" in effect.worsens for effect in on)
         around = f" px around the {grid.target_word}'s pixels" + (
             f", and {detectors.NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else "")
         windows = {detectors.margin_px(each) for each in self.experiment.detectors
                    if detectors.full_frame_reason(each) is None and not image
                    and "full" not in grid.values_of("window")}
-        assumptions = [
-            name for name in PARAMETERS
-            if name.startswith("believed_") and grid.fixed.get(name, "varies") is not None
-        ] + ["believed: calibration"] * calibrated
-        with_pixels = {each.name for each in grid.plugins if each.needs_images} | {
-            name for name, each in SOLVERS.items() if each.needs_images}
+        assumptions = [name for name in PARAMETERS if name.startswith("believed_")
+                       and grid.fixed.get(name, "varies") is not None]
+        with_pixels = [name for name, each in SOLVERS.items() if each.needs_images] + [
+            each.name for each in grid.plugins if each.needs_images]
         # Why each is active, and what is said if nothing is a reason.
         reasons: dict[str, tuple[Iterable[str], str]] = {
             "lens distortion": (["distortion is given"] * lens, "distortion is empty"),
@@ -688,21 +680,20 @@ class Facts:
             "renderer": (sorted(set(grid.values_of("renderer"))), ""),
             "solver guard": (["guarded = true"] * grid.any_value("guarded", bool),
                              "guarded = false: plain cv2.solvePnP"),
-            "accuracy bound": (
-                [f"bound is {each}" for each in sorted(set(grid.values_of("bound")) - {"none"})],
-                "bound is none"),
-            "pixels kept": (
-                [f"solver {each} needs them" for each in grid.values_of("solver")
-                 if each in with_pixels], "no solver needs them"),
-            "wrong assumptions": (assumptions, "the estimator knows the true camera and size"),
+            "accuracy bound": ([f"bound is {each}" for each in sorted(set(
+                grid.values_of("bound"))) if each != "none"], "bound is none"),
+            "pixels kept": ([f"solver {each} needs them" for each in grid.values_of("solver")
+                             if each in with_pixels], "no solver needs them"),
+            "wrong assumptions": ([*assumptions, *["believed: calibration"] * calibrated],
+                                  "the estimator knows the true camera and size"),
         }
         listed = [Part(name, bool(text := ", ".join(each)), text or otherwise)
                   for name, (each, otherwise) in reasons.items()]
-        return [*listed, *map(self._effect, effects)]
+        return listed + of_effects
 
     def _reasons_for_the_frame(self, on: Sequence[Effect], *, image: bool) -> list[str]:
         """Return why the whole frame is searched, given the effects that are on."""
-        settings = self.experiment.detectors
+        settings, word = self.experiment.detectors, self.grid.target_word
         reasons = sorted(filter(None, {*map(detectors.full_frame_reason, settings)}))
         gain = math.inf if any("uneven light" in effect.worsens for effect in on) else max(
             [1.0, *self.grid.values_of("gain")])
@@ -710,8 +701,8 @@ class Facts:
                 detectors.uneven_light_needs_frame(setting, gain) for setting in settings):
             reasons.append("adaptiveThreshConstant is low for uneven light")
         if image:
-            reasons.append("the background is an image: clutter near the "
-                           f"{self.grid.target_word} may change the detection")
+            reasons.append(
+                f"the background is an image: clutter near the {word} may change the detection")
         return reasons + ['window = "full"'] * ("full" in self.grid.values_of("window"))
 
     def _effect(self, effect: Effect) -> Part:

@@ -17,21 +17,9 @@ import tomlkit
 
 from sweep.declaration import Declared
 from sweep.errors import PluginError
+from sweep.experiment import document as documents
 from sweep.experiment import parameters
-from sweep.experiment.document import (
-    HEADER,
-    REQUIRE,
-    SEARCH,
-    Reading,
-    document_text,
-    file_text,
-    read_document,
-    read_keys,
-    read_value,
-    refusing,
-    section_of,
-    toml_item,
-)
+from sweep.experiment.document import HEADER, REQUIRE, SEARCH, Reading
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
@@ -95,8 +83,8 @@ def absent(
     """
     def check(reading: Reading) -> None:
         for name in names:
-            if name in reading.given and where(reading) and (
-                    reading.is_active(name) or not active):
+            counts = name in reading.given and (reading.is_active(name) or not active)
+            if counts and where(reading):
                 reading.refuse(name, expected)
 
     return check
@@ -104,11 +92,9 @@ def absent(
 
 def _is_no_noise_table(table: Sequence[float]) -> bool:
     levels, deviations = table[::2], table[1::2]
-    return (
-        list(levels) != sorted(set(levels))
-        or not all(0 <= level <= MAX_LEVEL for level in levels)
-        or not all(0 <= deviation <= 1e6 for deviation in deviations)
-    )
+    within = all(0 <= level <= MAX_LEVEL for level in levels) and all(
+        0 <= deviation <= 1e6 for deviation in deviations)
+    return not within or list(levels) != sorted(set(levels))
 
 
 def _without(*names: str) -> Callable[[Reading], bool]:
@@ -119,11 +105,6 @@ def _without(*names: str) -> Callable[[Reading], bool]:
 def _is_calibrated(reading: Reading) -> bool:
     """Return whether an estimator believes a calibration."""
     return "calibration" in reading.values_of("believed")
-
-
-def _in_planes(*listed: Any) -> bool:
-    """Return whether prints, listed as parameters' values, lie in several planes."""
-    return any(map(is_solid, listed))
 
 
 SEVERAL_PLANES = "for prints with z_m or tilt_deg"
@@ -157,13 +138,13 @@ RECORDS: tuple[Check, ...] = (
           lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),
           f"{RENDERERS}, for boards"),
     apart(("renderer", "markers", "distractors"),
-          lambda renderer, *listed: renderer != "exact" and _in_planes(*listed),
+          lambda renderer, *listed: renderer != "exact" and any(map(is_solid, listed)),
           f"exact, {SEVERAL_PLANES}"),
     absent(GEOMETRIC, lambda reading: {*reading.values_of("renderer")} - {"exact"},
            "renderer = exact beside it, which alone has it", active=True),
     absent(("curvature_per_m", "occlusion"),
-           lambda reading: _in_planes(
-               *reading.values_of("markers"), *reading.values_of("distractors")),
+           lambda reading: any(map(
+               is_solid, [*reading.values_of("markers"), *reading.values_of("distractors")])),
            f"it absent, {SEVERAL_PLANES}: it is of one sheet", active=True),
     # Cameras, and what estimators believe of them.
     absent(OTHER_WAYS, lambda reading: reading.stated,
@@ -555,7 +536,7 @@ def parse_settings(
     """
     def read(key: str, written: str) -> dict[str, Any]:
         section, _, name = key.rpartition(".")
-        value, home = read_value(written), section_of(name, known)
+        value, home = documents.read_value(written), documents.section_of(name, known)
         if section in (REQUIRE, SEARCH):
             return {key: value}
         if home and section not in ("", home, "axes"):
@@ -637,14 +618,14 @@ def apply_settings(
         home, _, key = name.rpartition(".")  # of a key of a section that has no parameters
         other = home
         if not home:
-            home, other = section_of(name, known) or "axes", "axes"
+            home, other = documents.section_of(name, known) or "axes", "axes"
             if name in known and _is_axis(value, known[name]):
                 home, other = other, home
         if all(isinstance(document.get(table, {}), dict) for table in (home, other)):
             if other != home and key in document.get(other, {}):
                 del document[other][key]
             inline = isinstance(document, tomlkit.TOMLDocument) and isinstance(value, dict)
-            document.setdefault(home, {})[key] = toml_item(value) if inline else value
+            document.setdefault(home, {})[key] = documents.toml_item(value) if inline else value
         # Otherwise a section is no table, which reading the document reports.
 
 
@@ -740,8 +721,8 @@ class Pipeline(Grid):
         """
         path = Path(path)
         source = plain(path, MAX_SHOWN_PATH_LENGTH)
-        with refusing(source):
-            text = file_text(path)
+        with documents.refusing(source):
+            text = documents.file_text(path)
         return Pipeline.from_text(
             text, settings, name=path.stem, source=source, folder=path.parent)
 
@@ -781,8 +762,8 @@ class Pipeline(Grid):
         PipelineError
             One line for each fault of the text or of the settings.
         """
-        with refusing(source):
-            document = read_document(text)
+        with documents.refusing(source):
+            document = documents.read_document(text)
         chosen = {}
         if settings:
             # Other settings may be of plug-ins that settings name.
@@ -795,7 +776,7 @@ class Pipeline(Grid):
             known = parameters.parameters_with(tuple(declared))
             chosen = parse_settings(settings, known)
             apply_settings(document, chosen, known)
-        reading = read_keys(document, source, str(folder), files, plugins)
+        reading = documents.read_keys(document, source, str(folder), files, plugins)
         return _checked(reading, text, name, chosen)
 
     @staticmethod
@@ -833,8 +814,8 @@ class Pipeline(Grid):
         distance_m = 0.3
         <BLANKLINE>
         """
-        with refusing(source):
-            text = document_text(mapping)
+        with documents.refusing(source):
+            text = documents.document_text(mapping)
         return Pipeline.from_text(text, settings, name=name, source=source, folder=folder)
 
     def to_toml(self) -> str:
@@ -913,7 +894,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     trial = chosen.pop(TRIAL, 0)
     for other in displaced_by(named, pipeline.parameters):
         chosen.pop(other, None)
-    document = read_document(pipeline.text)
+    document = documents.read_document(pipeline.text)
     for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
         document.pop(section, None)
     axes = document.get("axes", {})
@@ -922,8 +903,8 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     apply_settings(document, {
         name: list(value) if isinstance(value, tuple) else value for name, value in chosen.items()
     }, pipeline.parameters)
-    reading = read_keys(document, "--at", pipeline.folder, stored=pipeline.plugins)
-    single = _checked(reading, document_text(document), pipeline.name)
+    reading = documents.read_keys(document, "--at", pipeline.folder, stored=pipeline.plugins)
+    single = _checked(reading, documents.document_text(document), pipeline.name)
     return replace(single, axes=(Axis(TRIAL, {TRIAL: range(trial, trial + 1)}),))
 
 
@@ -948,7 +929,7 @@ def parse_selection(at: str, pipeline: Pipeline) -> dict[str, Any]:
     together = {axis.name: axis for axis in pipeline.axes if axis.zipped}
 
     def read(name: str, written: str) -> dict[str, Any]:
-        value = read_value(written)
+        value = documents.read_value(written)
         if name in together:
             return together[name].at(_row(together[name], value))
         if name not in declared:

@@ -312,14 +312,19 @@ def read_required(reading: Reading) -> dict[str, Any]:
     The axes have been read.
     """
     table = _read_section(reading, REQUIRE, REQUIRE_KEYS)
-    budgets: list[float] = []
+    budget_ms = None
     for text in table.get("all", ()):
         try:
             given = read_requirement(text)
-            if given.name == BUDGET:
-                budgets.append(_budget(reading, given))
-            if len(budgets) > 1:
+            if given.name == BUDGET and reading.table(SEARCH).keys().isdisjoint(CHOICES):
+                raise ValueError("is the time of a choice: give [search] smallest, largest or "
+                                 "cheapest, or use `sweep tradeoff --budget-ms`")
+            if given.name == BUDGET and (
+                    given.relation not in ("<=", "<") or given.limit <= 0.0 or given.unit):
+                raise ValueError(f"expected milliseconds of a frame: {BUDGET} <= 2")
+            if given.name == BUDGET and budget_ms is not None:
                 raise ValueError("there is another budget; delete one")
+            budget_ms = given.limit if given.name == BUDGET else budget_ms
         except ValueError as error:
             reading.note(f"{REQUIRE}.all = {shown(text)}", str(error))
     conditions = tuple(dict.fromkeys(table.get("per", ())))
@@ -327,17 +332,7 @@ def read_required(reading: Reading) -> dict[str, Any]:
         if not _is_of_scene(reading, name):
             _axis_at(reading, f"{REQUIRE}.per", name)
     return {"requirements": tuple(texts_in(reading.document)), "require_per": conditions,
-            "budget_ms": budgets[0] if budgets else None}
-
-
-def _budget(reading: Reading, given: RequirementText) -> float:
-    """Return the milliseconds of a budget; ValueError says what is wrong with it."""
-    if reading.table(SEARCH).keys().isdisjoint(CHOICES):
-        raise ValueError("is the time of a choice: give [search] smallest, largest or cheapest, "
-                         "or use `sweep tradeoff --budget-ms`")
-    if given.relation not in ("<=", "<") or given.limit <= 0.0 or given.unit:
-        raise ValueError(f"expected milliseconds of a frame: {BUDGET} <= 2")
-    return given.limit
+            "budget_ms": budget_ms}
 
 
 def texts_in(document: Mapping[str, Any]) -> list[str]:
@@ -348,10 +343,9 @@ def texts_in(document: Mapping[str, Any]) -> list[str]:
     """
     table = document.get(REQUIRE)
     listed = table.get("all") if isinstance(table, dict) else None
-    return [
-        text for text in (listed if isinstance(listed, list) else ()) if isinstance(text, str)
-        if (form := _FORM.fullmatch(text)) is None or form["name"] != BUDGET
-    ]
+    texts = [each for each in (listed if isinstance(listed, list) else ()) if isinstance(each, str)]
+    return [text for text in texts
+            if (form := _FORM.fullmatch(text)) is None or form["name"] != BUDGET]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -468,14 +462,10 @@ def search_settings(
     >>> search_settings(["detection >= 0.9"], "distance_m", max_trials=600)
     ['require.all=["detection >= 0.9"]', 'search.along="distance_m"', 'search.max_trials=600']
     """
+    lists = {f"{REQUIRE}.all": require or None, f"{SEARCH}.along": None, f"{SEARCH}.per": per,
+             f"{REQUIRE}.per": at_all}
     given: dict[str, Any] = {
-        f"{REQUIRE}.all": _listed(require) or None, f"{SEARCH}.along": along or None,
-        f"{SEARCH}.per": _listed(per), f"{REQUIRE}.per": _listed(at_all),
-        f"{SEARCH}.{MAX_TRIALS}": max_trials,
-    }
+        key: [texts] if isinstance(texts, str) else texts for key, texts in lists.items()}
+    given |= {f"{SEARCH}.along": along or None, f"{SEARCH}.{MAX_TRIALS}": max_trials}
     return [f"{key}={toml_item(value).as_string()}"
             for key, value in given.items() if value is not None]
-
-
-def _listed(texts: Sequence[str] | None) -> Sequence[str] | None:
-    return [texts] if isinstance(texts, str) else texts

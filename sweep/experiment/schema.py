@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.grid import MAX_DEVIATIONS, Axis, Grid
 from sweep.experiment.parameters import Stage, superseded
-from sweep.measure.flags import (
-    BoundStatus,
-    DetectionStatus,
-    EstimateStatus,
-    Flag,
-    Flipped,
-    TruthSource,
-)
+from sweep.measure import flags
+from sweep.measure.flags import DetectionStatus, Flag
 from sweep.messages import label
 from sweep.model.calibration import VIEW
 
@@ -338,7 +332,7 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("viewing_angle_deg", _S, "f8",
              "angle between the marker's normal and the line of sight to its centre", "degree",
              present_when=_TRUTH, tolerance=Tolerance("absolute", 180 * TRUTH_RTOL)),
-    Variable("bound", _S, "u1", "what became of the accuracy bound", flags=BoundStatus,
+    Variable("bound", _S, "u1", "what became of the accuracy bound", flags=flags.BoundStatus,
              tolerance=_EQUAL),
     Variable("bound_std", _S, "f4",
              "least standard deviation of an unbiased estimate, camera frame (Cramér-Rao)",
@@ -355,7 +349,7 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("corner_error_px", _D, "f4", "found corner minus true corner", "px",
              ("corner", "xy"),
              present_when=_DETECTED, tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
-    Variable("estimate", _E, "u1", "what became of the pose", flags=EstimateStatus,
+    Variable("estimate", _E, "u1", "what became of the pose", flags=flags.EstimateStatus,
              tolerance=_EQUAL),
     Variable("translation_error_m", _E, "f4", "estimated minus true, camera frame", "m",
              ("xyz",),
@@ -389,7 +383,7 @@ SCHEMA: tuple[Variable, ...] = (
              "standard deviation of shifts of the marker's parts beside the fitted pose that the "
              "residuals of photometric_real show", "px", present_when=_MAYBE_POSE),
     Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
-             flags=Flipped),
+             flags=flags.Flipped),
 )
 """Every variable, in the order in which the stages make them."""
 
@@ -441,7 +435,8 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
     _drawn("tilt_deg", "angle between the marker's plane and the image plane", "degree", 180),
     _drawn("image_x_px", "image of the marker's centre, x", "px", 1e6),
     _drawn("image_y_px", "image of the marker's centre, y", "px", 1e6),
-    Variable("truth", _S, "u1", "origin of the true pose", flags=TruthSource, tolerance=_EQUAL),
+    Variable("truth", _S, "u1", "origin of the true pose", flags=flags.TruthSource,
+             tolerance=_EQUAL),
     Variable("truth_std", _S, "f4",
              "standard deviation of the true pose, as far as it is known; camera frame",
              "radian, m", ("pose_parameter",),

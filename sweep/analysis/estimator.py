@@ -548,11 +548,6 @@ def with_interval(name: str, meaning: str, units: str) -> list[Output]:
     return [Output(f"{name}{end}", words + meaning, units) for end, words in INTERVAL.items()]
 
 
-def interval_variables(name: str, interval: Sequence[NDArray[Any]]) -> Variables:
-    """Return a value and the ends of its interval, (value, low, high), by name."""
-    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
-
-
 class Statistic(ABC, Generic[ViewT]):
     """What is computed of poses; generic over the view of them."""
 
@@ -565,8 +560,13 @@ class Statistic(ABC, Generic[ViewT]):
         return with_interval(self.name, self.meaning, self.units)
 
     @abstractmethod
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
+        """Return `outputs`, each (groups,), of poses whose draws are of a design."""
+
     def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
-        """Return the variables, each (groups,), of poses whose draws are of a design."""
+        """Return the same arrays by their names."""
+        names = (output.name for output in self.outputs())
+        return dict(zip(names, self.arrays(columns, design), strict=True))
 
 
 def guarded(statistic: Statistic[ViewT]) -> Statistic[ViewT]:
@@ -604,11 +604,10 @@ class Count(Statistic[ViewT]):
                 Output(self.drawn, "whether any cell has two draws", "1", "?")
                 ] if self.draws else [count]
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:  # noqa: ARG002
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:  # noqa: ARG002
         """Return the counts."""
         sample = Sample(*columns.by_draw(lambda poses, _: (self.of(poses),)))
-        more = {self.draws: sample.draws, self.drawn: sample.drawn} if self.draws else {}
-        return {self.name: sample.n, **more}
+        return [sample.n, sample.draws, sample.drawn] if self.draws else [sample.n]
 
 
 @dataclass(frozen=True)
@@ -651,26 +650,20 @@ class Rate(Statistic[ViewT]):
         hits, used = columns.by_draw(masks)
         return hits, used
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
-        """Return the rate and its intervals."""
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
+        """Return the counts, the rate and its intervals."""
         hits_by_draw, used = self.by_draw(columns)
         level, sample = design.level(self.level), Sample(used)
         n, hits = sample.n, Sample(hits_by_draw).n
         draws = whole(design.worth(hits_by_draw, used, level))
-        with np.errstate(invalid="ignore"):
-            values: Variables = {self.name: hits / n}
-        if self.counts:
-            names = (name for name, _ in self.counts)
-            values |= dict(zip(names, (n, hits), strict=False)) | {"draws": draws}
-        kinds = {"": clopper_pearson if self.exact or design.stopped else wilson}
-        if self.with_jeffreys:
-            kinds["_jeffreys"] = jeffreys
         fewest, most = scaled_to_draws(hits, n, draws)
-        for ending, interval in kinds.items():
-            low, high = interval(fewest, draws, level)[0], interval(most, draws, level)[1]
-            values[f"{self.name}{ending}_low"] = np.where(sample.drawn, low, np.nan)
-            values[f"{self.name}{ending}_high"] = np.where(sample.drawn, high, np.nan)
-        return values
+        kinds = [clopper_pearson if self.exact or design.stopped else wilson]
+        ends = [np.where(sample.drawn, end, np.nan)
+                for interval in kinds + [jeffreys] * self.with_jeffreys
+                for end in (interval(fewest, draws, level)[0], interval(most, draws, level)[1])]
+        counts = [n, hits][: len(self.counts)] + [draws] * bool(self.counts)
+        with np.errstate(invalid="ignore"):
+            return [*counts, hits / n, *ends]
 
 
 def newcombe_and_mcnemar(
@@ -766,10 +759,9 @@ class Mean(Statistic[ViewT]):
     used: Callable[[ViewT], Masks]
     level: float = LEVEL
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the mean and its interval."""
-        level = design.level(self.level)
-        return interval_variables(self.name, self.interval(columns, design, level))
+        return self.interval(columns, design, design.level(self.level))
 
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
         """Return value, low and high."""
@@ -844,9 +836,9 @@ class PositiveMean(Mean[ViewT]):
 
     unseen_factor: float = UNSEEN_FACTOR
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the mean and its interval: what may be unseen widens it for a stop, too."""
-        return interval_variables(self.name, self.interval(columns, design, self.level))
+        return self.interval(columns, design, self.level)
 
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:
         """Return value, low and high."""
@@ -943,7 +935,7 @@ class FlipMixture(Statistic[Poses]):
         """Return the poses that count."""
         return poses.solved
 
-    def variables(self, columns: Columns[Poses], design: Design) -> Variables:
+    def arrays(self, columns: Columns[Poses], design: Design) -> Sequence[NDArray[Any]]:
         """Return the root mean square and its interval."""
         level = design.level(self.level)
 
@@ -965,7 +957,7 @@ class FlipMixture(Statistic[Poses]):
         # What is computed is rounded: the value lies in its interval.
         interval = (square, np.fmin(low, square), np.fmax(high, square))
         ends = [np.where(sample.drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
-        return interval_variables(self.name, [np.sqrt(each) for each in ends])
+        return [np.sqrt(each) for each in ends]
 
 
 def _first_known(first: Floats, second: Floats) -> Floats:
@@ -1106,20 +1098,19 @@ class Quantiles(Statistic[ViewT]):
         used, = columns.by_draw(lambda poses, _: (self.used(poses),))
         return columns.column(values), used
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the quantiles, their intervals, and why these may have no ends."""
         errors, used = self.column(columns)
         values = quantile_intervals(
             errors, used, [*PERCENTS.values()], design, design.level(self.level))
-        sample, found = Sample(used), Variables()
-        for at, statistic in enumerate(PERCENTS):
-            found |= interval_variables(self.name.format(statistic), list(values[:, at].T))
+        sample, found = Sample(used), list[NDArray[Any]]()
+        for of_percent in np.moveaxis(values, 1, 0):
+            found += [*of_percent.T]
             if self.with_reason:
-                missing = np.isnan(values[:, at, 1:]).any(axis=1)
-                found[f"{statistic}_interval"] = np.select(
-                    [sample.n == 0, ~sample.drawn, missing],
+                found.append(np.select(
+                    [sample.n == 0, ~sample.drawn, np.isnan(of_percent[:, 1:]).any(axis=1)],
                     [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
-                    IntervalOf.given)
+                    IntervalOf.given))
         return found
 
 
@@ -1291,23 +1282,22 @@ def aggregate(
     """
     binning, binned = read_bins(results, kept, bins or {})
     layout, columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
-    tables = []
+    found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups)
     for part in binning.split(columns):
         groups, *rest = next(iter(part.values())).shape[:4]
         step = max(MAX_SHARED // max(math.prod(rest), 1), 1)  # groups at a time
-        found = []
-        for start in range(0, groups, step):
-            some = Columns({name: each[start : start + step] for name, each in part.items()}, view)
-            found.append({name: values for statistic in statistics
-                          for name, values in statistic.variables(some, design).items()})
-        tables.append({name: np.concatenate([each[name] for each in found]) for name in found[0]})
+        # One at a time: each keeps what it has computed of its poses.
+        blocks = (Columns({name: each[start : start + step] for name, each in part.items()}, view)
+                  for start in range(0, groups, step))
+        found.append([np.concatenate(arrays) for arrays in zip(*(
+            [array for statistic in statistics for array in statistic.arrays(block, design)]
+            for block in blocks), strict=True)])
     shape = (*(layout.sizes[name] for name in layout.kept), *binning.shape)
-    dims = (*layout.kept, *binning.edges)
+    outputs = [output for statistic in statistics for output in statistic.outputs()]
     variables = {
-        output.name: (
-            dims, np.stack([table[output.name] for table in tables], axis=-1).reshape(shape).astype(
-                output.dtype), output.attributes())
-        for statistic in statistics for output in statistic.outputs()}
+        output.name: ((*layout.kept, *binning.edges), np.stack(arrays, axis=-1).reshape(
+            shape).astype(output.dtype), output.attributes())
+        for output, arrays in zip(outputs, zip(*found, strict=True), strict=True)}
     coordinates = {name: value.variable for name, value in results.coords.items()
                    if set(value.dims) <= set(kept) and not is_fixed(value)}
     return xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))

@@ -35,7 +35,6 @@ from sweep.analysis.estimator import (
     Rate,
     Unit,
     Variables,
-    interval_variables,
     quantile_intervals,
     read_bins,
     with_interval,
@@ -435,13 +434,17 @@ def _gap(pair: PairedUnits, inside: Sequence[Masks]) -> Variables:
     return table
 
 
+def _named(name: str, interval: Sequence[Any]) -> Variables:
+    """Return a value and the ends of its interval by their names."""
+    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
+
+
 def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> Variables:
     """Return a rate of both, its difference, and their intervals."""
-    found = [rate.variables(Columns(each, Poses), BY_PHOTOGRAPH) for each in arrays]
-    value, low, high = (
-        np.stack([each[f"{rate.name}{end}"] for each in found]) for end in INTERVAL)
+    value, low, high = map(np.stack, zip(*(
+        rate.arrays(Columns(each, Poses), BY_PHOTOGRAPH) for each in arrays), strict=True))
     gap = value[1] - value[0]
-    return interval_variables(rate.name, (value, low, high)) | interval_variables(
+    return _named(rate.name, (value, low, high)) | _named(
         f"{rate.name}_gap", (gap, gap - np.hypot(value[1] - low[1], high[0] - value[0]),
                              gap + np.hypot(high[1] - value[1], value[0] - low[0])))
 
@@ -466,5 +469,5 @@ def _quantiles(each: Compared, sides: Sequence[Poses], counts: Sequence[Any]) ->
             np.array(intervals), -1, 0)
         ends = np.array([percentile_interval(row, least)
                          for row, least in zip(gaps, np.minimum(*units).tolist(), strict=True)])
-        return interval_variables(each.name, [*values]) | interval_variables(
+        return _named(each.name, [*values]) | _named(
             f"{each.name}_gap", (compare(values[0][1], values[0][0]), ends[:, 0], ends[:, 1]))

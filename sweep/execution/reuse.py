@@ -18,7 +18,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import RunStore, check_whole, receipts, region
-from sweep.store.provenance import changes, fingerprint
+from sweep.store.provenance import changes, excerpt, fingerprint
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -208,19 +208,10 @@ def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
 
 def _difference(pipeline: Pipeline, old: Pipeline, name: str) -> str:
     """Return a line on the values that a parameter has in either grid."""
-    ours, theirs = (_excerpt(_values(grid, name)) for grid in (pipeline, old))
+    ours, theirs = (
+        excerpt((fixed_value(grid, name),) if axis is None else axis.columns[name])
+        for grid in (pipeline, old) for axis in [grid.axis_of(name)])
     return f"{name}: the store has {theirs}, this run {ours}"
-
-
-def _values(pipeline: Pipeline, name: str) -> Sequence[Any]:
-    """Return a parameter's values."""
-    axis = pipeline.axis_of(name)
-    return (fixed_value(pipeline, name),) if axis is None else axis.columns[name]
-
-
-def _excerpt(values: Sequence[Any]) -> str:
-    shown = ", ".join(str(value) for value in values[:4])
-    return shown if len(values) <= 4 else f"{shown}, ... ({len(values):,} values)"
 
 
 @dataclass(slots=True)

@@ -32,16 +32,8 @@ from sweep.isolation.crash_isolation import check_plugins
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
-from sweep.store import lifecycle
-from sweep.store.blocks import (
-    Receipt,
-    RunStore,
-    check_whole,
-    committed,
-    drop_block,
-    missing_chunks,
-    receipts,
-)
+from sweep.store import blocks, lifecycle
+from sweep.store.blocks import Receipt, RunStore
 from sweep.store.locations import absolute_url, check_writable, exists, open_storage
 from sweep.store.lock import changing, is_written, writing
 from sweep.store.provenance import differences
@@ -128,14 +120,14 @@ def execute(
     again = failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
-        check_whole(begun)
+        blocks.check_whole(begun)
         return summary_of(begun, {}, time.perf_counter() - started, {})
     for line in pipeline.facts.notes:
         notice(line)
     if begun is not None and is_written(begun.storage):
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
-    done = set() if begun is None else committed(begun) - again.keys()
+    done = set() if begun is None else blocks.committed(begun) - again.keys()
     if begun is None:
         check_writable(url)
 
@@ -163,15 +155,15 @@ def execute(
             large = left * pipeline.size(Stage.scene) * scene_s >= SMALL_RUN_S
             executor = stack.enter_context(Children(
                 child, workers or default_workers(), at_once=large or workers is not None))
-        blocks = begun.blocks if begun is not None else forecast.blocks_of(
+        cut = begun.blocks if begun is not None else forecast.blocks_of(
             pipeline, scene_s, executor.threads, block_s, time_limit_s)
         if not (yes or sources):
             forecast.check_affordable(
-                url, pipeline, scene_s, executor.threads, len(blocks), len(blocks) - len(done))
+                url, pipeline, scene_s, executor.threads, len(cut), len(cut) - len(done))
         if begun is None:
             if overwrite and exists(url):
                 lifecycle.remove_store(url)
-            begun = lifecycle.create_store(url, pipeline, blocks.extents)
+            begun = lifecycle.create_store(url, pipeline, cut.extents)
         if stricter:
             begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
@@ -197,7 +189,7 @@ def recompute(
         If blocks failed.
     """
     _check_arguments(workers, None, None, None, time_limit_s)
-    each_s = forecast.scene_s_of(store, committed(store)) * len(store.blocks[0])
+    each_s = forecast.scene_s_of(store, blocks.committed(store)) * len(store.blocks[0])
     limit_s = forecast.block_time_limit_s(time_limit_s, each_s)
     with (
         Interrupts() as interrupts, Child(BLOCK_TASK) as child,
@@ -230,7 +222,7 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     if overwrite:
         # It is deleted once everything else is known to work, just before the new one is made.
         storage = open_storage(url, "r+")
-        lifecycle.read_run_metadata(url, storage)
+        lifecycle.read_root(url, storage)
         with changing(url, storage):
             return None
     store = lifecycle.open_store(url, "r+")
@@ -318,8 +310,8 @@ def compute(
     failed: list[tuple[str, bool]] = []
 
     def task(work: Work) -> tuple[Any, ...]:
-        blocks = [store.blocks[number] for number in work.numbers]
-        return (url, store.run_id, blocks, work.decision, sources, time_limit_s)
+        some = [store.blocks[number] for number in work.numbers]
+        return (url, store.run_id, some, work.decision, sources, time_limit_s)
 
     def count(receipt: Receipt) -> None:
         detected = sum(receipt.detection[DetectionStatus.detected :][:1])
@@ -337,7 +329,7 @@ def compute(
         progress(Progress(committed_so_far["scenes"], pipeline.size(Stage.scene),
                           committed_so_far["detected"], **waves))
 
-    for _, receipt in receipts(store, waiting.current):
+    for _, receipt in blocks.receipts(store, waiting.current):
         count(receipt)
     report()
     with contextlib.closing(executor.map(waiting, task, time_limit_s, interrupts)) as results:
@@ -372,21 +364,22 @@ def _raise_failed(url: str, failed: Sequence[tuple[str, bool]]) -> None:
 
 def _check_same_rule(store: RunStore) -> None:
     """Raise StoreError if another process gave the store another rule, as it may on S3."""
-    if lifecycle.read_attributes(store.url, store.storage)["pipeline"] != store.pipeline.text:
+    attributes, _ = lifecycle.read_root(store.url, store.storage)
+    if attributes["pipeline"] != store.pipeline.text:
         raise StoreError(f"{store.url}: another run has changed when its sampling stops")
 
 
 def _committed_whole(store: RunStore) -> set[int]:
     """Return the blocks that are committed; drop those of which chunks are missing, and say so."""
-    done = committed(store)
-    if missing := missing_chunks(store, done):
+    done = blocks.committed(store)
+    if missing := blocks.missing_chunks(store, done):
         number, key = next(iter(missing.items()))
         notice(
             f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of block "
             f"{number}, as in a copy that was made during a run; they are computed again"
         )
         for number in missing:
-            drop_block(store, store.blocks[number])
+            blocks.drop_block(store, store.blocks[number])
     return done - missing.keys()
 
 

@@ -15,23 +15,13 @@ import numpy as np
 
 from sweep.evaluation.block import bound_notes
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
-from sweep.experiment.grid import Axis
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
 from sweep.messages import plain
 from sweep.processor import differing_processors
-from sweep.store.blocks import (
-    MAX_PER_BLOCK,
-    FailedCell,
-    Receipt,
-    RunStore,
-    check_not_replaced,
-    check_whole,
-    committed,
-    drop_block,
-    receipts,
-)
+from sweep.store import blocks
+from sweep.store.blocks import FailedCell, Receipt, RunStore
 from sweep.store.lifecycle import finish, open_store, reopen
 from sweep.store.lock import changing, is_written
 
@@ -101,7 +91,7 @@ class Totals:
         totals.processors.update(counts.get("processors") or {})
         if any(totals.lost.values()):
             listed = Totals()
-            for _, receipt in receipts(store, committed(store)):
+            for _, receipt in blocks.receipts(store, blocks.committed(store)):
                 listed.add(receipt)
             totals.cells = listed.cells
         return totals
@@ -321,9 +311,9 @@ def close(store: RunStore) -> None:
     StoreError
         If a receipt is damaged, a chunk is missing, or the store cannot be written.
     """
-    check_not_replaced(store)
+    blocks.check_not_replaced(store)
     totals, costs = Totals(), {}
-    for number, receipt in receipts(store, check_whole(store, finished=True)):
+    for number, receipt in blocks.receipts(store, blocks.check_whole(store, finished=True)):
         totals.add(receipt)
         if receipt.seconds["scene"]:
             costs[number] = receipt.seconds
@@ -352,44 +342,30 @@ def _failure_table(totals: Totals) -> xr.Dataset:
         {name: column(name) for name in ("at", "kind", "stage", "text")},
         attrs={
             "long_name": "scenes that raised or ended their process",
-            "rows_kept": f"at most {MAX_ROWS} of each kind, and {MAX_PER_BLOCK} of a block",
+            "rows_kept": f"at most {MAX_ROWS} of each kind, and {blocks.MAX_PER_BLOCK} of a block",
             **{f"{kind}_cells": count for kind, count in totals.lost.items()},
         },
     )
 
 
-def _cost(
-    store: RunStore, blocks: Mapping[int, Mapping[str, Sequence[float]]]
-) -> xr.Dataset:
+def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -> xr.Dataset:
     """Return the cost group: seconds of each block per stage and configuration."""
     import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
 
-    pipeline = store.pipeline
-    settings = list(pipeline.axes_of(Stage.detection))
-    both = [*settings, *pipeline.axes_of(Stage.estimation)]
-
-    def shaped(values: list[Any], axes: list[Axis]) -> Any:
-        return np.asarray(values, dtype=np.float64).reshape(
-            (len(blocks), *(len(axis) for axis in axes))
-        )
-
+    settings = store.pipeline.axes_of(Stage.detection)
+    both = [*settings, *store.pipeline.axes_of(Stage.estimation)]
+    seconds = {
+        f"{stage}_s": (("block", *(axis.name for axis in axes)), np.array(
+            [each[stage] for each in costs.values()], dtype=np.float64,
+        ).reshape(len(costs), *map(len, axes)))
+        for stage, axes in (("scene", ()), ("detection", settings), ("estimation", both))
+    }
+    coordinates = {axis.name: axis.coordinates() for axis in both}
     return xr.Dataset(
-        {
-            "scene_s": (("block",), shaped([s["scene"][0] for s in blocks.values()], [])),
-            "detection_s": (
-                ("block", *(axis.name for axis in settings)),
-                shaped([s["detection"] for s in blocks.values()], settings),
-            ),
-            "estimation_s": (
-                ("block", *(axis.name for axis in both)),
-                shaped([s["estimation"] for s in blocks.values()], both),
-            ),
-        },
-        coords={
-            "block": list(blocks),
-            **{axis.name: axis.coordinates().astype(object)
-               if axis.coordinates().dtype.kind == "T" else axis.coordinates() for axis in both},
-        },
+        seconds,
+        coords={"block": list(costs), **{
+            name: values.astype(object) if values.dtype.kind == "T" else values
+            for name, values in coordinates.items()}},
         attrs={"long_name": "seconds per stage and treatment for each block"},
     )
 
@@ -407,9 +383,9 @@ def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict
     StoreError
         If a receipt is damaged.
     """
+    chosen = blocks.committed(store) if numbers is None else numbers
     return {
-        number: count
-        for number, receipt in receipts(store, committed(store) if numbers is None else numbers)
+        number: count for number, receipt in blocks.receipts(store, chosen)
         if (count := sum(_lost(receipt.detection, receipt.estimate).values()))
     }
 
@@ -434,7 +410,7 @@ def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
         if failed and store.finished:
             reopen(store)
         for number in failed:
-            drop_block(store, store.blocks[number])
+            blocks.drop_block(store, store.blocks[number])
     return open_store(store.url, "r+"), failed
 
 
@@ -637,7 +613,7 @@ def status(url: str) -> Status:
     """
     store = open_store(url)
     totals, written = Totals(), []
-    for _, receipt in receipts(store, check_whole(store)):
+    for _, receipt in blocks.receipts(store, blocks.check_whole(store)):
         totals.add(receipt)
         written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
     poses = store.pipeline.size(Stage.scene)
@@ -687,12 +663,12 @@ class WrittenBlock:
     scenes: int
 
 
-def poses_per_second(blocks: Iterable[WrittenBlock]) -> float | None:
+def poses_per_second(finished: Iterable[WrittenBlock]) -> float | None:
     """Return the rate at the last of some blocks, None if it is not known.
 
     Parameters
     ----------
-    blocks
+    finished
         Committed blocks, in any order.
 
     Examples
@@ -700,7 +676,7 @@ def poses_per_second(blocks: Iterable[WrittenBlock]) -> float | None:
     >>> poses_per_second([WrittenBlock(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
     50.0
     """
-    written = list(blocks)
+    written = list(finished)
     if not written:
         return None
     last = max(block.at for block in written)

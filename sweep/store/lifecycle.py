@@ -45,15 +45,8 @@ from sweep.experiment.schema import (
 from sweep.messages import plain, refusal
 from sweep.model.image_file import IMAGE_SUFFIXES, read_regular
 from sweep.plugins.declared import RECORDED, recorded_plugins
-from sweep.store import files, locations
-from sweep.store.blocks import (
-    BEGUN,
-    RunStore,
-    check_not_replaced,
-    check_whole,
-    committed,
-    run_metadata_in,
-)
+from sweep.store import blocks, files, locations
+from sweep.store.blocks import RunStore
 from sweep.store.lock import changing, is_written
 from sweep.store.provenance import environment, fingerprint
 
@@ -306,7 +299,7 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     store = open_unchecked(url, mode)
     # Tables may be written at this moment, and blocks do not need them.
     for key, fault in changed_files(store, read_listed(store, tables=False)).items():
-        check_not_replaced(store)
+        blocks.check_not_replaced(store)
         raise StoreError(
             f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
     return store
@@ -316,9 +309,8 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
     """Open a store that may be damaged; StoreError if its pipeline is lost."""
     url = locations.checked_url(url)
     storage = locations.open_storage(url, mode)
-    attributes = read_attributes(url, storage)
+    attributes, metadata = read_root(url, storage)
     try:
-        metadata = run_metadata_in(attributes)
         if metadata["format"] != FORMAT:
             raise StoreError(
                 f"{url}: store format {metadata['format']!r}, this version of sweep has format "
@@ -331,37 +323,18 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
             source=f"{url} (its pipeline)", folder=metadata["folder"],
             files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
-        blocks = Blocks(
+        cut = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
         group = locations.open_group(storage, mode)
-        return RunStore(url, group, pipeline, metadata["run_id"], blocks)
+        return RunStore(url, group, pipeline, metadata["run_id"], cut)
     except UNREADABLE:
         raise StoreError(locations.not_a_store(url)) from None
 
 
-def read_attributes(url: str, storage: Store) -> dict[str, Any]:
-    """Return the attributes of a storage's root.
+def read_root(url: str, storage: Store) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the attributes of the root of a store, and the run's metadata, which are among them.
 
-    Raises
-    ------
-    StoreError
-        If there are none.
-    """
-    try:
-        root = files.read_json(storage, "zarr.json") or {}
-        return dict(root["attributes"])
-    except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {locations.reason_of(error)}") from None
-    except UNREADABLE:
-        if files.list_folder(storage, files.RECEIPTS):
-            raise StoreError(
-                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
-            ) from None
-        raise StoreError(locations.not_a_store(url)) from None
-
-
-def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
-    """Return the run's metadata of a store that may be damaged or of another format.
+    The store may be damaged, or of another format.
 
     Raises
     ------
@@ -369,8 +342,15 @@ def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
         If it is not a store.
     """
     try:
-        return run_metadata_in(read_attributes(url, storage))
+        root = files.read_json(storage, "zarr.json") or {}
+        return root["attributes"], blocks.run_metadata_in(root["attributes"])
+    except PermissionError as error:
+        raise StoreError(f"{url}: cannot be read: {locations.reason_of(error)}") from None
     except UNREADABLE:
+        if files.list_folder(storage, files.RECEIPTS):
+            raise StoreError(
+                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
+            ) from None
         raise StoreError(locations.not_a_store(url)) from None
 
 
@@ -502,7 +482,7 @@ def remove_store(url: str) -> None:
         If something else lies there, another process writes it, or it cannot be deleted.
     """
     storage = locations.open_storage(url, "r+")
-    metadata = read_run_metadata(url, storage)
+    _, metadata = read_root(url, storage)
     with locations.translate_errors(url, "overwritten"):
         if locations.is_remote(url):
             pointer = locations.storage_at(url, read_only=False)
@@ -552,7 +532,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
     finished = store.finished
-    done = check_whole(store, finished=finished)
+    done = blocks.check_whole(store, finished=finished)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
@@ -666,7 +646,7 @@ def _write_groups(
     contents = {key: content for key, content in files.files_in(memory).items()
                 if key.startswith(within)}
     with locations.translate_errors(store.url, "written"):
-        files.sync(store.storage.delete_dir(BEGUN))
+        files.sync(store.storage.delete_dir(blocks.BEGUN))
         files.write_files(store.storage, contents)
         write_root(store, {**metadata, "files": metadata["files"] | checksums(contents)})
 
@@ -703,11 +683,11 @@ def unfinished_line(store: RunStore) -> str:
 
     A run continues one that no process writes.
     """
-    done, blocks = len(committed(store)), len(store.blocks)
+    done, total = len(blocks.committed(store)), len(store.blocks)
     after = "`sweep run` continues it"
     if is_written(store.storage):
         after = "it is being written: wait until it is finished"
-    return f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; {after}"
+    return f"{store.url}: unfinished: {done:,} of {total:,} blocks; {after}"
 
 
 def open_finished(url: str) -> RunStore:

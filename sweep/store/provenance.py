@@ -163,8 +163,8 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     if [axis.name for axis in ours.axes] != [axis.name for axis in theirs.axes]:
         lines.append(f"axes: the store has {_names(theirs)}, this run {_names(ours)}")
     lines += [
-        f"axes.{axis.name}: the store has {_values(other.values)}, "
-        f"this run {_values(axis.values)}"
+        f"axes.{axis.name}: the store has {excerpt(other.values)}, "
+        f"this run {excerpt(axis.values)}"
         for axis in ours.axes
         if (other := theirs.axis(axis.name)) is not None
         and not (
@@ -199,7 +199,8 @@ def _names(pipeline: Pipeline) -> str:
     return ", ".join(axis.name for axis in pipeline.axes) or "none"
 
 
-def _values(values: Any) -> str:
+def excerpt(values: Any) -> str:
+    """Return values, or the first and the last of many, as a text."""
     if len(values) <= 6:
         return ", ".join(str(value) for value in values)
     return f"{values[0]}, {values[1]}, ... {values[-1]} ({len(values):,} values)"

@@ -65,9 +65,8 @@ def test_stopped_run_in_other_blocks_continues_and_finished_one_is_left_alone(
     pipeline, undisturbed, tmp_path
 ):
     url = str(tmp_path / "stopped.zarr")
-    store = create_store(url, pipeline, (1, 3, 2, 2))
-    for number in (0, 1, 2, 0):  # a block that is computed twice is harmless
-        compute_block(url, store.run_id, store.blocks[number])
+    # A block that is computed twice is harmless.
+    store = by_hand(url, pipeline, (1, 3, 2, 2), (0, 1, 2, 0))
     assert committed(store) == {0, 1, 2}
     assert not open_store(url).finished
     summary = execute(pipeline, url)
@@ -165,8 +164,7 @@ def test_parameters_that_go_together_are_coordinates_and_pairs_are_not_mixed(tmp
 
 def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
     part = str(tmp_path / "part.zarr")
-    store = create_store(part, pipeline, (1, 4, 2, 3))
-    compute_block(part, store.run_id, next(iter(store.blocks)))
+    by_hand(part, pipeline, (1, 4, 2, 3), [0])
     new = str(tmp_path / "new.zarr")
     summary = execute(pipeline, new, reuse=[part])
     assert summary.computed_scenes == 24
@@ -257,13 +255,11 @@ def test_nothing_is_overwritten_by_a_run_that_cannot_be(pipeline, tmp_path):
 
 def test_task_of_a_replaced_store_writes_nothing(pipeline, tmp_path):
     url = str(tmp_path / "replaced.zarr")
-    old = create_store(url, pipeline, (2, 4, 2, 3))
-    block = next(iter(old.blocks))
-    compute_block(url, old.run_id, block)
+    old = by_hand(url, pipeline, (2, 4, 2, 3))
     remove_store(url)
     new = create_store(url, Pipeline.from_text(TEXT, ["seed=8"], name="other"), (2, 4, 2, 3))
     with pytest.raises(StoreError, match="replaced by another run"):
-        compute_block(url, old.run_id, block)
+        compute_block(url, old.run_id, old.blocks[0])
     assert committed(new) == set()
 
 
@@ -294,21 +290,20 @@ def test_background_axis_of_levels_and_images(tmp_path):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
 
 
-WITH_DRAWS = {
-    "seed": 5,
-    "camera": {"fx_px": 500},
-    "marker": {"size_m": 0.05},
-    "pose": {
-        "side_px": {"uniform": [25, 60]},
-        "tilt_deg": {"uniform": [0, 60]},
-        "roll_deg": {"normal": [0, 40]},
-        "bearing_x_deg": {"uniform": [-10, 10]},
-        "jitter_px": 0.5,
-    },
-    "scene": {"background": 255, "noise_grey": {"uniform": [0, 4]}},
-    "estimator": {"believed_fx_px": {"normal": [500, 5]}},
-    "axes": {"azimuth_deg": [0, 30], "trial": 40},
-}
+WITH_DRAWS = """
+seed = 5
+camera = { fx_px = 500 }
+marker = { size_m = 0.05 }
+scene = { background = 255, noise_grey = { uniform = [0, 4] } }
+estimator = { believed_fx_px = { normal = [500, 5] } }
+axes = { azimuth_deg = [0, 30], trial = 40 }
+[pose]
+side_px = { uniform = [25, 60] }
+tilt_deg = { uniform = [0, 60] }
+roll_deg = { normal = [0, 40] }
+bearing_x_deg = { uniform = [-10, 10] }
+jitter_px = 0.5
+"""
 DRAWN = {
     "side_px", "tilt_deg", "roll_deg", "bearing_x_deg", "noise_grey", "believed_fx_px",
     "distance_m", "jitter_u_px", "jitter_v_px",
@@ -318,7 +313,7 @@ DRAWN = {
 @pytest.fixture(scope="module")
 def url(tmp_path_factory):
     url = str(tmp_path_factory.mktemp("drawn") / "drawn.zarr")
-    by_hand(url, sweep.Pipeline.from_dict(WITH_DRAWS))
+    by_hand(url, Pipeline.from_text(WITH_DRAWS))
     return url
 
 

@@ -29,12 +29,9 @@ from sweep.store.blocks import MAX_CHARACTERS, MAX_PER_BLOCK, recorded
 TEXT = """
 title = "Scenes to be seen again"
 seed = 11
-[marker]
-size_m = 0.04
-[pose]
-jitter_px = 0.5
-[scene]
-background = 128
+marker = { size_m = 0.04 }
+pose = { jitter_px = 0.5 }
+scene = { background = 128 }
 [axes]
 distance_m = [0.2, 0.4]
 cornerRefinementMethod = ["none", "subpix"]
@@ -228,15 +225,9 @@ def search(settings, family):
 """
 
 CHANGING = """
-[pose]
-side_px = {{ uniform = [40, 60] }}
-tilt_deg = 30
-azimuth_deg = 40
-[detector]
-detector = "{detector}"
-[axes]
-solver = {solvers}
-trial = 12
+pose = {{ side_px = {{ uniform = [40, 60] }}, tilt_deg = 30, azimuth_deg = 40 }}
+detector = {{ detector = "{detector}" }}
+axes = {{ solver = {solvers}, trial = 12 }}
 """
 
 

@@ -30,13 +30,9 @@ from sweep.store.lifecycle import create_store, open_store
 TEXT = """
 title = "Größen, klein"
 seed = 7
-[marker]
-size_m = 0.04
-[pose]
-jitter_px = 0.5
-azimuth_deg = { uniform = [0, 360] }
-[scene]
-background = 128
+marker = { size_m = 0.04 }
+pose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }
+scene = { background = 128 }
 [axes]
 side_px = [30, 60, 4]
 cornerRefinementMethod = ["none", "subpix"]
@@ -404,25 +400,23 @@ def test_array_whose_metadata_was_changed_is_refused(change, copied, capsys):
     see_refused(copied, capsys)
 
 
-@pytest.mark.parametrize("change", [
-    lambda attributes, _: attributes.update(pipeline="\x00\x1b[2J"),
-    lambda _, metadata: metadata.update(fingerprint=5),
+@pytest.mark.parametrize(("attributes", "metadata"), [
+    ({"pipeline": "\x00\x1b[2J"}, {}), ({}, {"fingerprint": 5}), ({}, {"format": 7}),
+    ({}, {"format": None}),
 ])
-def test_root_of_something_else_is_refused(change, copied, capsys):
-    edit_root(copied, change)
+def test_root_of_something_else_or_of_another_format_is_refused(
+    attributes, metadata, copied, tmp_path, capsys
+):
+    edit_root(copied, lambda a, m: (a.update(attributes), m.update(metadata)))
     see_refused(copied, capsys)
-
-
-@pytest.mark.parametrize("number", [7, None])
-def test_store_of_another_format_is_refused_with_what_to_do(number, copied, tmp_path, capsys):
-    edit_root(copied, lambda _, metadata: metadata.update(format=number))
-    see_refused(copied, capsys)
+    if "format" not in metadata:
+        return
     file = tmp_path / "small.toml"
     file.write_text(TEXT)
     for more in (["--store", str(copied)], ["--reuse", str(copied), "--store", f"{tmp_path}/n"]):
         assert main(["run", str(file), *more]) == 2
         line = capsys.readouterr().err.splitlines()[-1]
-        assert line.startswith(f"{copied}: store format {number}")
+        assert line.startswith(f"{copied}: store format {metadata['format']}")
         assert "sweep run PIPELINE --store NEW" in line
 
 

@@ -192,9 +192,6 @@ def test_scenes_that_end_or_stall_their_process_are_found_and_no_other_is_touche
     claim("other results of 48 to 10,000 scenes of which some end or stall their process",
           "a run without them", 0.0, "bits differ")
 
-
-
-
 PLUGINS = '''
 import os
 from pathlib import Path
@@ -233,18 +230,10 @@ SOLVER = EstimatorPlugin(make=lambda _: solve, meaning="upright")
 
 CHANCE = """
 seed = 7
-[camera]
-width_px = 128
-height_px = 96
-[marker]
-size_m = 0.05
-[pose]
-side_px = 48
-jitter_px = 0.5
-[axes]
-detector = ["opencv"]
-solver = ["ippe_square"]
-trial = 3
+camera = { width_px = 128, height_px = 96 }
+marker = { size_m = 0.05 }
+pose = { side_px = 48, jitter_px = 0.5 }
+axes = { detector = ["opencv"], solver = ["ippe_square"], trial = 3 }
 """
 
 

@@ -17,11 +17,8 @@ from sweep.store.blocks import drop_block
 
 TEXT = """
 title = "Exported"
-[pose]
-jitter_px = 0.5
-roll_deg = { uniform = [0, 360] }
-[estimator]
-corner_noise_px = 0.3
+pose = { jitter_px = 0.5, roll_deg = { uniform = [0, 360] } }
+estimator = { corner_noise_px = 0.3 }
 [axes]
 dictionary = ["DICT_4X4_50", "DICT_5X5_50"]
 side_px = [5, 60]

@@ -31,29 +31,15 @@ from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 seed = 3
-[pose]
-side_px = 40
-jitter_px = 0.5
-[scene]
-noise_grey = 1
-black = 40
-white = 200
-background = 128
-bound = "known_blur"
-[axes]
-trial = 4
-solver = ["ippe_square", "iterative"]
+pose = { side_px = 40, jitter_px = 0.5 }
+scene = { noise_grey = 1, black = 40, white = 200, background = 128, bound = "known_blur" }
+axes = { trial = 4, solver = ["ippe_square", "iterative"] }
 """
 
 GRID = """
 seed = 3
-[pose]
-jitter_px = 0.5
-tilt_deg = { uniform = [0, 60] }
-[axes]
-side_px = [30, 60]
-solver = ["ippe_square", "iterative"]
-trial = 4
+pose = { jitter_px = 0.5, tilt_deg = { uniform = [0, 60] } }
+axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 4 }
 """
 
 EXTENTS = (1, 2)
@@ -105,8 +91,7 @@ def test_reader_between_any_two_writes_of_a_block_sees_no_flag_without_its_numbe
     work, pipeline, tmp_path, monkeypatch
 ):
     url = str(tmp_path / "read.zarr")
-    store = create_store(url, pipeline, (2,))
-    compute_block(url, store.run_id, store.blocks[0])
+    store = by_hand(url, pipeline, (2,), [0])
     copies, lock = [], threading.Lock()
 
     def watched(function):
@@ -136,8 +121,7 @@ def test_reader_between_any_two_writes_of_a_block_sees_no_flag_without_its_numbe
 
 def test_opened_store_shows_the_blocks_that_were_committed_when_it_was_opened(pipeline, tmp_path):
     url = str(tmp_path / "read.zarr")
-    store = create_store(url, pipeline, (2,))
-    compute_block(url, store.run_id, store.blocks[0])
+    store = by_hand(url, pipeline, (2,), [0])
     # A process that was killed in the midst of a block left a chunk of it.
     editable(url, "estimate")[2:] = np.ones((2, 2), dtype=np.uint8)
     with pickle.loads(pickle.dumps(sweep.open(url))) as results:  # noqa: S301

@@ -23,10 +23,10 @@ trial = 8
 """A grid of 96 scenes with axes of every stage."""
 
 
-def by_hand(url, pipeline, extents=None):
+def by_hand(url, pipeline, extents=None, numbers=None):
     """Compute a store in this process, without a cluster; as one block unless extents are given.
 
-    In waves, extents are such that a block is of one wave.
+    In waves, extents are such that a block is of one wave. With ``numbers``, these blocks alone.
     """
     rule = make_rule(pipeline)
     lengths = tuple(
@@ -35,8 +35,8 @@ def by_hand(url, pipeline, extents=None):
     )
     store = create_store(url, pipeline, extents or lengths)
     if rule is None:
-        for block in store.blocks:
-            compute_block(url, store.run_id, block)
+        for number in range(len(store.blocks)) if numbers is None else numbers:
+            compute_block(url, store.run_id, store.blocks[number])
     else:
         in_waves(store)
     return store

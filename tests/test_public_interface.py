@@ -12,6 +12,7 @@ import pytest
 
 import sweep
 from support.board_photographs import POSES, write_set
+from support.here import calls_here
 from sweep import library
 from sweep.errors import ArgumentError, SweepError
 from sweep.execution.progress import progress_report
@@ -60,6 +61,7 @@ def test_every_public_function_says_what_it_takes_returns_and_raises(name):
     assert sorted(", ".join(named).split(", ")) == sorted({*taken, *options} - {"options"})
 
 
+@pytest.mark.system
 def test_the_example_of_every_public_function_runs(tmp_path):
     """All in one folder: below half a minute."""
     write_set(tmp_path, POSES[:3])
@@ -70,7 +72,8 @@ def test_the_example_of_every_public_function_runs(tmp_path):
         inside = vars(sys.modules[function.__module__])
         (test,) = finder.find(function, globs=inside | {"sweep": sweep, "folder": tmp_path})
         assert test.examples
-        assert runner.run(test).failed == 0, name
+        with calls_here():
+            assert runner.run(test).failed == 0, name
 
 
 def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):

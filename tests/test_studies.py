@@ -16,11 +16,9 @@ import pytest
 from scipy.stats import binom, binomtest
 
 import sweep
-from support.stores import by_hand
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
-from sweep.measure.flags import EstimateStatus
 from sweep.model.marker import modules
 
 TOP = Path(__file__).parents[1]
@@ -159,20 +157,6 @@ def test_the_pipelines_can_be_read(name):
     for module in NEEDS[name]:
         pytest.importorskip(module)
     assert Pipeline.from_toml(PUBLISHED / f"{name}.toml").size(*Stage) > 1
-
-
-@pytest.mark.long
-def test_the_errors_in_fmac_s_box_are_those_of_the_page(tmp_path):
-    pipeline = Pipeline.from_toml(PUBLISHED / "fmac.toml", [
-        "trial=3200", "dictionary=DICT_6X6_250", "cornerRefinementMethod=none"])
-    by_hand(str(tmp_path / "fmac.zarr"), pipeline)
-    results = sweep.open(tmp_path / "fmac.zarr")
-    solved = (results.estimate == EstimateStatus.solved).values
-    assert solved.mean() > 0.999
-    errors = 1e3 * results.translation_error_m.values[solved].astype(float)
-    # Ten standard deviations of a standard deviation of 3,200 heavy-tailed numbers are about 20 %.
-    np.testing.assert_allclose(errors.std(axis=0), [4.6, 3.4, 12.8], rtol=0.2)
-    assert 14 < errors[:, 2].mean() < 22
 
 
 def test_the_page_has_the_register_s_table():

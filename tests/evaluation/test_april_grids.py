@@ -30,14 +30,12 @@ def run(settings, shape=(3, 3, 3), board=GRID):
 
 
 def test_the_named_setting_finds_what_the_default_loses():
-    default, named = run([]), run(FOUND)
+    default, named = (run(settings) for settings in ([], FOUND))
     lost = default["detection"] != DetectionStatus.detected
     assert lost.sum() >= 5
     assert (named["detection"] == DetectionStatus.detected).all()
-    found = [(each["marker_detection"] == DetectionStatus.detected).mean()
-             for each in (default, named)]
-    assert found[0] < 0.5
-    assert found[1] > 0.75
+    assert (default["marker_detection"] == DetectionStatus.detected).mean() < 0.5
+    assert (named["marker_detection"] == DetectionStatus.detected).mean() > 0.75
     solved = named["estimate"] == EstimateStatus.solved
     assert solved.mean() > 0.9
     # A board whose markers have other IDs or another turn than the picture fits nowhere.

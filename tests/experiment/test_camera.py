@@ -3,7 +3,6 @@
 Files of OpenCV, ROS, Kalibr and PhotonVision are read to the last digit, or refused.
 """
 
-import itertools
 import json
 import math
 import tomllib
@@ -86,38 +85,7 @@ def test_choosing_one_way_to_give_a_camera_drops_the_others(camera, setting, lef
     assert cell(pipeline(camera), setting).fixed == chosen.fixed
 
 
-def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
-    axes = {
-        "hfov_deg": [40.0, 60.0], "width_px": [640, 1280], "height_px": [480, 720],
-        "side_px": [20.0, 50.0],
-    }
-    grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
-    lengths = [len(axis) for axis in grid.experiment.scene_axes]
-    values = grid.experiment.scene_values([index.ravel() for index in np.indices(lengths)])
-    fx, fy, _, _ = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))
-    for k, chosen in enumerate(itertools.product(*axes.values())):
-        camera = dict(zip(("hfov_deg", "width_px", "height_px"), chosen[:3], strict=True))
-        assert [fx[k], fy[k]] == view(camera)[:2]
-        alone = Pipeline.from_dict(
-            {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
-        )
-        distance = alone.experiment.scene_values([])["distance_m"].values
-        assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
-
-
 # 2. What is told.
-
-def test_sides_of_a_board_s_markers_are_their_own():
-    # 600 · 0.01 / 2 and 600 · 0.04 / 1 px; the size of [marker] is that of no marker.
-    board = Pipeline.from_dict({
-        "camera": {"fx_px": 600}, "estimator": {"solver": "sqpnp"}, "marker": {"size_m": 0.5},
-        "board": {"kind": "markers", "markers": [
-            {"marker_id": 0, "x_m": 0, "y_m": 0, "size_m": 0.04},
-            {"marker_id": 1, "x_m": 0.1, "y_m": 0, "size_m": 0.01},
-        ]}, "axes": {"distance_m": [1, 2]},
-    })
-    assert board.facts.camera["side_px"] == pytest.approx((3, 24))
-    assert "the markers' sides are 3 to 24 px" in board.facts.camera_line
 
 
 @pytest.mark.parametrize(("sections", "line"), [

@@ -14,20 +14,13 @@ from sweep.store.provenance import fingerprint
 
 # A draw is a function of (seed, quantity, geometry, trial), and of nothing else.
 
-DRAWN = """
-seed = 2020
-[marker]
-size_m = 0.04
-[pose]
-jitter_px = 0.5
-tilt_deg = { uniform = [0, 70] }
-azimuth_deg = { normal = [10, 5] }
-[axes]
-marker_id = [3, 0, 8]
-distance_m = [0.2, 0.5, 1.0]
-bearing_x_deg = [0, 7.5]
-trial = 4
-"""
+DRAWN = {
+    "seed": 2020, "marker": {"size_m": 0.04},
+    "pose": {"jitter_px": 0.5, "tilt_deg": {"uniform": [0, 70]},
+             "azimuth_deg": {"normal": [10, 5]}},
+    "axes": {"marker_id": [3, 0, 8], "distance_m": [0.2, 0.5, 1.0], "bearing_x_deg": [0, 7.5],
+             "trial": 4},
+}
 ORDER = ("marker_id", "distance_m", "bearing_x_deg", "trial")
 QUANTITIES = ("shift_u_px", "shift_v_px", "tilt_deg", "azimuth_deg")
 
@@ -37,9 +30,9 @@ def whole(pipeline):
     return Block((0,) * len(shape), shape)
 
 
-def drawn(*settings, text=DRAWN, order=ORDER, take=None):
+def drawn(*settings, document=DRAWN, order=ORDER, take=None):
     """Return every quantity's draws over the grid, dimensions in ``order``, cut by ``take``."""
-    pipeline = Pipeline.from_text(text, settings)
+    pipeline = Pipeline.from_dict(document, settings)
     axes = {axis.name: axis for axis in pipeline.experiment.scene_axes}
     block = whole(pipeline)
     values = pipeline.experiment.scene_values(block.indices())
@@ -102,21 +95,16 @@ def test_draws_depend_on_seed_and_geometry(settings):
         assert (changed[name] != expected[name]).all(), name
 
 
-MANY = """
-seed = 5
-[pose]
-distance_m = 0.5
-jitter_px = 0.5
-tilt_deg = { normal = [30, 4] }
-[axes]
-marker_id = [0, 1]
-"""
+MANY = {
+    "seed": 5, "axes": {"marker_id": [0, 1]},
+    "pose": {"distance_m": 0.5, "jitter_px": 0.5, "tilt_deg": {"normal": [30, 4]}},
+}
 
 
 @lengths(10_000, 200_000)
 def test_draws_are_uniform_normal_and_independent(count):
     """Each assertion would fail one generator in a million that is right; the seed is fixed."""
-    draws = drawn(f"trial={count}", text=MANY, order=("marker_id", "trial"))
+    draws = drawn(f"trial={count}", document=MANY, order=("marker_id", "trial"))
     u, v, tilt = (draws[name][0] for name in ("shift_u_px", "shift_v_px", "tilt_deg"))
     other = draws["shift_u_px"][1]
     for column in (u, v, other):
@@ -137,7 +125,7 @@ def test_draws_are_uniform_normal_and_independent(count):
 def test_jitter_moves_the_undistorted_projection_of_the_centre_by_the_shift(distortion):
     settings = [f"distortion={distortion}", "bearing_y_deg=-4", "fx_px=700", "fy_px=650",
                 "cx_px=300.25", "cy_px=260"]
-    pipeline = Pipeline.from_text(DRAWN, settings)
+    pipeline = Pipeline.from_dict(DRAWN, settings)
     block = whole(pipeline)
     values = pipeline.experiment.scene_values(block.indices())
     truth = run_block(pipeline, block).values["true_tvec_m"].reshape(-1, 3)

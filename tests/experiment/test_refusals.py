@@ -136,12 +136,9 @@ BROKEN = [
     ("[detector]\ncornerRefinementMethod = 1", "OpenCV's constant 1 is subpix"),
     ("[marker]\ndictionary = 4", "OpenCV's constant 4 is DICT_5X5_50"),
     ('[estimator]\nsolver = "ippe_sqare"', "did you mean ippe_square?"),
-    ("[pose]\nTilt_Deg = 3", "did you mean tilt_deg?"),
     ("[detector]\ncorner_refinement_method = 'subpix'", "did you mean cornerRefinementMethod?"),
-    ("[Pose]\ntilt_deg = 3", "did you mean pose?"),
     (("", "Tilt_Deg=3"), "did you mean tilt_deg?"),
     ((P, "tilt_deg"), "expected name=value"),
-    ((P, "tilt=3"), "unknown parameter; did you mean"),
     ((P, "tilt_deg=[0, 1"), "expected a TOML value"),
     ((P, "camera.tilt_deg=3"), "expected tilt_deg or pose.tilt_deg"),
     ((P, "solver=best"), 'estimator.solver = "best": expected one of'),
@@ -170,7 +167,6 @@ SECTIONS = [
          "pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"),
         *(({"hfov_deg": bad}, f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9")
           for bad in (180, 0)),
-        ({"fov_deg": 60}, "camera.fov_deg: unknown key; did you mean"),
     )),
     *(({"pose": pose}, [line]) for pose, line in (
         ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
@@ -220,8 +216,6 @@ NAMES = [
       for name in ("detection", "xyz", "jitter_u_px", "solved", "outcome", "cost")),
     ({"my lens": TOGETHER}, "letters, digits and underscores"),
     ({"tilt_deg": TOGETHER}, "an axis of tilt_deg alone"),
-    ({"trial": TOGETHER}, "a whole number from 1"),
-    ({"fx_px": [1], "lens": TOGETHER}, "axes.fx_px is given too"),
     ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
     ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
 ]

@@ -243,14 +243,6 @@ def test_a_store_is_read_without_its_plug_in(made, tmp_path, capsys):
         (tmp_path / "mine.py").rename(made / "mine.py")
 
 
-def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
-    store = str(made / "grid.zarr")
-    assert main(["verify", store, "--sample", "2"]) == 0
-    assert "recomputed" in capsys.readouterr().out
-    assert main(["repro", store, "--at", "tilt_deg=40,detector=mine:TURNED"]) == 0
-    assert "agrees with the store bit for bit" in capsys.readouterr().out
-
-
 FOG = """
 from dataclasses import dataclass
 from sweep.plugins import EffectPlugin, parameter

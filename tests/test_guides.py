@@ -1,26 +1,32 @@
-"""What the guides show is what the project does: blocks run, links lead somewhere, tables hold.
+"""What guides, notebooks and the README show is what the project does.
 
-A comment before a block says what is done with it: ``<!-- not run: why -->`` (its syntax and its
-flags are checked), ``<!-- file: NAME -->`` (it is written, for the blocks that follow), any other
-or none (it runs).
+Blocks run, links lead somewhere, tables hold. A comment before a block says what is done with it:
+``<!-- not run: why -->`` (its syntax and its flags are checked), ``<!-- file: NAME -->`` (it is
+written, for the blocks that follow), any other or none (it runs).
 """
 
 import ast
 import contextlib
 import io
+import os
 import re
+import runpy
 import shlex
 import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
+import nbformat
+import numpy as np
 import pytest
+from nbclient import NotebookClient
 
 from support.here import calls_here
 from sweep.cli import main
+from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import read_board
-from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline, cell
 from sweep.photographs.twins import read_scene
 
 TOP = Path(__file__).parent.parent
@@ -229,3 +235,128 @@ def test_files_and_names_of_the_architecture_exist():
                       for path in (TOP / folder).rglob("*.py"))
     for name in re.findall(r"`([A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)`", text):
         assert re.search(rf"\b{name}\b", sources), name
+
+# What the README shows is what the project does.
+
+@pytest.mark.parametrize("path", sorted((TOP / "pipelines").glob("*.toml")), ids=lambda p: p.stem)
+def test_every_pipeline_is_sound(path):
+    pipeline = Pipeline.from_toml(path)
+    assert pipeline.title
+    assert pipeline.size(*Stage) > 1
+
+
+def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):
+    smoke = str(TOP / "pipelines" / "smoke.toml")
+    at = "distance_m=0.3,tilt_deg=45"
+    for options in ([], ["--plain"], ["--full", "--plain"]):
+        assert main(["show", smoke, "--at", at, "-o", str(tmp_path / "a.png"), *options]) == 0
+        assert "detected, solved" in capsys.readouterr().out
+        assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["show", smoke, "--at", "tilt=3"]) == 2
+    assert "unknown parameter; did you mean tilt_deg?" in capsys.readouterr().err
+    assert main(["show", smoke, "--at", "marker_id=99"]) == 2
+    assert "expected IDs from 0 to 49" in capsys.readouterr().err
+    assert main(["show", smoke, "-o", "/proc/none/a.png"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_close_look_is_that_of_the_run():
+    pipeline = Pipeline.from_toml(TOP / "pipelines" / "smoke.toml")
+    windowed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"))
+    framed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"), whole_frame=True)
+    assert framed.image.shape == (480, 640)
+    left, top, right, bottom = windowed.window
+    np.testing.assert_array_equal(framed.image[top:bottom, left:right], windowed.image)
+    np.testing.assert_array_equal(framed.markers, windowed.markers)
+    assert windowed.errors["rotation_error_deg"] > 0
+
+
+def test_plan_says_what_a_run_takes(capsys):
+    smoke = str(TOP / "pipelines" / "smoke.toml")
+    assert main(["plan", smoke, "--set", "distance_m=[0.2, 0.3]"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"distance_m +2 +scene +0.2 ... 0.3 m", told)
+    assert re.search(r"poses +240", told)
+    assert re.search(r"time +(over )?\S+ (s|min|h)", told)
+
+# The notebooks run, show their figures, and are stored with the outputs of their sources.
+
+NOTEBOOKS = TOP / "notebooks"
+FIGURES = {"choosing_a_marker": 6, "paper_reproduced": 4, "first_analysis": 5}
+TIMEOUT_S = 300  # a cell, on a busy machine
+COSTS = {"choosing_a_marker": "## The recommendation"}
+"""The heading from which on a notebook prints times, which no two runs have alike."""
+
+source_digest = runpy.run_path(str(NOTEBOOKS / "make.py"))["source_digest"]
+
+
+def read(name):
+    return nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+
+
+def code_cells(notebook):
+    return [each for each in notebook.cells if each.cell_type == "code"]
+
+
+def test_all_notebooks_are_known():
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == set(FIGURES)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_notebook_is_stored_with_the_outputs_of_its_sources(name):
+    notebook = read(name)
+    nbformat.validate(notebook)
+    assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert len({each.id for each in notebook.cells}) == len(notebook.cells)
+    assert all(each.metadata == {} for each in notebook.cells)
+    assert notebook.metadata.sweep.source_digest == source_digest(notebook), (
+        f"python notebooks/make.py {name}")
+    numbers = [each.execution_count for each in code_cells(notebook)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert figures_of(notebook) == FIGURES[name]
+
+
+def figures_of(notebook):
+    """Return the number of figures, after checks of a notebook's outputs."""
+    shown = 0
+    for each in code_cells(notebook):
+        kinds = {output.output_type for output in each.outputs}
+        complaints = [output.text for output in each.outputs
+                      if output.output_type == "stream" and output.name == "stderr"
+                      and "pipelines/half_pixel" not in output.text]  # a note on the pipeline
+        images = [output for output in each.outputs
+                  if output.output_type == "display_data" and "image/png" in output.data]
+        assert "error" not in kinds
+        assert not complaints
+        assert len(images) == each.source.count("plt.show()"), each.source
+        shown += len(images)
+    return shown
+
+
+def printed(notebook, until):
+    """Return what the cells before the one that starts with ``until`` print."""
+    texts = []
+    for each in notebook.cells:
+        if until and each.source.startswith(until):
+            break
+        if each.cell_type == "code" and 'group="cost"' not in each.source:
+            texts += [output.text for output in each.outputs if output.output_type == "stream"]
+            texts += [output.data["text/plain"] for output in each.outputs
+                      if output.output_type == "execute_result"
+                      and "xarray.Dataset" not in output.data["text/plain"]]
+    return texts
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize("name", FIGURES)
+def test_notebook_runs_shows_its_figures_and_prints_again_what_is_stored(name, tmp_path):
+    """With the same versions and processor features; times are left out."""
+    notebook = read(name)
+    client = NotebookClient(notebook, timeout=TIMEOUT_S, kernel_name="python3",
+                            resources={"metadata": {"path": str(NOTEBOOKS)}})
+    client.execute(env=os.environ | {"SWEEP_RUNS": str(tmp_path)})
+    assert figures_of(notebook) == FIGURES[name]
+    assert list(tmp_path.glob("*.zarr")), "stores go where SWEEP_RUNS says"
+    until = COSTS.get(name)
+    assert printed(notebook, until) == printed(read(name), until)

@@ -1,15 +1,24 @@
-"""Boards of pipelines have the images of their parts, each clipped to each pixel."""
+"""Boards in scenes: images of their parts, each clipped to each pixel; distractors; AprilGrids."""
 
 import cv2
 import numpy as np
 import pytest
 
+from support.blocks import run_block, run_cells
 from support.board_pictures import KINDS, NAME, SIZE_M, clipped_frame, parts
 from support.lengths import first_of, lengths
 from support.small_scenes import image_of, scenes_of
+from sweep.evaluation.search import visibility_flags
+from sweep.experiment.grid import Block
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.classify import target_scenes
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.board import extent_of, in_space
 from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.renderers import marker_levels
+from sweep.model.scene import build_scenes
+
+# Boards of pipelines have the images of their parts, each clipped to each pixel.
 
 LEVELS = {"black": 20.3, "white": 230.1, "background": 90.4}
 SIZE = (96, 80)
@@ -175,3 +184,132 @@ def test_markers_outside_the_frame_widen_no_window(settings, z):
     assert np.abs(one - several).max() <= 3
     assert one[2] - one[0] < 0.7 * SIZE[0]
     np.testing.assert_array_equal(image_of(settings, text=alone), image_of(settings, text=many))
+
+# Distractors beside a target are in its image and in the search, and count for nothing else.
+
+SQUARES = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.01}
+BOARD_ID = {"marker_id": 2, "x_m": 0.11, "y_m": 0.0}
+SQUARE = {"x_m": -0.1, "y_m": 0.02, "size_m": 0.03, "roll_deg": 20.0}
+OTHER = {"marker_id": 30, "x_m": 0.0, "y_m": 0.1}
+BESIDE = [BOARD_ID, SQUARE, OTHER]
+
+
+def distracted(board, *settings, **sections):
+    return Pipeline.from_dict({
+        "seed": 5,
+        "camera": {"width_px": 320, "height_px": 240, "fx_px": 300, "fy_px": 300},
+        "marker": {"dictionary": "DICT_4X4_50", "size_m": 0.04, "quiet_zone_modules": 1},
+        "board": board,
+        "pose": {"distance_m": 0.35, **sections.pop("pose", {})},
+        "scene": {"background": 120, "black": 30, "white": 220, "blur_px": 0.5,
+                  **sections.pop("scene", {})},
+        "estimator": {"solver": "iterative", "guarded": False},
+        **sections,
+    }, settings=settings)
+
+
+def scene_of(chosen):
+    values = chosen.experiment.scene_values([])
+    return build_scenes(values, 1), values
+
+
+def one(chosen, name):
+    return run_cells(chosen, []).columns[name][0][0]
+
+
+@pytest.mark.parametrize("board", [SQUARES, {"kind": "none"}])
+def test_a_target_is_visible_and_as_large_as_without_distractors(board):
+    for pose in ({}, {"bearing_x_deg": -36.0}):
+        plain, beside = (
+            distracted({**board, **more}, pose=pose)
+            for more in (({} if board is SQUARES else {"distractors": [SQUARE]}),
+                         {"distractors": BESIDE})
+        )
+        assert beside.largest_board == plain.largest_board
+        for name in ("marker_area_px", "detection", "marker_detection", "board_marker_id"):
+            np.testing.assert_array_equal(one(beside, name), one(plain, name))
+    # At the last pose the frame shows the distractor with the board's ID alone.
+    assert one(beside, "detection") == DetectionStatus.not_visible
+
+
+def test_an_id_of_the_board_elsewhere_is_no_detection_of_its_marker():
+    """Marker 2 is hidden; what has its ID lies beside the board."""
+    chosen = distracted({
+        "kind": "markers", "markers": [
+            {"marker_id": 0, "x_m": -0.03, "y_m": 0.0}, {"marker_id": 2, "x_m": 0.03, "y_m": 0.0},
+        ], "distractors": [{**BOARD_ID, "x_m": -0.1}],
+    }, scene={"occlusion": 0.4, "occluder": 120})
+    flags = one(chosen, "marker_detection")
+    assert flags[0] == DetectionStatus.detected
+    assert flags[1] in (DetectionStatus.no_candidate, DetectionStatus.rejected)
+    # Solvers get both, as OpenCV's matchImagePoints takes them, and find no pose of these.
+    assert one(chosen, "estimate") == EstimateStatus.solver_failed
+
+
+@pytest.mark.parametrize(("beside", "tilt", "expected"), [
+    ([], 60.0, DetectionStatus.not_run),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 60.0, DetectionStatus.not_modelled),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45, "z_m": 0.02}], 60.0, DetectionStatus.not_run),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 120.0, DetectionStatus.not_visible),
+])
+def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(beside, tilt, expected):
+    chosen = distracted({**SQUARES, "distractors": beside}, pose={"tilt_deg": tilt})
+    scenes, values = scene_of(chosen)
+    flags = visibility_flags(scenes)
+    assert flags[0] == expected
+    boards = target_scenes(
+        scenes, flags, values["board"].listed(1), chosen.largest_board)
+    assert (boards.flags == expected).all()
+
+# AprilGrids in scenes: Kalibr's order, IDs of one's own, and what detects them.
+
+APRIL_GRID = {"kind": "aprilgrid", "tagCols": 4, "tagRows": 3, "tagSpacing": 0.3}
+
+
+def april_pipeline(settings=(), board=APRIL_GRID):
+    return Pipeline.from_dict({
+        "marker": {"dictionary": "DICT_APRILTAG_36h11", "size_m": 0.04}, "board": board,
+        "pose": {"jitter_px": 1, "azimuth_deg": {"uniform": [0, 360]},
+                 "roll_deg": {"uniform": [0, 360]}},
+        "estimator": {"solver": "sqpnp"},
+        "axes": {"distance_m": [0.4, 0.7, 1.2], "tilt_deg": [0, 25, 50], "trial": 3},
+    }, settings)
+
+
+FOUND = ["adaptiveThreshConstant=60", "adaptiveThreshWinSizeMax=33", "adaptiveThreshWinSizeStep=4"]
+"""The setting that the guide of boards and the plan name."""
+
+
+def run(settings, shape=(3, 3, 3), board=APRIL_GRID):
+    return run_block(april_pipeline(settings, board), Block((0, 0, 0), shape)).values
+
+
+def test_the_named_setting_finds_what_the_default_loses():
+    default, named = (run(settings) for settings in ([], FOUND))
+    lost = default["detection"] != DetectionStatus.detected
+    assert lost.sum() >= 5
+    assert (named["detection"] == DetectionStatus.detected).all()
+    assert (default["marker_detection"] == DetectionStatus.detected).mean() < 0.5
+    assert (named["marker_detection"] == DetectionStatus.detected).mean() > 0.75
+    solved = named["estimate"] == EstimateStatus.solved
+    assert solved.mean() > 0.9
+    # A board whose markers have other IDs or another turn than the picture fits nowhere.
+    assert np.nanmedian(named["reprojection_error_px"][solved]) < 2
+    assert np.nanmedian(np.linalg.norm(named["rotation_error_rad"], axis=-1)[solved]) < 0.05
+
+
+def test_plan_names_the_setting_where_the_default_loses_markers():
+    (line,) = [each for each in april_pipeline().facts.notes if "squares" in each]
+    for setting in FOUND:
+        assert setting.replace("=", " = ") in line
+    assert not [each for each in april_pipeline(FOUND).facts.notes if "squares" in each]
+
+
+@pytest.mark.parametrize("board", [
+    APRIL_GRID, {"kind": "grid", "columns": 4, "rows": 3, "gap_m": 0.012},
+], ids=["aprilgrid", "grid"])
+def test_ids_are_those_listed_in_the_order_of_the_kind(board):
+    ids = [7, 3, 11, 5, 30, 31, 32, 33, 0, 1, 2, 4]
+    values = run(FOUND, (1, 1, 1), board | {"ids": ids})
+    assert values["board_marker_id"].ravel().tolist() == ids
+    assert (values["marker_detection"] == DetectionStatus.detected).mean() > 0.5

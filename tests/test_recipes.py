@@ -207,12 +207,12 @@ def results(tmp_path_factory):
         ("model/effects.py", "import dataclasses\n", "import numpy as np\n"),
         ("model/effects.py", "EFFECTS: tuple[Effect, ...] = (", EFFECTS),
         ("measure/frontal.py", None, SOLVER),
-        ("measure/estimators.py", "    PoseEstimator,\n    credible_estimates,\n)\n",
+        ("measure/estimators.py", ", PoseEstimator, credible_estimates\n",
          "from sweep.measure.frontal import FrontalSolver\n"),
         ("measure/estimators.py", "SOLVERS: dict[str, Solver] = {", SOLVER_RECORD),
         ("measure/flags.py", f'"{highest.meaning}")\n',
          f'    unlikely = flag({FLAG}, "{SENTENCE}", present=True)\n'),
-        ("experiment/schema.py", "             flags=Flipped),\n", VARIABLE),
+        ("experiment/schema.py", "             flags=flags.Flipped),\n", VARIABLE),
         ("evaluation/variables.py", '    "flipped": _flipped,\n', FUNCTION),
     )
     detectors = folder / "sweep" / "measure" / "detectors.py"

@@ -160,5 +160,6 @@ def test_public_cases_are_ranked_as_their_threads_found_out():
     assert sum([found] == causes[0] for found, causes in known) >= 0.7 * len(known)
     assert sum([found] in causes[:2] for found, causes in known) >= 0.9 * len(known)
     guide = (FOLDER / "README.md").read_text()
-    for case, found in answers:
-        assert (CASES["row"](case, found) in guide) == bool(case["found"])
+    shown = [case for case, found in answers if CASES["row"](case, found) in guide]
+    assert len(shown) >= 12
+    assert all(case in shown for case, _ in answers if case["found"])

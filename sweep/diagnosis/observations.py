@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import csv
 import math
 import os
 import sys
@@ -283,22 +283,19 @@ def _cells(source: str | os.PathLike[str] | Mapping[str, Sequence[Any]]) -> pd.D
         if isinstance(source, Mapping):
             return pd.DataFrame(dict(source))
         text = read_regular(os.fspath(source), MAX_BYTES).decode("utf-8-sig")
-        lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-        cells = pd.read_csv(io.StringIO("\n".join(lines)), header=None, dtype=str,
-                            keep_default_na=False).map(str.strip, na_action="ignore")
     except (OSError, ValueError) as error:
         given = "" if isinstance(source, Mapping) else plain(source)
-        problem = getattr(error, "strerror", None) or (
-            f"expected columns as long as each other, and commas between them ({error})")
+        problem = getattr(error, "strerror", None) or error
         raise ArgumentError("observations", given, plain(problem)) from None
-    cells = cells.iloc[1:].set_axis(cells.iloc[0], axis="columns").reset_index(drop=True)
-    faults = [f"column {plain(name)} is there twice"
-              for name in cells.columns[cells.columns.duplicated()]]
-    faults += [f"row {row + 1} has fewer cells than the header"
-               for row in np.flatnonzero(cells.isna().any(axis=1))]
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines)] or [[]]
+    faults = [f"row {number} has {len(row)} cells, the header {len(header)}: expected commas "
+              "between columns, and points in numbers"
+              for number, row in enumerate(rows, 1) if len(row) != len(header)]
+    faults += [f"column {plain(name)} is there twice" for name in header if header.count(name) > 1]
     if faults:
         raise ArgumentError("observations", plain(source), faults[0])
-    return cells
+    return pd.DataFrame(rows, columns=header)
 
 
 def _numbers(cells: pd.DataFrame) -> pd.DataFrame:

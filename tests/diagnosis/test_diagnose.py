@@ -76,7 +76,7 @@ def test_next_measurement_is_where_predictions_differ():
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
     ({"range_m": [1.0, 2.0], "tape_m": [1.0, ""]}, "row 2: expected tape_m"),
-    ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "as long as each other"),
+    ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "same length"),
     ({"range_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m = 0.0: expected a number between"),
     ({"range_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
     ({"range_m": [1e300]}, "range_m = 1e+300: expected a number between"),
@@ -127,6 +127,7 @@ def test_poses_are_solved_from_images(tmp_path):
     for text, words in (
         ("image,tape_m,marker_id\n" + f"{names[0]},1,7\n", "(IDs 0): expected one, or marker_id"),
         ("image,tape_m\nnone.png,1\n", "none.png"), ("tape_m;range_m\n1,5;1,5\n", "commas"),
+        ("image,tape_m\n1\n", "row 1 has 1 cells, the header 2"),
     ):
         rows.write_text(text)
         with pytest.raises(sweep.ArgumentError, match=re.escape(words)):

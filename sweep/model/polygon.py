@@ -246,13 +246,15 @@ def plane_normal(plane: Floats) -> tuple[float, float, float]:
 
 
 @compiled
-def sheet_pixel(
-    column: float, row: float, projection: Projection, sheet: Sheet
+def edge_pixel(
+    t: float, edge: ModuleEdge, projection: Projection, sheet: Sheet
 ) -> tuple[float, float]:
-    """Return the pixel of a point of the flat sheet: bent, through the lens, shifted.
+    """Return the pixel of the point at parameter t of an edge: bent, through the lens, shifted.
 
     NaN if it is not before the camera.
     """
+    column = edge.column + t * (edge.to_column - edge.column)
+    row = edge.row + t * (edge.to_row - edge.row)
     at_column, at_row, height = bent_point(column, row, sheet)
     x, y, z = plane_point(projection.plane, at_column, at_row)
     if height != 0.0:
@@ -277,17 +279,14 @@ def sheet_pixel(
 
 
 @compiled_inline
-def edge_pixel(
-    t: float, edge: ModuleEdge, projection: Projection, sheet: Sheet
+def sheet_pixel(
+    column: float, row: float, projection: Projection, sheet: Sheet
 ) -> tuple[float, float]:
-    """Return the pixel of the point at parameter t of an edge, as :func:`sheet_pixel`."""
-    return sheet_pixel(
-        edge.column + t * (edge.to_column - edge.column), edge.row + t * (edge.to_row - edge.row),
-        projection, sheet,
-    )
+    """Return the pixel of a point of the flat sheet; as :func:`edge_pixel`."""
+    return edge_pixel(0.0, ModuleEdge(column, row, column, row), projection, sheet)
 
 
-@compiled
+@compiled_inline
 def chord_count(
     edge: ModuleEdge, piece: int, pieces: int, ends: tuple[float, float, float, float],
     projection: Projection, sheet: Sheet,

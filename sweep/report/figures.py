@@ -368,6 +368,9 @@ def _bound(data: ReportData) -> Figure | None:
 USUAL = 0.2
 """The threshold that many programs use."""
 
+FRONTAL_DEG = 5.0
+"""Viewing angle up to which a pose hardly differs from its mirror."""
+
 CONDITIONS = 8
 """The most sizes, or angles, that are told apart."""
 
@@ -385,9 +388,13 @@ KEPT_AT_USUAL = (
 
 
 def _ambiguity(data: ReportData) -> Figure | None:
-    """Return the figure if any pose has another solution, and any is a flip."""
+    """Return the figure if any pose has another solution, any is a flip, not all are frontal."""
     if not all(name in data.results for name in (
             "reprojection_error_px", "alternative_reprojection_error_px")):
+        return None
+    angles = data.results.get("viewing_angle_deg")
+    if angles is not None and not data.once(
+            "largest angle", lambda: float(angles.max())) > FRONTAL_DEG:
         return None
     pooled = grouped(data, ambiguity)
     curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values

@@ -130,9 +130,6 @@ def _values(axis: Axis) -> str:
 # The report as one self-contained HTML page (no network, no script, no other file), or as Markdown
 # with its figures and scenes as files in a folder beside it: from the templates beside this module.
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""Content security policy: a browser refuses and logs every request of the page."""
-
 
 def page(
     title: str, answer: Answer, provenance: Mapping[str, Any], figures: Sequence[Figure],
@@ -151,7 +148,7 @@ def page(
         "sentence_case": str.capitalize, "svg": _svg,
     }
     text = environment.get_template("page.html" if html else "page.jinja").render(
-        policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
+        title=title, answer=answer, provenance=provenance, figures=figures,
         scenes=scenes, require=require, base=quote(folder),
         legend=LEGEND)
     return text.rstrip("\n") + "\n"

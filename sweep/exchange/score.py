@@ -21,8 +21,13 @@ from sweep.errors import (
     SweepError,
 )
 from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
-from sweep.exchange.export import EXPERIMENT, read_mark
-from sweep.exchange.images import image_batch, image_batches, write_errors
+from sweep.exchange.export import (
+    EXPERIMENT,
+    image_batch,
+    image_batches,
+    read_mark,
+    write_errors,
+)
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, StoreError
-from sweep.exchange.images import write_errors
+from sweep.exchange.export import write_errors
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, FindFunction, make_detector

@@ -191,7 +191,7 @@ def required(data: ReportData) -> Required:
     table = data.once("required", lambda: check_requirements(results, data.require, data.per))
     found = [verdicts(table.isel({name: [k] for name, k in at.items()})) for at in positions]
     decisions = [combined(each) for each in found]
-    along, others = course_of(data, data.per)
+    along, others = course_of(data)
     # At all other conditions together, and at each of them.
     courses = [((), others), *([(others, ())] if others else [])] if along else []
     limits = [

@@ -190,7 +190,7 @@ def signed_error_statistics(
 
 def _bias(data: ReportData) -> Figure | None:
     """Return the figure of bias along sizes, other numbers, or angles."""
-    along = course_of(data, data.per)[0]
+    along = course_of(data)[0]
     if along in (None, data.angle_axis):
         along = data.size or data.angle_axis
     if along is None:

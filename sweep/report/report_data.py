@@ -20,7 +20,6 @@ from sweep.analysis.requirements import (
     SIZES_BESIDE,
     conditions,
     parse_requirements,
-    usual_conditions,
 )
 from sweep.errors import StoreError, SweepError
 from sweep.execution.status import Totals, outcome_of_store
@@ -37,6 +36,7 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # Groups of poses that a figure compares, and the labels of groups.
 
+BOTH = (Stage.detection, Stage.estimation)
 AREA = "marker_area_px"
 ANGLES = ("tilt_deg", "view_angle_deg")
 """Axes along which the marker is turned away."""
@@ -154,8 +154,7 @@ class ReportData:
     @property
     def setting_axes(self) -> tuple[str, ...]:
         """Axes of the detector's and the estimator's settings that have several values."""
-        stages = (Stage.detection, Stage.estimation)
-        return tuple(axis.name for axis in self.pipeline.axes_of(*stages) if len(axis) > 1)
+        return tuple(axis.name for axis in self.pipeline.axes_of(*BOTH) if len(axis) > 1)
 
     @property
     def effect_axes(self) -> tuple[Axis, ...]:
@@ -213,10 +212,7 @@ class ReportData:
 
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
-        names = [
-            axis.name for axis in self.pipeline.axes_of(Stage.scene)
-            if len(axis) > 1 and axis.name not in (*kept, TRIAL)
-        ]
+        names = [name for name in self.scene_axes if name not in kept]
         return f"Pooled over {', '.join(names)}." if names else ""
 
     # Analyses.
@@ -231,25 +227,19 @@ class ReportData:
         return found
 
 
-def course_of(
-    data: ReportData, per: Sequence[str] | None = None
-) -> tuple[str | None, tuple[str, ...]]:
-    """Return how requirements are followed over conditions, by default the usual ones.
+def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
+    """Return how requirements are followed over the conditions.
 
     Returns
     -------
     The axis along which a limit is looked for, None if there is none; and the other axes of
     conditions, those of angles first.
     """
-    axes = {axis.name: axis for axis in data.pipeline.axes}
-    per = usual_conditions(data.results) if per is None else per
-    conditions = [name for name in per if name not in data.setting_axes]
-    ordered = [name for name in conditions
-               if name in data.scene_axes and axes[name].is_numeric]
-    ordered.sort(key=lambda name: (
+    conditions = [name for name in data.per if name not in data.setting_axes]
+    numeric = {axis.name for axis in data.pipeline.axes if axis.is_numeric} & {*data.scene_axes}
+    along = min((name for name in conditions if name in numeric), default=None, key=lambda name: (
         name != data.size_axis, name not in SIZES_BESIDE, name in ANGLES))
-    along = ordered[0] if ordered else None
-    others = [name for name in conditions if name != along]
+    others = (name for name in conditions if name != along)
     return along, tuple(sorted(others, key=lambda name: name not in ANGLES))
 
 
@@ -316,8 +306,6 @@ def read_report_data(
 
 MAX_CONFIGURATIONS = 30
 """Configurations that a table or a figure of all of them compares."""
-
-BOTH = (Stage.detection, Stage.estimation)
 
 
 @dataclass(frozen=True, eq=False)

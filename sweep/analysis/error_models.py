@@ -178,16 +178,12 @@ def differences(knots: Sequence[Floats]) -> Floats:
     >>> differences([np.arange(2.0), np.arange(1.0)]).tolist()
     [[1.0, -1.0], [-1.0, 1.0]]
     """
-    shape = [len(each) for each in knots]
-    numbers = np.arange(np.prod(shape)).reshape(shape)
-    total = np.zeros((numbers.size, numbers.size))
-    for axis in range(len(shape)):
-        a, b = (np.take(numbers, range(first, shape[axis] - 1 + first), axis).ravel()
-                for first in (0, 1))
-        np.add.at(total, (a, a), 1.0)
-        np.add.at(total, (b, b), 1.0)
-        np.add.at(total, (a, b), -1.0)
-        np.add.at(total, (b, a), -1.0)
+    total = np.zeros((math.prod(map(len, knots)),) * 2)
+    for axis, of_axis in enumerate(knots):
+        step = np.diff(np.eye(len(of_axis)), axis=0)
+        parts: list[Any] = [np.eye(len(each)) for each in knots]
+        parts[axis] = step.T @ step
+        total += functools.reduce(np.kron, parts)
     return total
 
 
@@ -1153,36 +1149,32 @@ def model_errors(
         others = [str(dim) for dim in model["sigma"].dims if dim not in ("quantity", *PREDICTORS)]
         raise ArgumentError("model", f"models for each {', '.join(others)}",
                             "expected one model; choose one with models.isel(...)")
-    distance, angle = (np.atleast_1d(np.asarray(each, dtype=np.float64))
-                       for each in (distance_m, viewing_angle_deg))
     if side_px is None:
         if model.attrs["focal_size_varies"]:
             raise ArgumentError("side_px", None, "expected the side: it varies in the store")
         with np.errstate(divide="ignore"):
-            side_px = model.attrs["focal_size_px_m"] / distance
-    bearing = np.atleast_1d(np.asarray(np.nan if bearing_deg is None else bearing_deg, dtype=float))
-    distance, side, angle, bearing = np.broadcast_arrays(
-        distance, np.atleast_1d(np.asarray(side_px, dtype=np.float64)), angle, bearing)
+            side_px = model.attrs["focal_size_px_m"] / np.asarray(distance_m, dtype=np.float64)
+    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(each, dtype=np.float64)) for each in (
+        distance_m, side_px, viewing_angle_deg, np.nan if bearing_deg is None else bearing_deg)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        at = np.stack([np.log(distance), np.log(side), angle, bearing], axis=-1)
-    inside = _seen(model, at, any_bearing=bearing_deg is None)
+        at = np.stack([condition.scaled(each) for condition, each in zip(
+            CONDITIONS.values(), values, strict=True)], axis=-1)
     cell = np.ravel_multi_index(tuple(
-        np.searchsorted(cell_edges(model, name)[1:-1], value, side="right")
-        for name, value in zip(PREDICTORS, (distance, side, angle), strict=True)),
-        model["flip_rate"].shape)
+        np.searchsorted(cell_edges(model, name)[1:-1], each, side="right")
+        for name, each in zip(PREDICTORS, values, strict=False)), model["flip_rate"].shape)
     basis = hat_basis(at[:, : len(PREDICTORS)], [
         CONDITIONS[name].scaled(model[name].values) for name in PREDICTORS])
-    bias = model["bias"].values / _metres(model["distance_m"].values)[:, :, None, None]
     flat = (len(QUANTITIES), -1)
-    values = {
-        "sigma": np.exp(basis @ np.log(model["sigma"].values).reshape(flat).T),
-        "bias": basis @ bias.reshape(flat).T * _metres(distance).T,
-    }
     use = model["use"].values.reshape(flat)[:, cell].T
-    inside &= (use != Use.no_poses).all(axis=1)
+    inside = _seen(model, at, any_bearing=bearing_deg is None) & (use != Use.no_poses).all(axis=1)
+    bias = model["bias"].values / _metres(model["distance_m"].values)[:, :, None, None]
+    found = {
+        "sigma": np.exp(basis @ np.log(model["sigma"].values).reshape(flat).T),
+        "bias": basis @ bias.reshape(flat).T * _metres(values[0]).T,
+    }
     out: dict[str, Any] = {
         name: (("pose", "quantity"), np.where(inside[:, None], each, np.nan),
-               {"units": "m, radian"}) for name, each in values.items()}
+               {"units": "m, radian"}) for name, each in found.items()}
     out["use"] = (("pose", "quantity"), np.where(inside[:, None], use, Use.no_poses),
                   model["use"].attrs)
     for name in ("flip_rate", "solved_rate"):

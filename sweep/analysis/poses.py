@@ -512,43 +512,39 @@ QUANTITIES = (
 """What `sweep.analysis.error_statistics` is of unless it is asked for others."""
 
 
-def _component(
-    name: str, source: str, k: int | None, words: str, unit: str = "m", units: str = "m"
-) -> Quantity:
-    """Return the k-th component of an array of `SignedErrors`, or the array itself."""
+def _signed(source: str, unit: str, units: str, **words: str) -> tuple[Quantity, ...]:
+    """Return the components of an array of `SignedErrors`, or the array itself, by their names."""
     errors = attrgetter(f"signed.{source}")
 
-    def vector(poses: Poses) -> Floats:
+    def component(k: int, poses: Poses) -> Floats:
         values = errors(poses)
-        return np.asarray(values[..., None] if k is None else values[..., k : k + 1])
+        return np.asarray(values[..., None] if len(words) == 1 else values[..., k : k + 1])
 
-    return Quantity(name, unit, units, words, vector, signed=True, inputs=SIGNED_INPUTS)
+    return tuple(
+        Quantity(name, unit, units, text, functools.partial(component, k), signed=True,
+                 inputs=SIGNED_INPUTS)
+        for k, (name, text) in enumerate(words.items()))
 
 
-def _angle(name: str, source: str, k: int | None, words: str) -> Quantity:
-    return _component(name, source, k, words, "deg", "degree")
-
+_IN_METRES, _IN_DEGREES = ("m", "m"), ("deg", "degree")
 
 SIGNED: dict[str, tuple[Quantity, ...]] = {
-    "camera_frame": tuple(
-        _component(axis, "in_camera_m", k, f"position error along {axis} of the camera")
-        for k, axis in enumerate(XYZ)),
-    "marker_frame": tuple(
-        _component(f"marker_frame_{axis}", "along_marker_m", k,
-                   f"position error along {axis} of the true marker")
-        for k, axis in enumerate(XYZ)),
-    "camera_in_marker": tuple(
-        _component(f"camera_in_marker_{axis}", "of_camera_m", k,
-                   f"error of the camera's {axis} in the marker's frame")
-        for k, axis in enumerate(XYZ)),
-    "yaw_pitch_roll": tuple(
-        _angle(name, "yaw_pitch_roll_deg", k, f"{name} error")
-        for k, name in enumerate(("yaw", "pitch", "roll"))),
+    "camera_frame": _signed("in_camera_m", *_IN_METRES, **{
+        axis: f"position error along {axis} of the camera" for axis in XYZ}),
+    "marker_frame": _signed("along_marker_m", *_IN_METRES, **{
+        f"marker_frame_{axis}": f"position error along {axis} of the true marker"
+        for axis in XYZ}),
+    "camera_in_marker": _signed("of_camera_m", *_IN_METRES, **{
+        f"camera_in_marker_{axis}": f"error of the camera's {axis} in the marker's frame"
+        for axis in XYZ}),
+    "yaw_pitch_roll": _signed("yaw_pitch_roll_deg", *_IN_DEGREES, **{
+        name: f"{name} error" for name in ("yaw", "pitch", "roll")}),
     "angles": (
-        _angle("tilt", "tilt_deg", None, "error of the angle to the image plane"),
-        _angle("viewing_angle", "viewing_angle_deg", None,
-               "error of the angle between normal and line of sight"),
-        _angle("in_plane", "in_plane_deg", None, "rotation error about the true normal"),
+        *_signed("tilt_deg", *_IN_DEGREES, tilt="error of the angle to the image plane"),
+        *_signed("viewing_angle_deg", *_IN_DEGREES,
+                 viewing_angle="error of the angle between normal and line of sight"),
+        *_signed("in_plane_deg", *_IN_DEGREES,
+                 in_plane="rotation error about the true normal"),
     ),
 }
 """Errors with a sign, by groups: of these bias and standard deviation are computed."""

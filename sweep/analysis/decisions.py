@@ -666,9 +666,8 @@ def walk(decision: Decisions, keeps: Masks) -> Walk:
 # --------------------------------------------------------------------------------------------------
 # The choice that meets requirements at all conditions: of a size, and among other settings.
 #
-# What a choice is stands in `sweep.experiment.sampling`, when one is answered in
-# `sweep.analysis.decisions`. Every alternative, a combination of the values of the axes ``among``,
-# has its own answer.
+# What a choice is stands in `sweep.experiment.sampling`. Every alternative, a combination of the
+# values of the axes ``among``, has its own answer.
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
@@ -1128,8 +1127,7 @@ def precision_table(
     if trials is not None:
         total = total // results.sizes[DRAWS] * trials
     judged = [each.judged(table, f"{number} ", total) for number, each in enumerate(precisions)]
-    out = {str(name): stacked([each[name] for each in judged], "quantity").reset_coords(drop=True)
-           for name in judged[0]}
+    out = stacked(judged, "quantity").reset_coords(drop=True)
     for name, meaning, units in (
         ("value", "value", ""), ("half_width", "half-width of the interval, as was wanted", ""),
         ("used", "poses that the value is of", "1"),
@@ -1141,9 +1139,9 @@ def precision_table(
     needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
     out["settled"] = (~needs.any([*configuration, "quantity"])).assign_attrs(
         cf_attributes("whether no configuration and quantity needs more trials", "1"))
-    out |= {"run": table["run"], "poses": table["poses"]}
-    coordinates = {name: each for name, each in table.coords.items() if set(each.dims) <= {*kept}}
-    return xr.Dataset(out, coordinates).assign_coords(
+    out = out.assign(run=table["run"], poses=table["poses"]).assign_coords(
+        {name: each for name, each in table.coords.items() if set(each.dims) <= {*kept}})
+    return out.assign_coords(
         quantity=("quantity", [each.name for each in precisions]),
         wanted=("quantity", [each.half_width for each in precisions]),
         relative_to=("quantity", [each.relative_to for each in precisions]),

@@ -351,10 +351,6 @@ class Poses:
                     self._arrays[COMMON] | (array == 0), array, VARIABLES[name].not_needed)
         return array
 
-    def __contains__(self, name: object) -> bool:
-        """Return whether the poses have an array."""
-        return f"{self._prefix}{name}" in self._arrays
-
     @property
     def inside(self) -> Masks:
         """Poses that count at all."""

@@ -644,16 +644,13 @@ def decide(
             "pipeline what computes it" for name in lacking))
     judged = [_judged(table, number, each, is_replicated(results))
               for number, each in enumerate(required)]
-    out = xr.concat(
-        judged, "requirement", data_vars="all", coords="minimal", compat="override", join="exact",
-    ).assign_coords(
+    out = stacked(judged, "requirement").assign_coords(
         requirement=xr.DataArray([each.text for each in required], dims="requirement", attrs={
             "long_name": "what is required"}),
         variable=("requirement", [each.variable for each in required]),
         relation=("requirement", [each.relation for each in required]),
         limit=("requirement", [each.limit for each in required]),
         units=("requirement", [each.requirable.units for each in required]))
-    out = out.transpose(..., "requirement")
     out.attrs["configuration_dims"] = [name for name in configuration if name in out.dims]
     return out.assign(looked_for=table["looked_for"], solved=table["solved"])
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import ast
-import gc
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sweep import compilation
@@ -108,26 +106,6 @@ def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
                 # Annotations inside are never evaluated.
                 for origin in {origins[word] for word in used} - {"sweep.typing"}:
                     assert origin in modules, f"{name}.{function.name} uses {origin}"
-
-
-@compilation.compiled
-def _added(values, step):
-    return values[0] + step
-
-
-@compilation.compiled
-def _added_thrice(values, step):
-    return _added(values, 1) + _added(values, 2) + _added(values, step)
-
-
-def test_constants_of_callers_make_no_functions_of_their_own():
-    enabled = gc.isenabled()
-    for function in (_added, _added_thrice):  # an earlier run may have left them on disk
-        for index in Path(function.stats.cache_path).glob(f"*.{function.__name__}-*.nbi"):
-            index.unlink()
-    assert _added_thrice(np.array([3.0]), 4) == 16.0
-    assert len(_added.signatures) == 1  # each constant made one before: `fit` was compiled thrice
-    assert gc.isenabled() == enabled
 
 
 def test_first_use_is_announced_and_no_later_one(monkeypatch, capsys):

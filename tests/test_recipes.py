@@ -78,10 +78,8 @@ SCRIPT = """
 import json
 import numpy as np
 import sweep
-import xarray as xr
 from support.flags_and_numbers import contradiction
 from support.here import calls_here
-from sweep.analysis import failure_composition
 from sweep.cli import main
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import to_dataset_layout
@@ -141,17 +139,12 @@ def flag():
     lost = values["rotation_error_deg"].copy()
     lost[0] = np.nan
     new = {"estimate": unlikely, "flipped": flipped}
-    shares = failure_composition(xr.Dataset({
-        name: (VARIABLES[name].dimensions(pipeline), array)
-        for name, array in (values | new).items()
-    }))["share"]
     return {
         "attributes": VARIABLES["estimate"].attributes(),
         "contradictions": [contradiction(pipeline, SCHEMA, values | changed) for changed in (
             {}, new, new | {"rotation_error_deg": lost}, {"estimate": unlikely},
             {"estimate": np.full_like(unlikely, len(EstimateStatus))},
         )],
-        "shares": shares.sel(outcome=["unlikely", "solved", "no_candidate"]).values.tolist(),
         "tables": [TABLES["flags"]().rows, TABLES["variables"]().rows],
     }
 
@@ -262,7 +255,6 @@ def test_a_flag_is_one_member(results):
         "", "", "rotation_error_deg: no number although estimate says that there is one",
         "flipped: contradicts estimate", f"estimate: unknown flag {FLAG + 1}",
     ]
-    assert got["shares"] == [1 / 3, 1 / 3, 1 / 3]
     flags, rows = got["tables"]
     assert ["estimate", str(FLAG), "unlikely", SENTENCE, "yes"] in flags
     assert any("solved or not_explained or unlikely" in row[-1] for row in rows)

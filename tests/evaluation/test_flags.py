@@ -12,11 +12,7 @@ from support.flags_and_numbers import contradiction
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
-from sweep.measure.classify import TargetScenes, classify
-from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.board import single_marker
-from sweep.model.scene import Targets
 
 PLAIN = {"seed": 9, "pose": {"side_px": 60}, "scene": {"background": 128}}
 
@@ -106,47 +102,3 @@ def test_numbers_exist_exactly_where_the_flags_say_so():
         EstimateStatus.solved, EstimateStatus.no_detection, EstimateStatus.solver_failed
     }
     assert contradiction(pipeline, SCHEMA, values) == ""
-
-
-SQUARE = np.array([[100.0, 100.0], [140.0, 100.0], [140.0, 140.0], [100.0, 140.0]])
-
-
-REJECTED_ID = None
-ORIGIN = np.array([[8.0, 16.0]])
-"""Top left pixel of the window; what is found is relative to it."""
-
-
-def classified(*found, truth=SQUARE):
-    """Classify what was found, (ID or none, corners in the frame) each, in a scene of ID 7."""
-    def quads(wanted):
-        return tuple(
-            np.float32(quad - ORIGIN)[None] for each, quad in found if (each is not None) == wanted
-        )
-
-    ids = [found_id for found_id, _ in found if found_id is not None]
-    output = SearchOutput(
-        quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False))
-    scene = TargetScenes(
-        Targets.of([single_marker("DICT_4X4_50", 7, 1.0)]), np.array([[7]]), truth[None, None],
-        np.empty((1, 0, 2)), np.zeros((1, 1), dtype=np.uint8),
-    )
-    result = classify(scene, {0: output}, ORIGIN)
-    return DetectionStatus(result.flags[0]), result.marker_corners[0, 0]
-
-
-ELSEWHERE = [SQUARE + shift for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0])]
-
-
-@pytest.mark.parametrize(("found", "expected"), [
-    ([(7, SQUARE + 0.5)], DetectionStatus.detected),
-    *(([(each, quad)], DetectionStatus.no_candidate)
-      for each in (7, 3, REJECTED_ID) for quad in ELSEWHERE),
-    *(([(7, np.roll(SQUARE, turn, axis=0))], DetectionStatus.wrong_id) for turn in (1, 2, 3)),
-    *((found, DetectionStatus.wrong_id) for found in (
-        [(3, SQUARE)], [(3, SQUARE), (REJECTED_ID, SQUARE)], [(REJECTED_ID, SQUARE), (3, SQUARE)])),
-])
-def test_what_is_found_is_judged_by_its_id_its_place_and_its_turn(found, expected):
-    flag, corners = classified(*found)
-    assert flag == expected
-    right = found[0][1] if expected == DetectionStatus.detected else np.full((4, 2), np.nan)
-    np.testing.assert_array_equal(corners, right)

@@ -261,20 +261,6 @@ def test_a_dictionary_is_understood_by_its_number_where_that_is_one(written, val
         assert pipeline.fixed["dictionary"] == value
 
 
-@pytest.mark.parametrize(("written", "meant"), [
-    ("DICT_4X4", "DICT_4X4_50, DICT_4X4_100, DICT_4X4_250 or DICT_4X4_1000"),
-    ("5x5", "DICT_5X5_50, DICT_5X5_100, DICT_5X5_250 or DICT_5X5_1000"),
-    ("apriltag", ", ".join(f"DICT_APRILTAG_{name}" for name in ("16h5", "25h9", "36h10"))
-     + " or DICT_APRILTAG_36h11"),
-    ("tag41h12", "tagStandard41h12"),
-])
-def test_of_several_dictionaries_the_nearest_are_named(written, meant):
-    with pytest.raises(ValueError, match=f"; did you mean {meant}\\?$"):
-        PARAMETERS["dictionary"].check(written)
-    with pytest.raises(PipelineError, match=f"; did you mean {meant}\\?"):
-        Pipeline.from_text("[pose]\nside_px = 40", [f'dictionary=["{written}", "36h11"]'])
-
-
 @given(st.sampled_from(sorted(PARAMETERS)), st.sampled_from(["camera", "pose", "estimator"]))
 def test_a_parameter_in_a_wrong_section_is_told_with_the_right_one(name, section):
     assert f"did you mean {name}?" not in nearest(name, list(PARAMETERS))

@@ -142,6 +142,9 @@ BROKEN = [
     ((P, "tilt_deg=[0, 1"), "expected a TOML value"),
     ((P, "camera.tilt_deg=3"), "expected tilt_deg or pose.tilt_deg"),
     ((P, "solver=best"), 'estimator.solver = "best": expected one of'),
+    ((P, "dictionary=4X4"),
+     "; did you mean DICT_4X4_50, DICT_4X4_100, DICT_4X4_250 or DICT_4X4_1000?"),
+    ((P, "dictionary=tag41h12"), "; did you mean tagStandard41h12?"),
     ((P, "aprilTagDeglitch=1"), "aprilTagDeglitch = 1"),  # OpenCV reads memory that it never wrote
     ((AXES + "trial = 40", "sampling=sobol"),
      "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),

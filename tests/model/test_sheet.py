@@ -207,7 +207,6 @@ def test_shifted_image_is_that_of_samples_shifted_by_each_field(fields):
     assert_sampled(exact_frame(scenes, value), expected, 6)
 
 
-@pytest.mark.long
 def test_shifts_are_normal_and_correlated_as_said():
     # 4,000 frames; means of squares have a standard error of 1.41/sqrt(8,000) = 1.6 %, products
     # of points at a distance less than that: 5.5 % are beyond an error probability of 1e-6.

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.blocks import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
@@ -168,22 +167,3 @@ def test_markers_behind_other_sheets_and_from_behind_are_not_visible(board, seen
     boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), size)
     assert (boards.flags[0] == DetectionStatus.not_run).tolist() == seen
     assert (boards.flags[0] == DetectionStatus.not_visible).tolist() == np.invert(seen).tolist()
-
-
-def test_markers_around_the_camera_leave_the_image_of_those_before_it():
-    """Two walls and the wall behind: rays meet the marker ahead alone."""
-    ahead = [marker(1, 0, 0, 0)]
-    around = [
-        *ahead,
-        marker(2, 0.6, 0, 1, tilt=90, azimuth=270), marker(3, -0.6, 0, 1, tilt=90, azimuth=90),
-        marker(4, 0, 0, 2, tilt=180),
-    ]
-    scenes = scenes_of(pipeline(around))
-    assert visibility_flags(scenes).tolist() == [DetectionStatus.not_run]
-    alone = scenes_of(pipeline([marker(1, 0, 0, 0)]))
-    np.testing.assert_allclose(image_of(scenes), image_of(alone), atol=1e-9)
-    assert np.abs(image_of(scenes) - rays_of(ahead, scenes, 5)).mean() < 0.1
-    result = run_cells(pipeline(around), [])
-    assert result.columns["marker_detection"][0].tolist() == [
-        [DetectionStatus.detected, *[DetectionStatus.not_visible] * 3]
-    ]

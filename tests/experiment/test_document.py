@@ -24,7 +24,9 @@ from sweep.experiment.pipeline import (
 )
 from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS
+from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest
+from sweep.model.renderers import bitmap_shape
 from sweep.store.lifecycle import open_store
 
 # Pipelines of nested dictionaries: the same document, checks and messages as a file's.
@@ -303,3 +305,63 @@ def test_the_canonical_value_is_what_is_kept_and_compared():
     assert parse_selection("solver=SOLVEPNP_IPPE", plain) == {"solver": "ippe"}
     with pytest.raises(PipelineError, match="each value once"):
         Pipeline.from_text('[axes]\nsolver = ["ippe", "SOLVEPNP_IPPE"]')
+
+
+# Boards of several kinds in one pipeline, and the most that a board can be.
+
+KEYS = {"none": {}, "grid": {"rows": 2, "columns": 2, "gap_m": 0.01},
+        "charuco": {"squares_x": 3, "squares_y": 3, "square_m": 0.06}}
+
+
+def of_board(*settings, size_m=0.05, **sections):
+    marker = {"dictionary": "DICT_4X4_50"} | ({} if size_m is None else {"size_m": size_m})
+    return Pipeline.from_dict({
+        "marker": marker, "estimator": {"solver": "iterative"}, "pose": {"distance_m": 0.4},
+        **sections,
+    }, settings)
+
+
+def of_kinds():
+    kinds = {"kind": ["none", "charuco", "grid"], "size_m": [0.1, 0.03, 0.05]}
+    return of_board(size_m=None, board=KEYS["grid"] | KEYS["charuco"],
+                    axes={"target": {"zip": kinds}})
+
+
+def test_warp_s_bitmap_of_a_board_has_a_limit():
+    """OpenCV warps no more than 2^15 pixels a side."""
+    def board(x_m):
+        made = of_board("renderer=warp", board={"kind": "markers", "markers": [
+            {"marker_id": k, "x_m": x, "y_m": 0} for k, x in ((1, 0), (2, x_m))]})
+        return made.experiment.scene_values([])["board"].listed(1)[0]
+
+    assert bitmap_shape(board(3)) == (80, 3680)
+    with pytest.raises(ValueError, match=r"a side of 32,766; this board takes 36,08. x 80$"):
+        bitmap_shape(board(30))
+
+
+def test_each_of_several_kinds_uses_its_own_keys():
+    boards = of_kinds().experiment.scene_values([np.arange(3)])["board"].listed(3)
+    assert [len(board) for board in boards] == [1, 4, 4]
+
+
+@pytest.mark.parametrize("kind", KEYS)
+def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind):
+    single = of_board(f"kind={kind}", *(f"{name}={value}" for name, value in KEYS[kind].items()),
+                      board={"kind": "grid", "rows": 5, "columns": 7, "gap_m": 0.01})
+    for each in (cell(of_kinds(), f"kind={kind},size_m=0.03"), single):
+        own = {name for name in each.given if each.parameters[name].section == "board"}
+        assert own == {"kind", *KEYS[kind]}
+
+
+def test_cells_of_smaller_boards_fit_the_largest_of_another_grid():
+    board = {"kind": "grid", "columns": 7, "gap_m": 0.01}
+    variables = {each.name: each
+                 for each in of_board("rows=[1,2]", board=board).experiment.variables}
+    flags, errors = variables["marker_detection"], variables["marker_corner_error_px"]
+    some = np.arange(1, 15, dtype=np.uint8).reshape(2, 7)
+    assert (flags.fitted(some)[:, :7] == some).all()
+    assert (flags.fitted(some)[:, 7:] == DetectionStatus.not_on_board).all()
+    wide = np.zeros((3, 35, 4, 2), dtype=np.float32)
+    assert errors.fitted(wide).shape == (3, 14, 4, 2)
+    assert np.isnan(errors.fitted(wide[:, :7])[:, 7:]).all()
+    assert errors.fitted(wide[:, :7]).dtype == np.float32

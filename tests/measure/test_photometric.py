@@ -399,12 +399,12 @@ def test_board_s_pose_from_pixels_is_within_its_own_bound(board, trials, near):
     (CHARUCO, "unknown_blur"), (BESIDE, "known_blur"), (SOLID, "known_blur"),
 ], ids=["charuco", "beside", "several planes"])
 def test_board_s_pose_from_pixels_attains_the_bound(board, blur, claim):
-    """RMSE of 50 x 3 errors scatters by 5.8 %, the mean of 50 NEES by 0.49."""
+    """RMSE of 100 x 3 errors scatters by 4 %, the mean of 100 NEES by 0.35."""
     free = str(blur == "unknown_blur").lower()
-    columns, relative = computed(board, 50, f"estimate_blur={free}", f"bound={blur}")
+    columns, relative = computed(board, 100, f"estimate_blur={free}", f"bound={blur}")
     assert (columns["estimate"] == EstimateStatus.solved).all()
     ratios = np.sqrt((relative.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
     claim("RMSE of solver photometric of boards over the accuracy bound, less 1",
           "the bound of the exact image's derivatives", np.abs(ratios - 1).max())
-    assert np.abs(ratios - 1).max() < 5 * 0.058
-    assert abs(columns["nees"].mean() - 6) < 5 * np.sqrt(12 / 50)
+    assert np.abs(ratios - 1).max() < 5 * 0.04
+    assert abs(columns["nees"].mean() - 6) < 5 * np.sqrt(12 / 100)

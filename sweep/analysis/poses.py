@@ -283,6 +283,28 @@ COMMON = "common"
 DEPTH = "true_depth_m"
 """Name, beside those of the dataset's variables, of z of the true position."""
 
+ROTATION_BOUND, DEPTH_BOUND = "rotation_bound", "depth_bound"
+"""Names, likewise, of the bounds' parts."""
+
+DERIVED: dict[str, tuple[str, Callable[[xr.DataArray], xr.DataArray]]] = {
+    DEPTH: ("true_tvec_m", lambda array: array.isel(xyz=XYZ.index("z"), drop=True)),
+    ROTATION_BOUND: ("bound_std", lambda array: array.sel(
+        pose_parameter=[f"rotation_{axis}" for axis in XYZ])),
+    DEPTH_BOUND: ("bound_std", lambda array: array.sel(
+        pose_parameter="translation_z", drop=True)),
+}
+"""Arrays that are parts of a variable: its name, and which part."""
+
+
+def variables_read(names: Iterable[str]) -> list[str]:
+    """Return the dataset's variables that arrays of these names are of, each once.
+
+    >>> variables_read(["estimate", DEPTH_BOUND, ROTATION_BOUND])
+    ['estimate', 'bound_std']
+    """
+    return list(dict.fromkeys(DERIVED[name][0] if name in DERIVED else name for name in names))
+
+
 DETECTION_INPUTS = ("detection",)
 ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
 ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", DEPTH)
@@ -290,12 +312,15 @@ SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec", "true_tvec_m")
 """Names of the arrays that a statistic of detections, of estimates, of errors reads, and one of
 errors along axes and about angles."""
 
-REQUIRED_VARIABLES = tuple("true_tvec_m" if name == DEPTH else name for name in ERROR_INPUTS)
+BOUND_INPUTS = (*ERROR_INPUTS, ROTATION_BOUND, DEPTH_BOUND)
+"""What a statistic of errors and their bounds reads."""
+
+REQUIRED_VARIABLES = tuple(variables_read(ERROR_INPUTS))
 """Variables that every dataset of results has."""
 
 
 def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
-    """Return arrays by the names that `Poses` gives them: variables' names, or `DEPTH`.
+    """Return arrays by the names that `Poses` gives them: variables' names, or of `DERIVED`.
 
     Raises
     ------
@@ -304,7 +329,7 @@ def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataA
     """
     arrays = {}
     for name in dict.fromkeys(names):
-        variable = "true_tvec_m" if name == DEPTH else name
+        variable = variables_read([name])[0]
         if variable not in results:
             if AXIS in results.dims:
                 raise DatasetError(
@@ -313,7 +338,7 @@ def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataA
             raise DatasetError(f"no variable {variable}; "
                                f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
         array = results[variable]
-        arrays[name] = array.isel(xyz=XYZ.index("z"), drop=True) if name == DEPTH else array
+        arrays[name] = DERIVED[name][1](array) if name in DERIVED else array
     return arrays
 
 

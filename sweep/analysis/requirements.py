@@ -48,20 +48,18 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import clopper_pearson
 from sweep.analysis.poses import (
-    DEPTH,
-    ERROR_INPUTS,
     ESTIMATE_INPUTS,
     QUANTITIES,
     SIGNED,
     Poses,
     Quantity,
     pose_arrays,
+    variables_read,
 )
 from sweep.analysis.summaries import (
     NEES_MEAN,
     RATIOS,
     PoseStatistic,
-    bound_arrays,
     quantiles_of,
     registered,
 )
@@ -88,9 +86,6 @@ MEAN_LEVEL = 0.99
 Their formulas are approximations: with 50 draws an end of 97.5 % is passed in 4.6 % (normal
 errors) to 8.3 % (Laplace) of the samples, one of 99.5 % in 1.4 to 3.4 %.
 """
-
-BOUND = "bound_std"
-"""The variable that bounds are read from."""
 
 MIN_DRAWS = 50
 """Draws from which on means are decided; where draws are Sobol' points, any number."""
@@ -148,7 +143,7 @@ class Requirable:
     @property
     def variables(self) -> list[str]:
         """The dataset's variables that it is computed of."""
-        return ["true_tvec_m" if name == DEPTH else name for name in self.inputs]
+        return variables_read(self.inputs)
 
     def level(self, share: float = 1.0) -> float:
         """Return the level of the interval by which it is decided with a share of the error."""
@@ -197,10 +192,8 @@ def requirable_arrays(
         raise DatasetError("\n".join(
             f"{name}: cannot be computed, for this store lacks {', '.join(missing)}"
             for name, missing in lacking.items()))
-    names = dict.fromkeys(name for each in required for name in each.inputs if name != BOUND)
-    bounds = any(BOUND in each.inputs for each in required)
-    return pose_arrays(results, [*ESTIMATE_INPUTS, *names]) | (
-        bound_arrays(results) if bounds else {})
+    return pose_arrays(
+        results, [*ESTIMATE_INPUTS, *(name for each in required for name in each.inputs)])
 
 
 @functools.cache
@@ -214,8 +207,7 @@ def requirables() -> dict[str, Requirable]:
     """
     signed = [each for group in SIGNED.values() for each in group]
     quantities = [*QUANTITIES, *signed]
-    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN,
-               *(PoseStatistic(ratio, (*ERROR_INPUTS, BOUND)) for ratio in RATIOS)]
+    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN, *RATIOS]
     return {each.name: each for record in records for each in _of_record(record, quantities)}
 
 

@@ -45,12 +45,15 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import (
+    BOUND_INPUTS,
     COMMON,
     DEPTH,
+    DEPTH_BOUND,
     DETECTION_INPUTS,
     ERROR_INPUTS,
     ESTIMATE_INPUTS,
     QUANTITIES,
+    ROTATION_BOUND,
     Poses,
     Quantity,
     chosen_quantities,
@@ -59,7 +62,7 @@ from sweep.analysis.poses import (
     relative,
 )
 from sweep.errors import ArgumentError
-from sweep.experiment.schema import POSE_PARAMETERS, XYZ
+from sweep.experiment.schema import POSE_PARAMETERS
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
 from sweep.typing import Floats, Masks
 
@@ -843,21 +846,10 @@ def efficiency(
     >>> table["rotation_efficiency"].round(3).values.tolist()
     [0.544, 0.27]
     """
-    kept = kept_dimensions(results, per)
-    inputs = pose_arrays(results, ERROR_INPUTS) | bound_arrays(results)
-    return aggregate(results, inputs, kept, RATIOS, Poses, bins)
-
-
-def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the bounds by the names that `BoundRatio` reads; NaN without ``bound_std``."""
-    labels = [f"rotation_{axis}" for axis in XYZ]
-    bound = results.get("bound_std", xr.DataArray(
-        np.full(4, np.nan), {"pose_parameter": [*labels, "translation_z"]}, "pose_parameter"
-    ))
-    return {
-        "rotation_bound": bound.sel(pose_parameter=labels),
-        "depth_bound": bound.sel(pose_parameter="translation_z", drop=True),
-    }
+    if "bound_std" not in results:
+        results = results.assign(bound_std=xr.DataArray(
+            np.nan, {"pose_parameter": list(POSE_PARAMETERS)}, "pose_parameter"))
+    return _table(results, per, bins, RATIOS)
 
 
 @dataclass(frozen=True)
@@ -882,16 +874,16 @@ class BoundRatio(RootMeanSquare[Poses]):
             return bound / value, bound / high, bound / low
 
 
-def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> BoundRatio:
-    return BoundRatio(
+def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> PoseStatistic:
+    return PoseStatistic(BoundRatio(
         f"{quantity.name}_efficiency",
         f"RMS bound over RMS {quantity.words}, solved and not flipped", "1", quantity.squares,
-        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound=bound)
+        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound=bound), BOUND_INPUTS)
 
 
 RATIOS = (
-    _of_bound(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
+    _of_bound(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses[ROTATION_BOUND]))),
     _of_bound(QUANTITIES[1],
-              lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
+              lambda poses: (100.0 * relative(poses[DEPTH_BOUND], poses[DEPTH])) ** 2),
 )
 """Of the rotation and of the depth."""

@@ -507,21 +507,14 @@ def _faces(board: Board, planes: Floats) -> list[_Face]:
     ]
 
 
-def _common(one: _Face, other: _Face) -> Floats:
-    """Return the corners (n, 3) of that part of a sheet which the other's outline encloses."""
-    polygon = one.corners
-    for normal in other.normals:
-        polygon = half_plane(polygon, polygon @ normal)
-        if len(polygon) < 3:
-            return np.empty((0, 3))
-    return polygon
-
-
 def _hides(front: _Face, behind: _Face) -> bool:
     """Return whether a sheet hides a part of another."""
-    common = _common(behind, front)
-    if not len(common):
-        return False
+    # The part of the one that the other's outline encloses, (n, 3).
+    common = behind.corners
+    for normal in front.normals:
+        common = half_plane(common, common @ normal)
+        if len(common) < 3:
+            return False
     rays = common / np.linalg.norm(common, axis=1)[:, None]
     spread = np.cross(rays[1:] - rays[0], np.roll(rays, -1, axis=0)[1:] - rays[0])
     if not np.abs(spread).max() > _NEGLIGIBLE:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from hashlib import sha256
 from typing import NamedTuple
 
 import cv2
@@ -134,33 +133,23 @@ WAVES = 32
 directions are drawn, so that the covariance of one frame deviates from the formula by 1/8 of its
 height."""
 
-FIELDS = ("geometry", "edge")
-"""Fields of shifts: of the first word of their parameters."""
-
-_STREAMS = {
-    field: np.uint64(int.from_bytes(sha256(f"{field}_px".encode()).digest()[:8], "little"))
-    for field in FIELDS
-}
-
-
-def shift_waves(std_px: float, length_px: float, key: np.uint64, field: str = "geometry") -> Floats:
-    """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.Sheet`).
+def shift_waves(std_px: float, length_px: float, key: np.uint64) -> Floats:
+    """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.polygon.Sheet`).
 
     Parameters
     ----------
     std_px, length_px
         Standard deviation of each coordinate's shift, and its correlation length.
     key
-        Of the frame's random numbers.
-    field
-        Which of :data:`FIELDS`: each has random numbers of its own.
+        Of the field's random numbers in the frame.
     """
     normals = np.empty((8, WAVES))
-    standard_normals(np.uint64(key ^ _STREAMS[field]), 0, 0, 0, normals)
+    standard_normals(key, 0, 0, 0, normals)
     waves = np.stack([normals[:4].T, normals[4:].T])
     waves[:, :, :2] /= length_px
     waves[:, :, 2:] *= std_px / math.sqrt(WAVES)
     return waves
+
 
 # --------------------------------------------------------------------------------------------------
 # The sheets of scenes: where they are, how they are bent, and how their image is shifted.
@@ -206,10 +195,11 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     """Return how the sheets of one scene are bent, in modules, and how their image is shifted."""
     effect, flat = scenes.effects.of(row), polygon.flat_sheet()
     waves, length_px = flat.waves, math.inf
-    for field in FIELDS:
+    for field in ("geometry", "edge"):
         if effect[f"{field}_px"] != 0:
             own_px = effect[f"{field}_length_px"]
-            added = shift_waves(effect[f"{field}_px"], own_px, scenes.effects.noise_key[row], field)
+            key = scenes.patch(row, 0, 0).stream_key(f"{field}_px")
+            added = shift_waves(effect[f"{field}_px"], own_px, key)
             # The sum of both fields has the waves of both.
             waves, length_px = np.concatenate([waves, added], axis=1), min(length_px, own_px)
     x, y = extent_of(scenes.targets[row]).origin.tolist()

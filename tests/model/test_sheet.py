@@ -201,8 +201,8 @@ def test_shifted_image_is_that_of_samples_shifted_by_each_field(fields):
         noise_key=77, tilt_deg=30.0, roll_deg=15.0, width_px=28, height_px=26, side_px=14.0, **given
     )
     assert not not_modelled(scenes)[0]
-    waves = [shift_of(shift_waves(*field, np.uint64(77), *([name] if name == "edge" else [])))
-             for name, field in fields.items()]
+    keys = {name: scenes.patch(0, 0, 0).stream_key(f"{name}_px") for name in fields}
+    waves = [shift_of(shift_waves(*field, keys[name])) for name, field in fields.items()]
     expected = sampled_frame(value, 6, lambda points: sum(wave(points) for wave in waves))
     assert_sampled(exact_frame(scenes, value), expected, 6)
 

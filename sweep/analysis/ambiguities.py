@@ -256,21 +256,18 @@ def _with_choice(
     low = table["kept_flip_rate_low"]
     meets = useful & low.notnull() & (bound <= flip_rate)
     of_all = {"threshold": -1}
-    choice = xr.full_like(table["solved"], ThresholdChoice.too_few_draws)
-    for where, flag_ in (
-        (((low > flip_rate) | ~useful).all("threshold"), ThresholdChoice.none),
-        (meets.any("threshold"), ThresholdChoice.found),
-        (meets.isel(of_all), ThresholdChoice.not_needed),
-        (low.isel(of_all).isnull(), ThresholdChoice.nothing_drawn),
-        (table["kept"].isel(of_all) == 0, ThresholdChoice.not_run),
-    ):
-        choice = choice.where(~where, flag_)
+    choice = table["solved"].copy(data=np.select(
+        [table["kept"].isel(of_all) == 0, low.isel(of_all).isnull(), meets.isel(of_all),
+         meets.any("threshold"), ((low > flip_rate) | ~useful).all("threshold")],
+        [ThresholdChoice.not_run, ThresholdChoice.nothing_drawn, ThresholdChoice.not_needed,
+         ThresholdChoice.found, ThresholdChoice.none],
+        ThresholdChoice.too_few_draws).astype(np.uint8))
     # The largest threshold that meets.
     at = (meets * np.arange(table.sizes["threshold"])).argmax("threshold")
     columns = table.assign(bound=bound).isel(threshold=at).reset_coords("threshold").where(
         meets.any("threshold"))
     chosen = {f"chosen_{name}": columns[source].assign_attrs(cf_attributes(meaning, "1"))
               for name, (source, meaning) in CHOSEN.items()}
-    chosen["choice"] = choice.astype(np.uint8).assign_attrs(
+    chosen["choice"] = choice.assign_attrs(
         cf_attributes("whether a threshold keeps the wanted flip rate", flags=ThresholdChoice))
     return table.assign(chosen).assign_attrs(flip_rate=flip_rate, min_kept=min_kept)

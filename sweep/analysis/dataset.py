@@ -192,21 +192,12 @@ def require_poses(results: xr.Dataset) -> None:
         raise DatasetError(f"there are no poses: {', '.join(empty)} has no values")
 
 
-def require_dimension(results: xr.Dataset, *names: str) -> str:
-    """Return the first of the names that is a dimension of the dataset.
-
-    Raises
-    ------
-    DatasetError
-        If none is.
-    """
+def require_dimension(results: xr.Dataset, name: str) -> None:
+    """Raise DatasetError unless a dataset has a dimension, the variables of results, and poses."""
     require_poses(results)
     axes = axes_of(results)
-    for name in names:
-        if name in axes:
-            return name
-    raise DatasetError(f"{' or '.join(names)}: no such dimension; "
-                       f"there are {', '.join(axes) or 'none'}")
+    if name not in axes:
+        raise DatasetError(f"{name}: no such dimension; there are {', '.join(axes) or 'none'}")
 
 
 def each_cell(

@@ -674,19 +674,18 @@ def _judged(
     not_met = ~requirement.holds(refutes) & refutes.notnull() & enough
     no_number = (table[f"{number} one used"] == 0) & (
         (table["looked_for"] == 0) | (table["solved"] > 0))
-    decision = (xr.full_like(value, Decision.undecided).where(~not_met, Decision.not_met)
-                .where(~met, Decision.met).where(~no_number, Decision.not_applicable))
-    words = {
-        "value": (value, "value"),
-        "low": (low, "lower end of the interval by which it is decided"),
-        "high": (high, "upper end of the interval by which it is decided"),
-        "draws": (draws, "random draws that the value is worth"),
-    }
-    out = {name: array.assign_attrs(long_name=meaning, units="1" if "draws" in name else "")
-           for name, (array, meaning) in words.items()}
-    out["decision"] = decision.astype(np.uint8).assign_attrs(
-        cf_attributes("whether the requirement is met", flags=Decision))
-    return xr.Dataset(out)
+    decision = value.copy(data=np.select(
+        [no_number, met, not_met], [Decision.not_applicable, Decision.met, Decision.not_met],
+        Decision.undecided).astype(np.uint8))
+    return xr.Dataset({
+        name: array.assign_attrs(long_name=meaning, units=units)
+        for name, array, meaning, units in (
+            ("value", value, "value", ""),
+            ("low", low, "lower end of the interval by which it is decided", ""),
+            ("high", high, "upper end of the interval by which it is decided", ""),
+            ("draws", draws, "random draws that the value is worth", "1"))
+    } | {"decision": decision.assign_attrs(
+        cf_attributes("whether the requirement is met", flags=Decision))})
 
 
 # --------------------------------------------------------------------------------------------------

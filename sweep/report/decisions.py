@@ -63,11 +63,18 @@ def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.D
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
                                 f"there are {', '.join(axes)}")
         values = axis.columns[name]
-        kept[axis.name] = [k for k in kept.get(axis.name, range(len(axis))) if values[k] == value]
+        kept[axis.name] = [k for k in kept.get(axis.name, range(len(axis)))
+                           if _is_same(values[k], value)]
         if not kept[axis.name]:
             shown = ", ".join(map(label, values[:20]))
             raise ArgumentError("at", f"{name}={label(value)}", f"no such value; there are {shown}")
     return results.isel(kept)
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Return whether two values are equal, numbers but for rounding."""
+    numbers = isinstance(one, int | float) and isinstance(other, int | float)
+    return math.isclose(one, other, rel_tol=1e-9) if numbers else bool(one == other)
 
 
 def pooled_axes(results: xr.Dataset, per: Sequence[str]) -> list[str]:
@@ -92,14 +99,10 @@ def conditions_of(
     one = table.isel(requirement=table["requirement"].values.tolist().index(each.requirement))
     one = one.sel({name: value for name, value in each.configuration.items() if name in one.dims})
     dims = [str(dim) for dim in one["decision"].dims]
-    found = []
-    for index in np.argwhere(every | (one["decision"].values == each.decision)).tolist():
-        cell = one.isel(dict(zip(dims, index, strict=True)))
-        found.append({
-            "condition": {name: cell[name].item() for name in dims},
-            "decision": Decision(int(cell["decision"])),
-            **{name: cell[name].item() for name in ("value", "low", "high", "draws")},
-        })
+    found = [
+        {"condition": at, "decision": Decision(int(cell["decision"])),
+         **{name: cell[name].item() for name in ("value", "low", "high", "draws")}}
+        for at, cell in each_cell(one, dims) if every or cell["decision"] == each.decision]
     sign = -1 if one["relation"].item() in (">=", ">") else 1
     return sorted(found, key=lambda row: -sign * np.nan_to_num(row["value"], nan=sign * np.inf))
 

@@ -54,7 +54,7 @@ def test_what_the_pipeline_requires_is_decided(require):
 
 @pytest.mark.parametrize(("arguments", "status"), [
     (["detection >= 0.3"], 0), (["detection >= 0.8"], 1),
-    (["detection >= 0.995", "--at", "side_px=40"], 3),
+    (["detection >= 0.995", "--at", "side_px=40.00000000001"], 3),
     (["detection >= 0.3", "rotation_p95_deg <= 0.0001", "--per", "side_px"], 1),
     (["--pipeline", "other.toml", "--at", "side_px=40"], 0),
 ])

@@ -1,14 +1,10 @@
 """Runs to a precision: equal bits whatever computes them, tightened, reused, verified, repaired."""
 
 import itertools
-import json
 
-import numpy as np
 import pytest
 
-from support.commands import command
 from support.here import calls_here
-from support.poison import Poison, poisoned
 from support.stores import by_hand, in_waves, same
 from sweep.errors import OtherExperimentError, StoreError
 from sweep.execution.forecast import check_affordable
@@ -16,9 +12,8 @@ from sweep.execution.runner import execute, tighten
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import repair, verify
-from sweep.measure.flags import DetectionStatus
 from sweep.store.blocks import committed, drop_block, receipts
-from sweep.store.lifecycle import open_dataset, open_store
+from sweep.store.lifecycle import open_store
 
 TEXT = """
 seed = 3
@@ -123,29 +118,6 @@ def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
             execute(precise(width, change), url, workers=workers, block_s=block_s)
         assert same(url, reference), url
         assert verify(url, 5).damage == []
-
-
-@pytest.mark.long
-def test_cells_that_crash_are_flagged_whatever_computes_them(tmp_path):
-    """They are data, and the rule goes on beside them: one crashes in the second wave."""
-    crashed, raised = (1, 60), (2, 10)  # side and trial
-    file = tmp_path / "crashing.toml"
-    file.write_text(TEXT % WIDTHS[-1])
-    poisons = [Poison(150 * side + trial, stage, how) for (side, trial), stage, how in (
-        (crashed, "detection", "segv"), (raised, "scene", "raise"))]
-    urls = []
-    for workers in ([], ["--workers", "2"]):
-        urls.append(str(tmp_path / f"{len(workers)}.zarr"))
-        ran = command("run", str(file), "--store", urls[-1], "--json", *workers,
-                      env=poisoned(poisons, tmp_path / "log"))
-        assert ran.returncode == 0, ran.stderr
-        summary = json.loads(ran.stdout)
-        assert [summary[name] for name in ("crashed", "failed", "unsettled")] == [1, 1, 0]
-    assert same(*urls)
-    flags = open_dataset(urls[0]).detection.to_numpy()
-    assert flags[crashed] == DetectionStatus.crashed
-    assert flags[raised] == DetectionStatus.failed
-    assert np.isin(flags, (DetectionStatus.crashed, DetectionStatus.failed)).sum() == 2
 
 
 def test_a_run_in_waves_is_refused_if_all_its_trials_would_take_too_long():

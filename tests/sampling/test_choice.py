@@ -21,10 +21,8 @@ from sweep.tradeoff import choice_search
 def group(pipeline, rates, trials, generator):
     """Return results of a group with detections at rates (size, tilt, dictionary)."""
     found = generator.random((3, 2, 2, trials)) < np.asarray(rates)[..., None]
-    flags = flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.rejected))
-    of_solvers = {name: np.repeat(flags[name][..., None], 2, axis=-1)
-                  for name in ("estimate", "flipped")}
-    return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, flags | of_solvers)
+    flags = flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.rejected), 2)
+    return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, flags)
 
 
 @pytest.fixture

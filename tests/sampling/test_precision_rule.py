@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from support.searches import flags_of
 from sweep.analysis.decisions import wanted_precisions
 from sweep.analysis.estimator import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.sampling.rules import GroupResults, make_rule
 
 TEXT = """
@@ -29,18 +30,15 @@ def results_of(pipeline, trials, detected, sigma=(1.0, 1.0), seed=0):
     """Return results of both markers, with errors of the range in percent (normal)."""
     rng = np.random.default_rng(seed)
     shape = (2, 4, trials)
-    flags = np.where(rng.random(shape) < np.asarray(detected)[None, :, None],
-                     DetectionStatus.detected, DetectionStatus.no_candidate).astype(np.uint8)
-    seen = (flags == DetectionStatus.detected)[..., None] & np.ones(2, bool)
+    found = rng.random(shape) < np.asarray(detected)[None, :, None]
+    flags = np.where(found, DetectionStatus.detected, DetectionStatus.no_candidate)
     errors = rng.normal(size=(*shape, 2, 3)) * np.asarray(sigma)[:, None] / 100
-    errors[~seen] = np.nan
+    errors[~found] = np.nan
     truth = np.zeros((*shape, 3))
     truth[..., 2] = 1.0
     return GroupResults(pipeline, (0, 0), (2, 4), 1, trials, {
-        "detection": flags,
-        "estimate": np.where(seen, EstimateStatus.solved, EstimateStatus.no_detection),
-        "flipped": np.where(seen, Flipped.not_flipped, Flipped.no_estimate),
-        "rotation_error_rad": errors, "translation_error_m": errors, "true_tvec_m": truth,
+        **flags_of(flags, 2), "rotation_error_rad": errors, "translation_error_m": errors,
+        "true_tvec_m": truth,
     })
 
 

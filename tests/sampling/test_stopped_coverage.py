@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from support.searches import flags_of
 from sweep.analysis.decisions import wanted_precisions
 from sweep.analysis.estimator import Columns, Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import Poses
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import DetectionStatus, Flipped
 from sweep.sampling.rules import GroupResults, make_rule
 
 REPETITIONS = 2000
@@ -27,12 +28,8 @@ def poses(found, error=0.0, flipped=False, axis=2):
     errors = np.zeros((*found.shape, 3))
     errors[..., axis] = error
     errors[~found] = np.nan
-    chosen = {
-        "detection": (DetectionStatus.detected, DetectionStatus.no_candidate),
-        "estimate": (EstimateStatus.solved, EstimateStatus.no_detection),
-        "flipped": (np.where(flipped, Flipped.flipped, Flipped.not_flipped), Flipped.no_estimate),
-    }
-    flags = {name: np.where(found, yes, no).astype(np.uint8) for name, (yes, no) in chosen.items()}
+    flags = flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.no_candidate))
+    flags["flipped"][found & flipped] = Flipped.flipped
     return {**flags, "rotation_error_rad": errors, "translation_error_m": errors}
 
 

@@ -39,10 +39,13 @@ def pipeline_of(curves, values, text, most):
     })
 
 
-def flags_of(detection):
-    """Return the values of a group with these flags of detection."""
+def flags_of(detection, solvers=None):
+    """Return the values of a group with these flags of detection, for a number of solvers."""
     detected = detection == DetectionStatus.detected
     unneeded = detection == DetectionStatus.not_needed
+    if solvers is not None:
+        detected, unneeded = (
+            np.repeat(each[..., None], solvers, axis=-1) for each in (detected, unneeded))
     return {
         "detection": detection.astype(np.uint8),
         "estimate": np.select([detected, unneeded],

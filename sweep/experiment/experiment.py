@@ -352,18 +352,6 @@ def distinct(pipeline: Grid, combinations: Sequence[Mapping[str, Any]]) -> list[
     return list(first.values())
 
 
-def _truths(grid: Grid) -> dict[str, Any]:
-    """Return the true value of each belief; none, or None, where it varies."""
-    truths = {name: grid.fixed.get(name) for name in ("size_m", "blur_px", "noise_grey")}
-    if "distortion" in grid.fixed:
-        truths["distortion"] = canonical_distortion(grid.fixed["distortion"])
-    if grid.fixed.keys() >= {*VIEW_PARAMETERS}:
-        view = intrinsics(*(grid.fixed[name] for name in VIEW_PARAMETERS))
-        truths |= zip(("fx_px", "fy_px", "cx_px", "cy_px"), view, strict=True)
-    return {"believed": "truth", "believed_focal_scale": 1.0} | {
-        f"believed_{name}": truth for name, truth in truths.items()}
-
-
 def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
     r"""Return for each value of an axis whether it makes the estimator believe what is not true.
 
@@ -377,7 +365,15 @@ def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
     >>> wrong_beliefs(pipeline, pipeline.axes[0])
     (True, False)
     """
-    truths = _truths(pipeline)
+    fixed = pipeline.fixed
+    truths = {f"believed_{name}": fixed.get(name) for name in ("size_m", "blur_px", "noise_grey")}
+    truths |= {"believed": "truth", "believed_focal_scale": 1.0}
+    if "distortion" in fixed:
+        truths["believed_distortion"] = canonical_distortion(fixed["distortion"])
+    if fixed.keys() >= {*VIEW_PARAMETERS}:
+        view = intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))
+        truths |= zip((f"believed_{name}_px" for name in ("fx", "fy", "cx", "cy")), view,
+                      strict=True)
     return tuple(
         any(_differs(value, truths.get(name)) for name, value in axis.at(k).items())
         for k in range(len(axis)))
@@ -403,9 +399,6 @@ def _differs(believed: Any, truth: Any) -> bool:
     return bool((canonical_distortion(believed) if lens else believed) != truth)
 
 
-Range = tuple[float, float]
-"""The least and the largest value on the grid."""
-
 MAX_SAMPLE = 600
 """Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
 
@@ -419,7 +412,8 @@ MIN_SHARE = 0.01
 """Share of poses that is told."""
 
 
-def _ends(numbers: Floats) -> Range:
+def _ends(numbers: Floats) -> tuple[float, float]:
+    """Return the least and the largest number."""
     return float(np.min(numbers)), float(np.max(numbers))
 
 
@@ -639,9 +633,8 @@ class Facts:
     @property
     def notes(self) -> list[str]:
         """The lines that `sweep plan` and the start of a run print."""
-        if "photographs" in self.grid.given:
-            return []
-        return [*self.camera_notes, *self.pose_notes, *self.detector_notes]
+        return [] if "photographs" in self.grid.given else [
+            *self.camera_notes, *self.pose_notes, *self.detector_notes]
 
     @cached_property
     def parts(self) -> list[Part]:

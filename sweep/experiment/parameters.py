@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
@@ -122,19 +122,6 @@ RIVALS: dict[str, frozenset[str]] = {
 >>> sorted(RIVALS["yaw_deg"])
 ['azimuth_deg', 'tilt_deg', 'view_angle_deg']
 """
-
-
-def superseded(given: Collection[str]) -> set[str]:
-    """Return the parameters that have no meaning beside those that are given.
-
-    >>> sorted(superseded({"view_angle_deg", "distance_m"}))
-    ['pitch_deg', 'side_px', 'tilt_deg', 'yaw_deg']
-    """
-    if PHOTOGRAPHS in given:
-        return {*IN_CAMERA, *WORLD, "jitter_px"}
-    if any(name in given for name in WORLD):
-        return set(IN_CAMERA)
-    return {rival for name in given for rival in RIVALS.get(name, ())}
 
 
 def is_zip(value: Any) -> bool:

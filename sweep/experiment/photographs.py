@@ -182,13 +182,6 @@ BESIDE_MODULES = 4.0
 farther out influences the marker's corners."""
 
 
-def _around(marker: BoardMarker | None) -> Board | None:
-    """Return a marker of a board with what is printed around it; None of a marker alone."""
-    if marker is None:
-        return None
-    return with_neighbours(marker, float(np.ceil(clear_modules(marker))) + BESIDE_MODULES)
-
-
 @lru_cache(maxsize=8)
 def _board(document: str) -> Board:
     """Return the board of a record, the same object for the same document."""
@@ -254,7 +247,9 @@ def recorded_poses(
         "truth": source, "truth_std": std,
     }
     if simulated:
-        columns["neighbourhood"] = [_around(each) for each in columns["on_board"]]
+        columns["neighbourhood"] = [each and with_neighbours(
+            each, float(np.ceil(clear_modules(each))) + BESIDE_MODULES)
+            for each in columns["on_board"]]
     else:
         images = {
             (name, number): reference((Path(folder) / name).parent / records[name].paths[number],

@@ -931,21 +931,16 @@ def parse_selection(at: str, pipeline: Pipeline) -> dict[str, Any]:
     def read(name: str, written: str) -> dict[str, Any]:
         value = documents.read_value(written)
         if name in together:
-            return together[name].at(_row(together[name], value))
+            axis, labels = together[name], together[name].values
+            if value not in (*labels, *range(len(axis))) or isinstance(value, (bool, float)):
+                raise ValueError(
+                    f'a number from 0 to {len(axis) - 1}, or a label such as "{labels[0]}"')
+            return axis.at(labels.index(value) if value in labels else value)
         if name not in declared:
             raise LookupError(name)
         return {name: declared[name].check(value)}
 
     return _assigned("--at", map(str, _PART.findall(at)), read, [*declared, *together])
-
-
-def _row(axis: Axis, value: Any) -> int:
-    """Return the index along an axis that a label or a number names; ValueError for others."""
-    if isinstance(value, str) and value in axis.values:
-        return axis.values.index(value)
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(axis):
-        return value
-    raise ValueError(f'a number from 0 to {len(axis) - 1}, or a label such as "{axis.values[0]}"')
 
 
 def selection_text(pipeline: Pipeline, index: Mapping[str, int]) -> str:

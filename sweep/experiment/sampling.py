@@ -130,15 +130,12 @@ def not_continued(ours: StoppingRule | None, begun: StoppingRule | None) -> str:
     for name, width in begun.precision:
         if not widths.get(name, math.inf) <= width:
             return f"{SEARCH}.precision.{name}: this run is looser than the store"
-    here = dataclasses.asdict(ours)
-    return next((
-        f"{SEARCH}.{name}: the store has {_text(there)}, this run {_text(here[name])}"
-        for name, there in dataclasses.asdict(begun).items()
-        if name != "precision" and here[name] != there), "")
-
-
-def _text(value: Any) -> str:
-    return (", ".join(value) or "none") if isinstance(value, tuple) else str(value)
+    here, there = ({
+        name: (", ".join(value) or "none") if isinstance(value, tuple) else str(value)
+        for name, value in dataclasses.asdict(rule).items() if name != "precision"
+    } for rule in (ours, begun))
+    return next((f"{SEARCH}.{name}: the store has {there[name]}, this run {here[name]}"
+                 for name in there if here[name] != there[name]), "")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sweep.experiment.draws import CALIBRATED
 from sweep.experiment.grid import MAX_DEVIATIONS, Axis, Grid
-from sweep.experiment.parameters import Stage, superseded
+from sweep.experiment.parameters import IN_CAMERA, RIVALS, WORLD, Stage
 from sweep.measure import flags
 from sweep.measure.flags import DetectionStatus, Flag
 from sweep.messages import label
@@ -92,7 +92,12 @@ def fixed_values(pipeline: Grid) -> dict[str, tuple[float | bool | str, dict[str
     They are those of marker and pose that have a value (unless the pose is given otherwise), and
     all that the pipeline gives, in the order of their declaration; a list of numbers as a text.
     """
-    without = superseded(pipeline.given)
+    given = pipeline.given
+    without = {rival for name in given for rival in RIVALS.get(name, ())}
+    if "photographs" in given:
+        without = {*IN_CAMERA, *WORLD, "jitter_px"}
+    elif not given.isdisjoint(WORLD):
+        without = {*IN_CAMERA}
     return {
         each.name: (label(value) if isinstance(value, tuple) else value, {
             "long_name": each.meaning, FIXED: "on the whole grid",

@@ -218,7 +218,7 @@ def _calibration(node: dict[str, Any]) -> Calibration:
     region = named["roi"].value if "roi" in named else None
     if isinstance(region, dict):  # ROS: only a part of the frame may be sent
         whole = {"x_offset": 0, "y_offset": 0, "width": width, "height": height}
-        for name in whole.keys() & region.keys():
+        for name in sorted(whole.keys() & region.keys()):
             if _Entry(name, region[name]).numbers()[0] not in ([0], [whole[name]]):
                 raise ValueError(
                     f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "

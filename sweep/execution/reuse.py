@@ -30,13 +30,24 @@ from sweep.typing import Masks
 class Key(NamedTuple):
     """Parameters that are looked up together, and what finds a row of their values.
 
-    Those of an axis of the old grid: the index along it, None if it has no such row. Or one that
-    the old grid keeps fixed: 0 if it is the same.
+    Those of an ``axis`` of the old grid: the index along it, None if it has no such row. Or one
+    that the old grid keeps fixed: 0 if it is the same. ``new`` are the new grid's axes that have
+    any of them, and ``fixed`` the values of the others there.
     """
 
     axis: str | None
     parameters: tuple[str, ...]
     find: Callable[[tuple[Any, ...]], int | None]
+    new: tuple[Axis, ...]
+    fixed: Mapping[str, Any]
+
+    def found(self, along: Sequence[range]) -> Iterator[int | None]:
+        """Yield what is found for each combination of indices along the new axes, in order."""
+        for chosen in itertools.product(*along):
+            values = dict(self.fixed)
+            for axis, index in zip(self.new, chosen, strict=True):
+                values |= axis.at(index)
+            yield self.find(tuple(values[name] for name in self.parameters))
 
 
 def fixed_value(pipeline: Pipeline, name: str) -> Any:
@@ -44,13 +55,11 @@ def fixed_value(pipeline: Pipeline, name: str) -> Any:
     return 0 if name == TRIAL else pipeline.fixed.get(name)
 
 
-def _axis_key(axis: Axis) -> Key:
-    names = tuple(axis.columns)
+def _row_finder(axis: Axis) -> Callable[[tuple[Any, ...]], int | None]:
     first, *others = axis.columns.values()
     if isinstance(first, range) and not others:  # of trials, which may be many
-        return Key(axis.name, names, lambda row: first.index(row[0]) if row[0] in first else None)
-    rows = {row: k for k, row in enumerate(zip(first, *others, strict=True))}
-    return Key(axis.name, names, rows.get)
+        return lambda row: first.index(row[0]) if row[0] in first else None
+    return {row: k for k, row in enumerate(zip(first, *others, strict=True))}.get
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,26 +87,17 @@ class Source:
     def of(new: Pipeline, store: RunStore, done: frozenset[int]) -> Source:
         """Return how the cells of a new grid are found in a store."""
         old = store.pipeline
-        keys = [_axis_key(axis) for axis in old.axes]
-        owned = {name for key in keys for name in key.parameters}
-        keys += [Key(None, (name,), {(fixed_value(old, name),): 0}.get)
-                 for axis in new.axes for name in axis.columns if name not in owned]
-        return Source(store, new, done, tuple(keys))
-
-    def axes_of(self, key: Key) -> list[Axis]:
-        """Return the new axes that have a key's parameters."""
-        return [axis for axis in self.new.axes
-                if not axis.columns.keys().isdisjoint(key.parameters)]
-
-    def found(self, key: Key, along: Sequence[range]) -> Iterator[int | None]:
-        """Yield what a key finds for each combination of indices along its new axes, in order."""
-        fixed = {name: fixed_value(self.new, name) for name in key.parameters}
-        axes = self.axes_of(key)
-        for chosen in itertools.product(*along):
-            values = dict(fixed)
-            for axis, index in zip(axes, chosen, strict=True):
-                values |= axis.at(index)
-            yield key.find(tuple(values[name] for name in key.parameters))
+        owned = {name for axis in old.axes for name in axis.columns}
+        looked_up: list[tuple[str | None, tuple[str, ...], Callable[..., int | None]]] = [
+            *((axis.name, tuple(axis.columns), _row_finder(axis)) for axis in old.axes),
+            *((None, (name,), {(fixed_value(old, name),): 0}.get)
+              for axis in new.axes for name in axis.columns if name not in owned),
+        ]
+        return Source(store, new, done, tuple(
+            Key(axis, names, find,
+                tuple(each for each in new.axes if not each.columns.keys().isdisjoint(names)),
+                {name: fixed_value(new, name) for name in names})
+            for axis, names, find in looked_up))
 
     def located(
         self, order: Sequence[str], cuts: Mapping[str, range]
@@ -119,9 +119,9 @@ class Source:
         exists = np.ones(shape, dtype=bool)
         indices: dict[str, NDArray[np.intp]] = {}
         for key in self.keys:
-            names = [axis.name for axis in self.axes_of(key)]
+            names = [axis.name for axis in key.new]
             along = [cuts[name] for name in names]
-            at = np.array([-1 if index is None else index for index in self.found(key, along)])
+            at = np.array([-1 if index is None else index for index in key.found(along)])
             axes = [names.index(name) for name in order if name in names]
             spread = at.reshape([len(part) for part in along]).transpose(axes)[
                 tuple(slice(None) if name in names else None for name in order)]
@@ -182,11 +182,10 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         ):
             faults.append(_difference(pipeline, old, name))
     for key in source.keys:
-        axes = source.axes_of(key)
-        if len(axes) > 1 or drawn.intersection(key.parameters):
+        if len(key.new) > 1 or drawn.intersection(key.parameters):
             continue  # looked up cell by cell, or a fault that is noted already
-        if all(index is None for index in source.found(key, [range(len(axis)) for axis in axes])):
-            names = dict.fromkeys([*(axis.name for axis in axes), key.axis or key.parameters[0]])
+        if all(index is None for index in key.found([range(len(axis)) for axis in key.new])):
+            names = dict.fromkeys([*(axis.name for axis in key.new), key.axis or key.parameters[0]])
             faults.append(
                 f"{', '.join(names)}: no values of {', '.join(sorted(key.parameters))} go together "
                 "in both" if len(key.parameters) > 1
@@ -253,7 +252,11 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
     processors: set[str] = set()
     for source in sources:
         exists, at = source.located(order, cuts)
-        numbers = _block_numbers(source, at, exists.shape)
+        blocks, numbers = source.store.blocks, np.zeros(exists.shape, dtype=np.intp)
+        for axis, extent, count in zip(
+            source.store.pipeline.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
+        ):
+            numbers = numbers * count + at[axis.name] // extent
         taken = np.zeros_like(available)
         wanted = exists & ~available
         for number in source.done.intersection(np.unique(numbers[wanted]).tolist()):
@@ -273,19 +276,6 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
         available |= taken
     searches = pipeline.size(Stage.detection)
     return ReusedCells(values, available.reshape(len(block), searches, -1), processors)
-
-
-def _block_numbers(
-    source: Source, at: dict[str, NDArray[np.intp]], shape: tuple[int, ...]
-) -> NDArray[np.intp]:
-    """Return the number of the old block that each cell lies in."""
-    blocks = source.store.blocks
-    numbers = np.zeros(shape, dtype=np.intp)
-    for axis, extent, count in zip(
-        source.store.pipeline.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
-    ):
-        numbers = numbers * count + at[axis.name] // extent
-    return numbers
 
 
 def _copied(

@@ -4,7 +4,7 @@
 
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
-Efficiency is the workers' busy share; start and end count more with few ``--waves`` (blocks a
+The workers' busy share has start and end in it, which count more with few ``--waves`` (blocks a
 worker). The second table is of stores of ``--stored`` committed blocks, of which only receipts are
 made: processor seconds.
 """
@@ -149,7 +149,7 @@ def simulated(count, waves, folder):
         return {
             "workers": count, "blocks": len(store.blocks), "block_s": round(block_s, 2),
             "blocks_a_s": round(len(store.blocks) / wall, 1),
-            "efficiency": round(busy_s / workers / wall, 3),
+            "with_start_and_end": round(busy_s / workers / wall, 3),
             **{f"{name}_core": round((cpu_s(process) - spent[name]) / wall, 2)
                for name, process in processes.items()},
             **{f"{name}_mb": round(process.memory_info().rss / 1e6)

@@ -1,27 +1,22 @@
 """The table of the poses that a wanted precision needed."""
 
 import numpy as np
-import pytest
 import xarray as xr
 
 from sweep.analysis.decisions import Reached
 from sweep.report.figures import precision_table
 
 
-@pytest.fixture
-def table():
-    """Return what `precision_reached` gives of three conditions, two solvers and one quantity."""
+def test_each_configuration_has_the_number_of_conditions_by_flag():
+    """What `precision_reached` gives of three conditions, two solvers and one quantity."""
     reached = np.array([[[1], [2], [3]], [[1], [1], [4]]], dtype=np.uint8)
-    return xr.Dataset(
+    table = xr.Dataset(
         {"reached": (("solver", "side_px", "quantity"), reached),
          "half_width": (("solver", "side_px", "quantity"), reached * 0.01),
          "run": (("solver", "side_px"), np.array([[300, 50, 100]] * 2)),
          "wanted": ("quantity", [0.02])},
         {"solver": ["ippe", "sqpnp"], "side_px": [10, 20, 30], "quantity": ["detection_rate"]},
         {"configuration_dims": ["solver"]})
-
-
-def test_each_configuration_has_the_number_of_conditions_by_flag(table):
     shown = precision_table(table.set_coords("wanted"))
     rows = shown.rows
     assert "3 conditions, which took 50 to 300 poses each" in shown.caption

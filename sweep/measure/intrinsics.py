@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from sweep.measure.flags import CalibrationStatus
+from sweep.model import calibration
 from sweep.typing import Floats
 
-VIEW = ("fx_px", "fy_px", "cx_px", "cy_px")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-INTRINSICS = (*VIEW, *COEFFICIENTS)
+COEFFICIENTS = calibration.COEFFICIENTS[:5]
+INTRINSICS = (*calibration.VIEW, *COEFFICIENTS)
 """The numbers of a camera that are estimated, in the order of arrays."""
 
 FREE_COEFFICIENTS: dict[int, int] = {

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sweep.measure import detectors
 from sweep.measure.classify import Findings, TargetScenes
-from sweep.measure.detectors import SearchOutput
+from sweep.measure.detectors import DetectorSetting, SearchOutput
 from sweep.measure.flags import DetectionStatus
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
@@ -55,10 +55,8 @@ class ImageSearch:
         if target.is_marker:
             output = SearchOutput(*found)
         else:
-            opencv, own = detectors.DetectorSetting, self.setting
-            output = detectors.completed(
-                image, target, found, self.on_board, own if isinstance(own, opencv) else opencv()
-            )
+            own = self.setting if isinstance(self.setting, DetectorSetting) else DetectorSetting()
+            output = detectors.completed(image, target, found, self.on_board, own)
         self._last = image, dictionary, output
         return output
 

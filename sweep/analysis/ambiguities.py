@@ -1,4 +1,4 @@
-"""What a threshold on the ambiguity of planar poses keeps: of the poses, and of the flips.
+"""Poses and flips that a threshold on the ambiguity of planar poses keeps.
 
 The ratio of a pose is its reprojection error over that of the other planar solution: the
 "ambiguity" that users compare with a fixed number such as 0.2.
@@ -60,7 +60,7 @@ class ThresholdChoice(Flag):
 
 
 def ambiguity_ratio(reprojection_px: ArrayLike, alternative_px: ArrayLike) -> Floats:
-    """Return the ratio (...) of reprojection errors, that of the pose over that of the other.
+    """Return the ratio (...) of reprojection errors, the pose's over the other solution's.
 
     0 if there is no other solution (NaN), so that every threshold keeps the pose; 1 if both are 0,
     since nothing tells them apart; infinite if only the other's is 0. Above 1 the solver did not
@@ -108,7 +108,7 @@ def ambiguity(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None, *,
     thresholds: Iterable[float] = THRESHOLDS, flip_rate: float = 0.01, min_kept: float = 0.05,
 ) -> xr.Dataset:
-    """Return what thresholds on the ratio of both reprojection errors keep, and which one to take.
+    """Return the poses that thresholds on the ratio of reprojection errors keep, and which to take.
 
     A threshold keeps the solved poses with ``reprojection_error_px /
     alternative_reprojection_error_px`` of at most itself. A pose without another solution is
@@ -119,7 +119,7 @@ def ambiguity(
     results, bins
         As in `sweep.analysis.detection_rate`.
     per
-        Dimensions that are kept beside those of the detector and the estimator: configurations
+        Dimensions that are kept beside the detector's and the estimator's: configurations
         are never pooled.
     thresholds
         What to try, numbers of at least 0; infinity, which keeps all, is always among them.
@@ -242,7 +242,7 @@ CHOSEN = {
     "right_rejected_rate": (
         "right_rejected_rate", "rejected of the poses not flipped, at the chosen threshold"),
 }
-"""What is told at the chosen threshold: its name there, and what it is."""
+"""Variables at the chosen threshold: name there -> description."""
 
 
 def _with_choice(

@@ -89,7 +89,7 @@ def camera_calibrations(
     ArgumentError
         If an argument is not as expected.
     DatasetError
-        If the results are not those of boards, or have too few trials.
+        If the results show no boards, or have too few trials.
 
     Notes
     -----
@@ -188,7 +188,7 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
           and the root mean square of the reported standard deviations.
         - ``coverage`` (..., intrinsic): share of the 95 % intervals, the estimate plus or minus
           1.96 reported standard deviations, that hold the truth; ``coverage_low``,
-          ``coverage_high``: its 95 % interval (Wilson). NaN for what is not estimated.
+          ``coverage_high``: its 95 % interval (Wilson). NaN for numbers that are not estimated.
         - ``position_rmse_m`` (..., direction, xyz).
 
     Raises

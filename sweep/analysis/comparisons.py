@@ -79,7 +79,7 @@ class Pair:
     Parameters
     ----------
     arrays
-        Those of `paired_arrays`, (groups, cells, draws, settings, ...).
+        Arrays of `paired_arrays`, (groups, cells, draws, settings, ...).
     """
 
     def __init__(self, arrays: Arrays) -> None:
@@ -149,7 +149,7 @@ ROTATION, _DEPTH = QUANTITIES[:2]
 def compare(
     first: xr.Dataset, second: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:
-    """Return what differs between two configurations on the same scenes, second minus first.
+    """Return the differences of two configurations on the same scenes, second minus first.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
 
 
 # --------------------------------------------------------------------------------------------------
-# What a renderer changes against the exact one, paired scene by scene.
+# Changes by a renderer against the exact one, paired scene by scene.
 
 CORNERS = "corner_error_px"
 OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
@@ -344,13 +344,13 @@ _POSE_DIMENSIONS = 4
 
 
 def corners_of(results: xr.Dataset) -> str:
-    """Return the name of the corners' errors: a marker's, or those of a board's markers."""
+    """Return the name of the corners' errors: a marker's, or a board's markers'."""
     return OF_BOARDS if OF_BOARDS in results else CORNERS
 
 
 @describes
 def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
-    """Return what each renderer changes against ``reference``, paired scene by scene.
+    """Return each renderer's changes against ``reference``, paired scene by scene.
 
     Parameters
     ----------
@@ -362,8 +362,8 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Dimensions: renderer and those of the detector's settings; for the pose variables also
-        those of the estimator's. All others are pooled. The interval of
+        Dimensions: renderer and the detector's settings; for the pose variables also
+        the estimator's. All others are pooled. The interval of
         ``x`` is in ``x_low`` and ``x_high``.
 
         - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
@@ -497,7 +497,7 @@ def regressions(
     old, new
         Two stores over the same scenes and configurations, with the same seed.
     variables
-        Names of what is required; without any, rotation and range are compared.
+        Names of required quantities; without any, rotation and range are compared.
     per
         Axes whose values are conditions; others of the scene are pooled.
 
@@ -591,7 +591,7 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Dimensions: those of the detector's settings, for estimates and poses also those of the
+        Dimensions: the detector's settings, for estimates and poses also the
         estimator's; ``statistic``: median, p99 and worst. Scenes are pooled.
 
         - ``detections`` and ``estimates`` (..., first_flag, second_flag): poses by their flag in
@@ -613,7 +613,7 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
 
     Notes
     -----
-    Counts and quantiles are those of the poses that were computed; they are no estimates and have
+    Counts and quantiles describe the poses that were computed; they are no estimates and have
     no intervals. `sweep.analysis.compare` tells whether rates and errors differ beyond chance.
 
     Examples
@@ -726,7 +726,7 @@ def _motions(sides: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def _summed(parts: Sequence[xr.Dataset], scene: Sequence[str]) -> xr.Dataset:
-    """Return counts of masks, and `STATISTICS` of the lengths of what differs.
+    """Return counts of masks, and `STATISTICS` of the lengths of the differences.
 
     They are over all dimensions of scenes and of labels.
     """

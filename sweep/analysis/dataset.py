@@ -1,4 +1,4 @@
-"""What an analysis reads of a dataset: axes, draws, stored parameters, labels of flags."""
+"""The parts of a dataset that analyses read: axes, draws, stored parameters, labels of flags."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plugins.declared import recorded_plugins
 
 # --------------------------------------------------------------------------------------------------
-# What the dimensions of a dataset are, and which of them the caller keeps.
+# The kinds of a dataset's dimensions, and which of them the caller keeps.
 
 DRAWS = "trial"
 """The dimension of random draws."""
@@ -49,7 +49,7 @@ def configuration_axes(results: xr.Dataset) -> list[str]:
 
 
 def of_photographs(results: xr.Dataset) -> bool:
-    """Return whether the poses are those of photographs: the draws are then photographs."""
+    """Return whether the scenes are photographs: the draws are then photographs."""
     return PHOTOGRAPHS in results.coords
 
 
@@ -121,7 +121,7 @@ def is_sampling_stopped(results: xr.Dataset) -> bool:
 
 
 def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
-    """Return what a dataset's attributes record of its run.
+    """Return the record of its run in a dataset's attributes.
 
     It is JSON as `sweep.open` returns it, a mapping as Zarr has it; empty if there is none.
     """
@@ -259,7 +259,7 @@ def is_replicated(results: xr.Dataset) -> bool:
 
 
 def replicate_order(results: xr.Dataset, draws: Sequence[str]) -> NDArray[np.intp] | None:
-    """Return the indices of the trials, those of each replicate together; None if not replicated.
+    """Return the indices of the trials, replicate by replicate; None if not replicated.
 
     ``draws`` are the pooled dimensions of draws.
 
@@ -343,7 +343,7 @@ SIZE_AXES = ("side_px", "distance_m")
 """The usual axes along which the size in the image changes."""
 
 SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
-"""What the side depends on: itself, or distance, size and camera."""
+"""Parameters that determine the side: itself, or distance, size and camera."""
 
 
 def image_sides(results: xr.Dataset) -> xr.DataArray:
@@ -434,7 +434,7 @@ def with_sampling(table: xr.Dataset, *datasets: xr.Dataset) -> xr.Dataset:
 def sampling_text(results: xr.Dataset) -> str:
     """Return the rule by which a dataset's sampling was stopped; empty if it was not.
 
-    That is ``stopped by [search]: along = distance_m, max_trials = 240``.
+    An example is ``stopped by [search]: along = distance_m, max_trials = 240``.
     """
     if not is_sampling_stopped(results):
         return ""
@@ -470,7 +470,7 @@ def decode_flags(results: Labelled) -> Labelled:
     Raises
     ------
     ArgumentError
-        For what is no dataset and no variable of one.
+        For an object that is neither a dataset nor a variable of one.
 
     Examples
     --------
@@ -486,7 +486,7 @@ def decode_flags(results: Labelled) -> Labelled:
             "results", type(results).__name__,
             "expected a dataset, as sweep.open returns it, or a variable of one",
         )
-    return results.assign({  # without its coordinates, which are those of the results
+    return results.assign({  # without its coordinates, which the results have
         name: _decoded(variable).variable for name, variable in results.data_vars.items()
     })
 

@@ -376,7 +376,7 @@ def met_run(
     (3, 4)
     """
     at = np.flatnonzero(judged)
-    # Runs begin and end where what is kept changes.
+    # Runs begin and end where the mask changes.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keeps[at], [False]])))
     if not edges.size:
         return None
@@ -442,7 +442,7 @@ def detection_limit(
 
     Notes
     -----
-    The interval is that of `requirement_limits`, for each condition by itself.
+    The interval is computed by `requirement_limits`, for each condition by itself.
 
     Examples
     --------
@@ -490,18 +490,18 @@ def detection_limit(
                 long_name=f"{meaning}, per module", units="px")}
         if along[0] != "side_px":
             out[f"{along[0]}{end}"] = value
-    # Others along the axis, such as the distance of a side, are not those of the answer.
+    # Others along the axis, such as the distance of a side, do not belong to the answer.
     return xr.Dataset({name: each.drop_vars(along, errors="ignore").reset_coords(drop=True)
                        for name, each in out.items()})
 
 
 # --------------------------------------------------------------------------------------------------
-# What is wrong with a choice before anything is computed, a line each.
+# Faults of a choice that show before anything is computed, a line each.
 
 def choice_faults(pipeline: Pipeline, rule: StoppingRule, shares: ErrorShares) -> list[str]:
-    """Return what makes a choice impossible.
+    """Return the reasons why a choice is impossible.
 
-    Those are requirements that cannot be, and those that ``max_trials`` cannot show to be met even
+    Such are requirements that cannot hold, and ones that ``max_trials`` cannot show to be met even
     if no trial fails.
     """
     required, faults = read_requirements(rule.requirements)
@@ -541,7 +541,7 @@ def least_draws(requirement: Requirement, share: float) -> int:
 
 
 # --------------------------------------------------------------------------------------------------
-# The walk from the safe end of an axis to the wanted one: what is answered, what is needed still.
+# The walk from the safe end of an axis to the wanted one: answers so far, and trials still needed.
 #
 # The values of the axis stand in the order of the walk: for the smallest size that will do, from
 # the largest down. Each value's conditions are decided one by one. The answer is the last value
@@ -711,7 +711,7 @@ class Answer:
     passing
         Those values beyond.
     nearest
-        If none is met: what is nearest to it.
+        If none is met: the nearest alternative.
     is_open
         Whether it is undecided what the answer is: the next value may meet them, too.
     possible
@@ -749,7 +749,7 @@ class ChoiceCells:
     hopeless
         (alternatives, values, conditions): undecided, and no number of trials will tell.
     rule, shares
-        What is sought, and the shares of the error probability that a decision may spend.
+        The search, and the shares of the error probability that a decision may spend.
     """
 
     table: xr.Dataset
@@ -914,7 +914,7 @@ class WantedPrecision:
 
     @property
     def relative_to(self) -> str:
-        """What the half-width is a share of; empty for a rate."""
+        """Quantity of which the half-width is a share; empty for a rate."""
         return "" if self.requirable.is_rate else "RMSE" if self.spread else "value"
 
     @property
@@ -924,9 +924,9 @@ class WantedPrecision:
             if "_bias_" in self.name else None
 
     def statistics(self, prefix: str) -> list[Statistic[Poses]]:
-        """Return what must be computed, the names of their variables beginning with a prefix.
+        """Return the statistics that must be computed, their variables' names with a prefix.
 
-        Their intervals are to be those of stores whose sampling was stopped.
+        Their intervals must hold for stores whose sampling was stopped.
         """
         parts = self.requirable.computed(prefix, LEVEL)
         return parts + self.spread.computed(f"{prefix}of ", LEVEL)[:1] if self.spread else parts
@@ -1000,9 +1000,9 @@ class WantedPrecision:
 
 
 def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
-    """Return what some names and half-widths want.
+    """Return the precisions that names and half-widths ask for.
 
-    Names are those of requirements (`sweep.analysis.requirements.parse_requirements`).
+    Names are as in requirements (`sweep.analysis.requirements.parse_requirements`).
 
     Raises
     ------
@@ -1052,9 +1052,9 @@ def precision_reached(
     wanted
         Half-widths of intervals by the name of the quantity, such as ``{"detection_rate": 0.02}``:
         of rates as they are, of a bias relative to the root mean square error, of all else
-        relative to the value. By default those of the pipeline's [search].
+        relative to the value. By default as in the pipeline's [search].
     per
-        Dimensions whose values are conditions; by default those of the pipeline's [search].
+        Dimensions whose values are conditions; by default as in the pipeline's [search].
         Detector and estimator are always kept.
 
     Returns

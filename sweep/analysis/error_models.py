@@ -46,7 +46,7 @@ from sweep.typing import Floats, Integers, Masks
 #
 # Between knots the bias and the logarithm of the standard deviation are linear in ln(distance),
 # ln(side) and the viewing angle. With two knots of the distance the standard deviation is a power
-# of it: more knots are for what is no power law.
+# of it: more knots are for curves that are no power law.
 
 FLOOR = 1e-18
 """Smallest mean square of an error: its unit is a radian or a share of the distance."""
@@ -226,7 +226,7 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     ratio = sums.power_mean(basis @ bias, 2) * np.exp(-fitted)
     bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
     # Mean of (residual² / variance - 1)². A bin's own is too small as often as it has not seen
-    # its tails: it is at least that of all.
+    # its tails: it is at least the variance of all.
     spread = np.maximum(kurtosis - 2.0 * ratio + 1.0, 0.0)
     spread = np.maximum(spread, (count * spread).sum() / count.sum())
     meat = (basis * (count * spread)[:, None]).T @ basis
@@ -442,7 +442,7 @@ CONDITIONS = {
 """Models do not depend on the last, but hold where it was seen."""
 
 PREDICTORS = ("distance_m", "side_px", "viewing_angle_deg")
-"""What models depend on."""
+"""Conditions on which models depend."""
 
 
 @dataclass(frozen=True)
@@ -813,7 +813,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
 def _fits(
     moments: Floats, own: Sequence[Sequence[Floats]], knots: Sequence[Floats]
 ) -> list[Fit]:
-    """Return the fits of the errors with their own knots, at those of all."""
+    """Return the fits of the errors with their own knots, at the knots of all."""
     # Points of the grid of all knots, the last axis fastest.
     points = np.stack([each.ravel() for each in np.meshgrid(*knots, indexing="ij")], axis=-1)
     fits = []
@@ -861,7 +861,7 @@ def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> 
 
 
 def _metres(distance_m: Floats) -> Floats:
-    """Return what errors (quantities, distances) are multiplied with: positions with distances."""
+    """Return the factors of errors (quantities, distances): of positions the distances."""
     scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
     return np.asarray(scale * distance_m + (1.0 - scale))
 
@@ -982,7 +982,7 @@ HALF, FOCAL_SIZE = "half", "focal_size"
 """Names of a block's arrays: the half, fx times the marker's side."""
 
 COUNTS = ("looked_for", "solved", "flipped", "judged")
-"""Columns of what is judged before the shares."""
+"""Columns that are judged before the shares."""
 
 
 class SightErrors(Poses):

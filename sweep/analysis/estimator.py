@@ -62,7 +62,7 @@ ResultT = TypeVar("ResultT")
 
 
 # --------------------------------------------------------------------------------------------------
-# Columns in memory; what is computed of them pose by pose is so for a block at a time.
+# Columns in memory; quantities of single poses are computed a block at a time.
 
 MAX_BLOCK = 1 << 17
 """Poses in a block: a thread needs 25 MB for so many."""
@@ -104,7 +104,7 @@ class Columns(Generic[ViewT]):
         self._views: dict[int, ViewT] = {}
 
     def map(self, function: Callable[[ViewT, tuple[slice, ...]], ResultT]) -> list[ResultT]:
-        """Return what a function gives of the view of each block, and of where the block lies."""
+        """Return the results of a function of each block's view and place."""
         def of_block(number: int) -> ResultT:
             return function(self._view_of(number), self._blocks[number])
 
@@ -231,7 +231,7 @@ def stopped_level(level: float) -> float:
 
 
 class Unit(Enum):
-    """What is drawn independently of all else."""
+    """The unit that is drawn independently of all else."""
 
     trial = "trial"
     photograph = "photograph"
@@ -245,7 +245,7 @@ class Design:
     Attributes
     ----------
     unit
-        What is independent: its axis is that of the draws.
+        The independent unit: its axis is the axis of draws.
     points
         Pooled settings that see the same Sobol' point.
     stopped
@@ -475,7 +475,7 @@ def with_unseen_tail(
     geometric mean of the shares seen is at most the arithmetic one, so that it holds there, too).
     Errors of that share are taken to be at most ``factor`` times as large as the largest that was
     seen. That is an assumption: no sample can tell. It lets the end be a p-th part of the square of
-    that and a (1 - p)-th part of the end for what was seen.
+    that and a (1 - p)-th part of the end for the draws that were seen.
 
     The end of 100 normal errors of one component is then 1.24 times their root mean square, 1.11
     times of 400 (1.15 and 1.07 without); with the factor of decisions 1.5 and 1.2 times.
@@ -483,7 +483,7 @@ def with_unseen_tail(
     Parameters
     ----------
     high
-        Upper ends (groups,) of the mean squares of what was seen.
+        Upper ends (groups,) of the mean squares of the draws that were seen.
     largest
         Largest squares (groups,) that were seen.
     draws
@@ -549,7 +549,7 @@ def with_interval(name: str, meaning: str, units: str) -> list[Output]:
 
 
 class Statistic(ABC, Generic[ViewT]):
-    """What is computed of poses; generic over the view of them."""
+    """A statistic of poses; generic over the view of them."""
 
     name: str
     meaning: str
@@ -712,7 +712,7 @@ def newcombe_and_mcnemar(
 # Means of poses' values with their intervals: bias, standard deviation, root mean square.
 
 class Sums(NamedTuple):
-    """What a mean needs of each draw.
+    """The sums of each draw that a mean needs.
 
     Attributes
     ----------
@@ -771,7 +771,7 @@ class Mean(Statistic[ViewT]):
     def sums(
         self, columns: Columns[ViewT], centre: Floats | None = None, *, largest: bool = False
     ) -> Sums:
-        """Return what it needs of each draw: the values, or their squared distance to a centre.
+        """Return the values of each draw, or their squared distances to a centre.
 
         ``centre`` is (groups, components). ``largest``: with the largest value of each draw.
         """
@@ -845,7 +845,7 @@ class PositiveMean(Mean[ViewT]):
         of_points = design.unit is Unit.replicate
         sums = self.scores(columns, largest=of_points)
         sample = Sample(sums.used)
-        # What may be unseen is a draw with all its poses, or a point of the replicates.
+        # A draw with all its poses may be unseen, or a point of the replicates.
         draws: Floats | Integers
         if of_points:
             draws, largest = sample.n / design.points, sums.largest
@@ -860,7 +860,7 @@ class PositiveMean(Mean[ViewT]):
         return value, low, with_unseen_tail(high, most, draws, level, self.unseen_factor)
 
     def scores(self, columns: Columns[ViewT], *, largest: bool) -> Sums:
-        """Return the sums of what the mean is of, ``largest`` as for `sums`."""
+        """Return the sums whose mean is taken, ``largest`` as for `sums`."""
         return self.sums(columns, largest=largest)
 
 
@@ -954,7 +954,7 @@ class FlipMixture(Statistic[Poses]):
         shares = (clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1])
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
-        # What is computed is rounded: the value lies in its interval.
+        # Sums are rounded: the value lies in its interval.
         interval = (square, np.fmin(low, square), np.fmax(high, square))
         ends = [np.where(sample.drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
         return [np.sqrt(each) for each in ends]
@@ -1022,7 +1022,7 @@ def quantile_intervals(
     percents
         Of the values, at or below the quantile.
     design
-        What the draws are.
+        The design of the draws.
     level
         Probability with which the interval is to hold it.
     """
@@ -1151,7 +1151,7 @@ Bins = Mapping[str, Sequence[float]]
 """Edges of bins, by the name of the variable or coordinate that is binned."""
 
 PREFIX = "bin "
-"""What stands before the name of an array that is binned, among a block's arrays."""
+"""Prefix of the name of a binned array, among a block's arrays."""
 
 
 @dataclass(frozen=True)
@@ -1256,7 +1256,7 @@ def aggregate(
     Parameters
     ----------
     results
-        The dataset whose coordinates and variables name what is kept and binned.
+        The dataset whose coordinates and variables are kept and binned.
     inputs
         The arrays, by name, of which ``view`` makes the poses that the statistics read.
     kept
@@ -1327,7 +1327,7 @@ def arranged(
 
 @dataclass(frozen=True)
 class Layout:
-    """What each dimension is: kept, of cells, of draws, or of settings.
+    """The kind of each dimension: kept, of cells, of draws, or of settings.
 
     ``order`` are the indices of the trials by replicate, if they have such: then replicates stand
     in the place of draws.
@@ -1374,5 +1374,5 @@ class Layout:
         values = np.broadcast_to(values, (*shape, *rest))
         if self.order is None:
             return values
-        points = shape[2] // REPLICATES * shape[3]  # what is of a replicate stands together
+        points = shape[2] // REPLICATES * shape[3]  # a replicate's points stand together
         return values[:, :, self.order].reshape((*shape[:2], REPLICATES, points, *rest))

@@ -212,7 +212,7 @@ def looks_factor(count: int) -> float:
 
     Of Clopper and Pearson's interval, enumerated over all paths of the counts at 1 to 21 looks up
     to 10,000 draws, rates from 0.01 to 0.99 and errors from 0.025 to 1e-4, the probability that
-    any look errs is then at most 1.006 times that of a single one.
+    any look errs is then at most 1.006 times a single look's.
 
     Examples
     --------

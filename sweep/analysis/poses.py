@@ -200,7 +200,7 @@ class SignedErrors:
                           + 0.5 * np.sinc(angle / (2.0 * np.pi))**2 * np.cross(error, across))
 
     def _difference(self, estimated: Floats, true: Floats) -> Floats:
-        """Return the angle of the estimated normal to a direction minus that of the true one."""
+        """Return the angle of the estimated normal to a direction minus the true normal's."""
         return np.asarray(np.degrees(angle_between(self._estimated[..., 2], -estimated)
                                      - angle_between(self._rotation[..., 2], -true)))
 
@@ -281,7 +281,7 @@ COMMON = "common"
 """Name of the mask of the trials that all pooled cells have, where sampling was stopped."""
 
 DEPTH = "true_depth_m"
-"""Name, beside those of the dataset's variables, of z of the true position."""
+"""Name of z of the true position, beside the names of the dataset's variables."""
 
 ROTATION_BOUND, DEPTH_BOUND = "rotation_bound", "depth_bound"
 """Names, likewise, of the bounds' parts."""
@@ -313,7 +313,7 @@ SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec", "true_tvec_m")
 errors along axes and about angles."""
 
 BOUND_INPUTS = (*ERROR_INPUTS, ROTATION_BOUND, DEPTH_BOUND)
-"""What a statistic of errors and their bounds reads."""
+"""Variables that a statistic of errors and their bounds reads."""
 
 REQUIRED_VARIABLES = tuple(variables_read(ERROR_INPUTS))
 """Variables that every dataset of results has."""
@@ -530,7 +530,7 @@ QUANTITIES = (
              lambda poses: poses.range_percent, signed=True),
     Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
 )
-"""What `sweep.analysis.error_statistics` is of unless it is asked for others."""
+"""Kinds of error in `sweep.analysis.error_statistics` unless others are asked for."""
 
 
 def _signed(source: str, unit: str, units: str, **words: str) -> tuple[Quantity, ...]:

@@ -71,7 +71,7 @@ from sweep.measure.flags import Flag, flag
 from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
 
 # --------------------------------------------------------------------------------------------------
-# What can be required of results: every output of a statistic that has an interval.
+# Quantities that can be required: every output of a statistic that has an interval.
 #
 # The names are those of `sweep.analysis.error_statistics` (all kinds of error), `efficiency` and
 # `covariance_trust`, and quantiles of the absolute errors along axes and about angles; they come
@@ -150,7 +150,7 @@ class Requirable:
         return 1.0 - (1.0 - (EXACT_LEVEL if self.exact else MEAN_LEVEL)) * share
 
     def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
-        """Return what computes it, its poses and draws; variables' names begin with a prefix.
+        """Return the statistics for it, its poses and draws; variables' names begin with a prefix.
 
         Rates have Clopper and Pearson's interval.
         """
@@ -212,7 +212,7 @@ def requirables() -> dict[str, Requirable]:
 
 
 def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Requirable]:
-    """Return what a record gives with an interval."""
+    """Return the outputs of a record that have an interval."""
     outputs = {output.name: output for output in record.statistic.outputs()}
     found = []
     for name, output in outputs.items():
@@ -228,21 +228,21 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
 
 
 # --------------------------------------------------------------------------------------------------
-# What is wrong with requirements: names, units, limits, contradictions, a line each.
+# Faults of requirements: names, units, limits, contradictions, a line each.
 
 UNITS = {"deg": "degrees", "rad": "radians", "m": "metres", "mm": "millimetres", "percent": "%",
          "px": "pixels", "cm": "centimetres"}
 """Units that names end with."""
 
 STATISTICS = (*PERCENTS, "bias", "sd", "rmse")
-"""What names of statistics of errors have in the middle."""
+"""Middle parts of the names of statistics of errors."""
 
 ENDINGS = ("_rate", "_mean")
 """Endings of names that may be left out."""
 
 
 def named(name: str) -> Requirable:
-    """Return what a name means.
+    """Return the quantity that a name stands for.
 
     Raises
     ------
@@ -286,7 +286,7 @@ EXAMPLES = ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "r
 
 
 def fault_of(what: Requirable, given: RequirementText) -> str:
-    """Return what is wrong with a limit and its unit; empty if nothing is."""
+    """Return the fault of a limit and its unit; empty without one."""
     limit, more = given.limit, given.relation in (">=", ">")
     share = f": write {limit / 100:g} for {limit:g} %" if 2.0 <= limit <= 100.0 else ""
     sign = " (of a bias the absolute value is required)" if what.signed else ""
@@ -322,8 +322,8 @@ def _wrong_unit(what: Requirable, given: RequirementText) -> str:
 def contradictions(given: Sequence[Requirement]) -> list[tuple[str, str]]:
     """Return the requirements that cannot hold together, each as its text and a line.
 
-    What is implied counts: a median is at most the 95 % quantile, a solved pose was detected, and
-    where a 95 % quantile is finite, 95 % of the poses were solved.
+    Implied requirements count: a median is at most the 95 % quantile, a solved pose was detected,
+    and where a 95 % quantile is finite, 95 % of the poses were solved.
     """
     faults = []
     for number, each in enumerate(given):
@@ -390,7 +390,7 @@ def combined_decision(
 ) -> NDArray[np.uint8]:
     """Return the decision of all requirements and conditions over some axes together.
 
-    Not met if any is not, met if all are that can be judged: what is not applicable is left out.
+    Not met if any is not, met if all are that can be judged: not applicable ones are left out.
     Not applicable if none can be judged.
     """
     applicable = decision != Decision.not_applicable
@@ -419,7 +419,7 @@ class ErrorShares:
 
 @dataclass(frozen=True)
 class Requirement:
-    """What is required of a quantity.
+    """A requirement on a quantity.
 
     Attributes
     ----------
@@ -441,7 +441,7 @@ class Requirement:
 
     @property
     def requirable(self) -> Requirable:
-        """What is required."""
+        """The requirement in words."""
         return requirables()[self.variable]
 
     @property
@@ -498,7 +498,7 @@ def parse_requirements(
 def read_requirements(
     texts: Iterable[str]
 ) -> tuple[list[Requirement], list[tuple[str, str]]]:
-    """Return the requirements of some texts, and their faults: texts and what is wrong."""
+    """Return the requirements of some texts, and pairs of a faulty text and its fault."""
     requirements, faults = [], []
     for text in texts:
         try:
@@ -573,7 +573,7 @@ def check_requirements(
     with fewer draws.
 
     A missed marker is an infinite error in every quantile. Where poses were looked for and none
-    was solved, what is required of solved poses is undecided.
+    was solved, requirements on solved poses are undecided.
 
     Examples
     --------
@@ -709,7 +709,7 @@ def draws_needed(
     Parameters
     ----------
     requirement, table
-        What is required, and its decisions (`decide`).
+        The requirement, and its decisions (`decide`).
     solved
         Share of the solved poses.
     share
@@ -979,7 +979,7 @@ def conditions(
     Returns
     -------
     tuple
-        ``per``, else those of the pipeline, else `usual_conditions`.
+        ``per``, else the pipeline's, else `usual_conditions`.
     """
     if per is not None:
         return tuple(per)

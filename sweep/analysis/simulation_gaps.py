@@ -85,7 +85,7 @@ class PairedUnits:
     binning, bin_coordinates
         The edges of the bins, and the bins' coordinates.
     values
-        What is binned of both: name -> (units, rows).
+        Binned variables of both: name -> (units, rows).
     """
 
     sides: Sequence[Arrays]
@@ -255,7 +255,7 @@ def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:
-    """Return an array (c, 1, t, rows, ...) of trials as that of photographs (c, 1, p, rows, ...).
+    """Return an array of trials (c, 1, t, rows, ...) as one of photographs (c, 1, p, rows, ...).
 
     ``trials`` is (p, repeats); of -1 nothing counts, and flags are 0.
     """
@@ -267,7 +267,7 @@ def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:
 
 
 def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
-    """Return what is binned of a dataset: a variable, or what follows from others."""
+    """Return the binned quantity of a dataset: a variable, or one computed from others."""
     if name in results.variables and not is_fixed(results[name]):
         return results[name].reset_coords(drop=True)
     if name == SIDE:
@@ -300,7 +300,7 @@ BY_PHOTOGRAPH = Design(Unit.photograph)
 
 @dataclass(frozen=True)
 class Compared:
-    """What is compared: a rate, or a quantile of the errors (...) of solved poses.
+    """A compared statistic: a rate, or a quantile of the errors (...) of solved poses.
 
     By its ratio, or else by its difference.
     """
@@ -324,14 +324,14 @@ QUANTILES = (
                error=quantity.norm, percent=percent, ratio=True)
       for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()),
 )
-"""What is compared, in the order of the table."""
+"""Compared statistics, in the order of the table."""
 
 
 @describes
 def simulation_gap(
     photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
 ) -> xr.Dataset:
-    """Return statistics of photographs beside those of a simulation, and the gap between them.
+    """Return statistics of photographs and of a simulation, and the gap between them.
 
     Parameters
     ----------

@@ -197,7 +197,7 @@ def flip_rate(
 
 
 OUTCOMES = (*outcomes(counted=True), *outcomes(counted=False))
-"""What a pose can end as: solved, or the step at which it was lost."""
+"""Outcomes of a pose: solved, or the step at which it was lost."""
 
 
 def ends_as(outcome: str, poses: Poses) -> Masks:
@@ -316,7 +316,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
 
     Notes
     -----
-    The test is that of Cochran, Mantel and Haenszel: J. Natl. Cancer Inst. 22 (1959), 719-748.
+    The test: Cochran, Mantel and Haenszel, J. Natl. Cancer Inst. 22 (1959), 719-748.
     Under the hypothesis the ID's detections in a cell are hypergeometric; the tails of their sum
     are taken from the gamma distribution (Pearson's type III) with the same mean, variance and
     skewness, with a continuity correction of 1/2, so that they are right if misses are rare. Draws
@@ -489,7 +489,7 @@ POSE_STATISTICS: tuple[PoseStatistic, ...] = (
     PoseStatistic(DETECTION_RATE, DETECTION_INPUTS), PoseStatistic(SOLVED_RATE, ESTIMATE_INPUTS),
     PoseStatistic(FLIP_RATE, ESTIMATE_INPUTS),
 )
-"""What is known of the poses as such."""
+"""Counts of the poses."""
 
 QUANTILES = ErrorStatistic(
     {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
@@ -519,7 +519,7 @@ ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
             quantity.units, quantity.vector, lambda poses: poses.unflipped),
         of_signed=True),
 )
-"""What is computed of each kind of error; of those of `SIGNED` only what says so."""
+"""Statistics of each kind of error; for `SIGNED` kinds only where it says so."""
 
 
 def quantiles_of(quantity: Quantity) -> PoseStatistic:
@@ -528,7 +528,7 @@ def quantiles_of(quantity: Quantity) -> PoseStatistic:
 
 
 def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[PoseStatistic]:
-    """Return all statistics, those of some kinds of error among them."""
+    """Return all statistics, with the ones of some kinds of error."""
     return [*POSE_STATISTICS, *(
         PoseStatistic(record.make(quantity), (*record.inputs, *quantity.inputs))
         for quantity in quantities for record in ERROR_STATISTICS
@@ -608,8 +608,8 @@ def error_statistics(
     Notes
     -----
     95 % intervals over the random draws, conditional on the grid; NaN if no cell has two draws
-    that count. Those of rates are Wilson's, a little wide if the cells' rates differ. That of a
-    mean is Student's, that of an RMSE or a standard deviation Student's of the logarithm of the
+    that count. Intervals of rates are Wilson's, a little wide if the cells' rates differ; of a
+    mean Student's, of an RMSE or a standard deviation Student's of the logarithm of the
     mean square (`sweep.analysis.estimator`): they need some 50 draws and tails not much heavier
     than normal, for no sample tells of what it has not seen; if a few
     cells have nearly all of the error, only their draws count. That of ``rotation_rmse_deg``
@@ -837,7 +837,7 @@ def efficiency(
     -----
     Both are over the poses that have a bound and are solved and not flipped: a flip is another
     minimum, which the bound does not describe. A biased estimator can be above 1. The intervals
-    are those of the RMSE; the bound is taken as known. Kay, "Fundamentals of Statistical Signal
+    are the RMSE's; the bound is taken as known. Kay, "Fundamentals of Statistical Signal
     Processing: Estimation Theory", 1993, chapter 3.
 
     Examples
@@ -865,7 +865,7 @@ class BoundRatio(RootMeanSquare[Poses]):
     bound: Callable[[Poses], Floats] = field(kw_only=True)
 
     def interval(self, columns: Columns[Poses], design: Design, level: float) -> Interval:
-        """Return the ratio; its interval is that of the error."""
+        """Return the ratio; its interval is the error's."""
         value, low, high = super().interval(columns, design, level)
         squares: Mean[Poses] = Mean(
             "", "", "", lambda poses: self.bound(poses)[..., None], self.used)

@@ -20,7 +20,7 @@ from sweep.plugins.recording import OF_TARGET, REJECTED
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
-# Conventions of other programs, and their detections and poses in those of OpenCV.
+# Conventions of other programs, and their detections and poses in OpenCV's conventions.
 
 CORNERS = ("TL", "TR", "BR", "BL")
 
@@ -91,7 +91,7 @@ class Conventions:
         return np.asarray(theirs[:, order] - self.pixel_center)
 
     def rotations(self, theirs: Floats) -> Floats:
-        """Return rotations (N, 3, 3) of our marker frame, of those of theirs."""
+        """Return rotations (N, 3, 3) of our marker frame from rotations of the program's."""
         # Rows are their axes in our frame: a point in ours is axesᵀ times theirs.
         axes = np.array([DIRECTIONS[word] for word in self.frame], dtype=np.float64)
         return np.asarray(theirs @ axes)
@@ -122,7 +122,7 @@ SEPARATORS = ",;\t"
 """The header has most of the one that separates; with semicolons, commas are decimal points."""
 
 STEM = r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$"
-"""What is left out of an image's name: folders, and the suffix."""
+"""Parts of an image's name that are left out: folders, and the suffix."""
 
 NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 
@@ -196,7 +196,7 @@ def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
 
 
 def _header_fault(header: Sequence[str], written: Sequence[str]) -> str:
-    """Return what a header lacks, or has twice; ``written`` are the names as the file has them."""
+    """Return the columns that a header lacks, or has twice; ``written`` has the file's spelling."""
     columns = set(header)
     repeated = next((name for name in header if name and header.count(name) > 1), None)
     if repeated is not None:
@@ -226,7 +226,7 @@ def _header_fault(header: Sequence[str], written: Sequence[str]) -> str:
 
 @dataclass(slots=True)
 class Answers:
-    """What a program found in exported images.
+    """Detections and poses of a program in exported images.
 
     Attributes
     ----------

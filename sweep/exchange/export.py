@@ -88,7 +88,7 @@ def image_batch(
 ) -> ImageBatch:
     """Return scenes by their numbers (N,); ``windowed``: images of the target's surroundings.
 
-    A window is the smallest that holds those of all detector settings of the experiment.
+    A window is the smallest that holds the windows of all detector settings of the experiment.
     """
     indices = pipeline.experiment.all_scenes.indices(numbers)
     batch = scenes_at(pipeline.experiment, indices)
@@ -350,7 +350,7 @@ COCO_INFO = {
     "pixel_center": 0,
     "corner_order": "top left, top right, bottom right, bottom left of the upright marker",
 }
-"""What the COCO-like file says of itself."""
+"""Description inside the COCO-like file."""
 
 
 def _coco(table: pd.DataFrame) -> dict[str, Any]:
@@ -412,13 +412,13 @@ def write_errors(folder: Path) -> Iterator[None]:
 # Export of an experiment: its images, their truth, and camera files, in a folder.
 
 MARK = "export.json"
-"""The file by which a folder is known as an export; it says of what."""
+"""The file by which a folder is known as an export; it names the experiment."""
 
 CHECKSUMS = "images.sha256"
 """Digests of the images that are written, as ``sha256sum -c`` reads them."""
 
 GUIDE = Path(__file__).with_name("readme.md.jinja")
-"""The README of an export: what is in the folder, its conventions, and how answers come back."""
+"""The README of an export: the folder's content, its conventions, and how answers come back."""
 
 EXPERIMENT = "experiment"
 """Folder of the pipeline and of the files that it names."""
@@ -437,7 +437,7 @@ SAMPLE = 8
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """What an export did.
+    """Result of an export.
 
     Attributes
     ----------
@@ -586,7 +586,7 @@ def check_folder(folder: Path, mark: dict[str, Any]) -> bool:
 
 
 def read_mark(folder: Path) -> dict[str, Any] | None:
-    """Return what an export's folder says of it; None if it is no export."""
+    """Return the record in an export's folder; None if it is no export."""
     try:
         content = json.loads((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -595,7 +595,7 @@ def read_mark(folder: Path) -> dict[str, Any] | None:
 
 
 def _mark(pipeline: Pipeline, windowed: bool) -> dict[str, Any]:
-    """Return what makes two exports the same: the experiment, the versions, what images show."""
+    """Return the identity of an export: the experiment, the versions, the content of images."""
     made_by = fingerprint(pipeline)
     return {
         "sweep_export": FORMAT,
@@ -641,7 +641,7 @@ def _remove_changed(folder: Path) -> int:
 
 
 class _Part(NamedTuple):
-    """What became of a run of scenes: its images' paths and digests, counts, and bytes."""
+    """Result of a run of scenes: its images' paths and digests, counts, and bytes."""
 
     digests: dict[str, str]
     scenes: int
@@ -703,7 +703,7 @@ def encoded_image(batch: ImageBatch, row: int) -> bytes:
 
 
 def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) -> None:
-    """Refuse what is large, or more than fits: StoreError; by a sample of the images."""
+    """Refuse an export that is large, or more than fits: StoreError; by a sample of the images."""
     numbers = np.unique(np.linspace(0, count - 1, SAMPLE).astype(np.intp))
     batch = image_batch(pipeline, numbers, windowed=windowed)
     sizes: Sequence[int] = [

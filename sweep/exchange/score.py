@@ -37,7 +37,7 @@ from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
-# What may be wrong with the conventions of answers, where the truth fits other ones better.
+# Faults of the conventions of answers, where the truth fits other ones better.
 
 SAMPLE = 500
 """Markers that are compared with the truth."""
@@ -123,9 +123,9 @@ class Scored:
     pipeline
         The experiment, with the answers as its detectors.
     name
-        What its store is named after.
+        The name that its store gets.
     lines
-        What the answers hold, and what may be wrong with their conventions, in lines.
+        Lines on the content of the answers, and on likely faults of their conventions.
     written
         Recordings that were not there before.
     """
@@ -175,9 +175,9 @@ def prepare(
     files
         CSV files, one a program.
     names
-        A name for each program (default: those of the files).
+        A name for each program (default: the files' names).
     conventions
-        Theirs (default: those of the export).
+        Settings of the experiment (default: the export's).
     doubled
         "refuse" where an image has an ID twice, or "nearest".
     beside
@@ -307,7 +307,7 @@ def _write_recording(path: Path, content: bytes) -> None:
 
 
 def _summary(label: str, answers: Answers, images: int, with_pose: bool) -> list[str]:
-    """Return what answers hold, in lines."""
+    """Return lines on the content of answers."""
     decoded = int((answers.marker_id >= 0).sum())
     of_targets = int((answers.marker_id == OF_TARGET).sum())
     if not decoded + of_targets:

@@ -1,7 +1,7 @@
 """Runs: blocks in processes or on a Dask cluster, reuse, progress, status and forecasts."""
 
 BLOCK_TASK = "sweep.execution.block_task"
-"""What a child process imports that measures scenes and computes blocks."""
+"""Module that a child process imports to time scenes and compute blocks."""
 
 TIME_LIMIT_S = 600.0
 """Block timeout in seconds, more if blocks are long (`sweep.execution.forecast.MAX_BLOCK_SHARE`);

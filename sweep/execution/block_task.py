@@ -47,16 +47,16 @@ from sweep.store.provenance import changes, fingerprint
 # The task of a worker: compute one block, write it, and return its receipt.
 
 def other_here(pipeline: Pipeline, begun: Mapping[str, Any]) -> list[str]:
-    """Return what this process has otherwise than a run began with: versions, plug-ins, files.
+    """Return where this process differs from the run's start: versions, plug-ins, files.
 
     Parameters
     ----------
     pipeline
-        What is computed.
+        The experiment.
     begun
         The fingerprint of the process that began.
     """
-    # What a camera file says is in the pipeline's text.
+    # The content of a camera file is in the pipeline's text.
     images = pipeline.values_of("background")
     return [
         *(f"{name} is {own}, the run began with {value}" for name, value, own in changes(
@@ -126,7 +126,7 @@ def compute_blocks(
 
 @contextlib.contextmanager
 def _local_faults(url: str) -> Iterator[None]:
-    """Raise what this machine cannot do with a store as MachineFaultError."""
+    """Raise MachineFaultError for a store that this machine cannot use."""
     try:
         with machine_faults_raised():
             yield
@@ -156,7 +156,7 @@ def compute_block(
     time_limit_s
         Block timeout in seconds.
     decision
-        What the needed scenes follow from; all scenes are needed without one. A block that is
+        Inputs that determine the needed scenes; all scenes are needed without one. A block that is
         committed on another basis is computed again, its computed scenes taken from itself.
 
     Raises

@@ -1,4 +1,4 @@
-"""Where blocks are computed: the loop over what is out, and the child processes of this machine."""
+"""Where blocks are computed: the loop over submitted blocks, and this machine's child processes."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Executor(ABC):
         Parameters
         ----------
         waiting
-            The blocks that wait; more may wait after what was yielded is committed.
+            The blocks that wait; more may wait after a yielded block is committed.
         task
             Gives the arguments of :func:`compute_blocks` for work.
         limit_s
@@ -92,7 +92,7 @@ class Executor(ABC):
             If the store was moved, deleted or replaced.
         """
         finished: SimpleQueue[Any] = SimpleQueue()
-        # What is out, and how it failed before.
+        # Submitted blocks, and how they failed before.
         out: dict[Any, tuple[Work, list[Failed]]] = {}
 
         last, told_s = time.monotonic(), SILENCE_S
@@ -146,7 +146,7 @@ class Executor(ABC):
 
     @abstractmethod
     def cancel(self, out: Collection[Any]) -> None:
-        """Take back what is still out."""
+        """Take back the blocks that are still submitted."""
 
 
 # --------------------------------------------------------------------------------------------------

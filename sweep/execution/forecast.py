@@ -1,4 +1,4 @@
-"""What a run takes, from a few scenes that are timed: its blocks, its time, its disk."""
+"""The cost of a run, from a few timed scenes: its blocks, its time, its disk."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from sweep.store.blocks import RunStore, receipts
 from sweep.store.locations import is_remote
 
 # --------------------------------------------------------------------------------------------------
-# What a scene takes: a seeded random batch of scenes is timed in a child process.
+# The cost of a scene: a seeded random batch of scenes is timed in a child process.
 
 TIMING_S = 0.2
 """Seconds of the batch of scenes that is timed before blocks are cut."""
@@ -58,7 +58,7 @@ UNMEASURED_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What a scene takes.
+    """The cost of a scene.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def measured_or_assumed(child: Child, pipeline: Pipeline, block_limit_s: float) 
     """Time scenes, which may crash or raise: then :data:`UNMEASURED_S` is assumed.
 
     Also if this machine is at fault: whether the workers' are is seen by their blocks. The time
-    limit is that of a block in seconds.
+    limit is a block's, in seconds.
     """
     try:
         return measure(child, pipeline, min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S))
@@ -239,7 +239,7 @@ def blocks_of(
     total_s = pipeline.size(Stage.scene) * scene_s
     rule = make_rule(pipeline)
     if rule is not None:
-        # What is written of a block costs as much if few of its scenes are needed.
+        # Writing a block costs as much if few of its scenes are needed.
         total_s = max(total_s * rule.ends[0] / rule.ends[-1], WAVE_BLOCK_S * BLOCKS_PER_WORKER)
     work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
     most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1))
@@ -257,7 +257,7 @@ def blocks_of(
 def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int, ...]:
     """Return the extents of blocks of at most ``target`` scenes.
 
-    With a rule, the trials of a block are those of a wave, or an equal part of them.
+    With a rule, a block has the trials of a wave, or an equal part of them.
     """
     order = sorted(range(len(axes)), key=lambda k: (axes[k].name != TRIAL, k), reverse=True)
     extents = [1] * len(axes)
@@ -292,14 +292,14 @@ SAMPLED_RECEIPTS = 100
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What a run takes.
+    """The cost of a run.
 
     Attributes
     ----------
     seconds, workers
         Time, with so many workers.
     bytes
-        What it writes, before compression.
+        Bytes that it writes, before compression.
     files
         How many files it makes.
     """
@@ -312,14 +312,14 @@ class Demand:
 
 @dataclass(frozen=True, slots=True)
 class FreeDisk:
-    """What is free on a disk; ``files`` is None where their number is not limited."""
+    """Free space on a disk; ``files`` is None where their number is not limited."""
 
     bytes: int
     files: int | None
 
 
 def free_disk(url: str) -> FreeDisk | None:
-    """Return what is free on the disk of a local store; None if that is not known."""
+    """Return the free space on the disk of a local store; None if it is not known."""
     if is_remote(url):
         return None
     path = Path(url).absolute()
@@ -335,7 +335,7 @@ def free_disk(url: str) -> FreeDisk | None:
 def demand_of(
     pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int
 ) -> Demand:
-    """Return what the ``left`` of a run's blocks take.
+    """Return the cost of the ``left`` of a run's blocks.
 
     A block has a file for each variable, and its receipt.
     """
@@ -407,7 +407,7 @@ START_S = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run would take.
+    """The expected cost of a run.
 
     Attributes
     ----------
@@ -444,7 +444,7 @@ class Forecast:
 
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
-    """Return what a run would take; write nothing.
+    """Return the expected cost of a run; write nothing.
 
     A seeded sample of scenes is measured in a child process, for a few seconds at most,
     compilation not counted.
@@ -499,6 +499,6 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
 
 
 def least_share(pipeline: Pipeline) -> float:
-    """Return the share of the poses that is computed in any case: in waves, that of the first."""
+    """Return the share of the poses that is computed in any case: in waves, the first wave's."""
     rule = make_rule(pipeline)
     return 1.0 if rule is None else rule.ends[0] / rule.ends[-1]

@@ -37,7 +37,7 @@ def search_limits(
     settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
     begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
 ) -> tuple[xr.Dataset, Summary | None]:
-    """Run a search, and return its limits and what was run, None if nothing had to be.
+    """Run a search, and return its limits and the run's summary, None if nothing had to run.
 
     Parameters
     ----------

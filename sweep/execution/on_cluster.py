@@ -59,12 +59,12 @@ def connected(
     pipeline: Pipeline, scheduler: str | None, client: Client | Cluster | None,
     workers: int | None = None,
 ) -> Iterator[OnCluster]:
-    """Return what computes on a cluster.
+    """Return the executor on a cluster.
 
     Parameters
     ----------
     pipeline
-        What is to be computed.
+        The experiment.
     scheduler
         Address of a running scheduler, or :data:`LOCAL`.
     client
@@ -169,7 +169,7 @@ def _checked_client(client: Client | Cluster | None, name: str) -> Client | Clus
 
 
 def _name(client: object) -> str:
-    """Return what a message calls a client or cluster: its type, and the scheduler's address."""
+    """Return the name of a client or cluster in messages: its type, and the scheduler's address."""
     scheduler = getattr(client, "scheduler", None)
     address = getattr(scheduler, "address", getattr(client, "scheduler_address", None))
     return f"{type(client).__name__}({address})"
@@ -184,7 +184,7 @@ class Worker(NamedTuple):
 
 
 def this_process(pipeline: Pipeline, begun: dict[str, Any]) -> Worker:
-    """Return what the numbers of the process that calls this depend on."""
+    """Return the versions and processor that the calling process' numbers depend on."""
     return Worker(other_here(pipeline, begun), (socket.gethostname(), os.getpid()), processor())
 
 
@@ -376,7 +376,7 @@ class OnCluster(Executor):
         return receipts
 
     def cancel(self, out: Collection[Any]) -> None:
-        """Take back what is still out; a caller's cluster outlives the run."""
+        """Take back the blocks that are still submitted; a caller's cluster outlives the run."""
         if out and self._client.status == "running":
             with contextlib.suppress(OSError, TimeoutError):
                 self._client.cancel(list(out))

@@ -25,7 +25,7 @@ class Progress:
     Attributes
     ----------
     done
-        Poses that are committed, those of earlier runs into the store included.
+        Poses that are committed, by earlier runs into the store, too.
     total
         Poses of the grid.
     detected
@@ -62,12 +62,12 @@ ProgressReport = Callable[[Progress], None]
 
 
 StageReport = Callable[[str, float], None]
-"""Called with what is being done, and the share of it that is done."""
+"""Called with the current step, and the share of it that is done."""
 
 
 @contextlib.contextmanager
 def stage_display() -> Iterator[StageReport]:
-    """Show what is being done on stderr: a bar on a terminal, else a line for each new thing."""
+    """Show the current step on stderr: a bar on a terminal, else a line for each new step."""
     printed: list[str] = []
 
     def report(what: str, _share: float) -> None:
@@ -84,7 +84,7 @@ def stage_display() -> Iterator[StageReport]:
 
 @contextlib.contextmanager
 def progress_report(progress: bool | ProgressReport | None) -> Iterator[ProgressReport | None]:
-    """Return what is called with a run's progress.
+    """Yield the function that is called with a run's progress.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class Key(NamedTuple):
     fixed: Mapping[str, Any]
 
     def found(self, along: Sequence[range]) -> Iterator[int | None]:
-        """Yield what is found for each combination of indices along the new axes, in order."""
+        """Yield the matching cell for each combination of indices along the new axes, in order."""
         for chosen in itertools.product(*along):
             values = dict(self.fixed)
             for axis, index in zip(self.new, chosen, strict=True):
@@ -75,7 +75,7 @@ class Source:
     done
         Numbers of the old store's committed blocks.
     keys
-        What is looked up of each cell.
+        Values that are looked up for each cell.
     """
 
     store: RunStore
@@ -235,7 +235,7 @@ class ReusedCells:
 def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
     """Read a block's reusable cells from old stores; of several, the first that has a cell."""
     settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
-    # The last axis is that of a grid without any.
+    # The last axis stands in for a grid without any.
     order = [*(axis.name for axis in (*pipeline.experiment.scene_axes, *settings)), ""]
     parts = [range(*cut) for cut in zip(block.starts, block.stops, strict=True)]
     parts += [*(range(len(axis)) for axis in settings), range(1)]

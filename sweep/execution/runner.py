@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 # --------------------------------------------------------------------------------------------------
-# A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
+# A run from a pipeline to a finished store: prepare, compute and finish, in order.
 
 
 def execute(
@@ -64,7 +64,7 @@ def execute(
     progress: ProgressReport | None = None,
     child: Child | None = None,
 ) -> Summary:
-    """Run a pipeline into a store; what is committed there already is not computed again.
+    """Run a pipeline into a store; blocks that are committed there are not computed again.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _compute_and_close(
     store: RunStore, executor: Executor, sources: Sequence[str], time_limit_s: float,
     interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
-    """Compute the blocks that are not committed; return counts of what was computed."""
+    """Compute the blocks that are not committed; return counts of the computed poses."""
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)

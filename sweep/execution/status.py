@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 # --------------------------------------------------------------------------------------------------
-# What the receipts of a store add up to.
+# Totals of a store's receipts.
 
 MAX_ROWS = 1000
 """Failed cells, and as many crashed ones, that are listed of a store; the flags count all."""
@@ -184,7 +184,7 @@ def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of the cells of a store.
+    """The outcome of the cells of a store.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ def outcome_of(url: str, totals: Totals, first: str) -> Outcome:
     url
         The store, for the command that repeats failures.
     totals
-        What its receipts add up to.
+        Totals of its receipts.
     first
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
@@ -415,11 +415,11 @@ def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# What a run did, in one record.
+# The result of a run, in one record.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary(Outcome):
-    """What a run did; ``sweep run --json`` prints it.
+    """The result of a run; ``sweep run --json`` prints it.
 
     Attributes
     ----------
@@ -470,7 +470,7 @@ class Summary(Outcome):
 
     @property
     def detected_line(self) -> str:
-        """Detections, of what was looked for, in words."""
+        """Detections among the markers that were looked for, in words."""
         return f"detected {self.detected:,} of {self.looked_for:,} looked for"
 
 
@@ -579,7 +579,7 @@ class Status(Outcome):
         conditions need no more trials; None of a run of fixed trials.
     processors
         Blocks by the features of the processors that computed them: where there are several, the
-        last digits of results differ from those of a uniform run.
+        last digits of results differ from a uniform run's.
     """
 
     store: str

@@ -24,7 +24,7 @@ SETTLED_AT_ONCE = 64
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What one task does: blocks by their numbers, and what their needed scenes follow from.
+    """One task: blocks by their numbers, and the inputs that determine their needed scenes.
 
     Without a decision, all scenes are computed.
     """
@@ -56,7 +56,7 @@ class AnyOrder:
 
 
 class _Known(NamedTuple):
-    """What is kept of a committed block's receipt; ``content`` is a digest of what rules read."""
+    """The kept part of a committed block's receipt; ``content`` is a digest of what rules read."""
 
     basis: int | None
     content: int
@@ -65,7 +65,7 @@ class _Known(NamedTuple):
 
 
 class InWaves:
-    """Blocks in waves: those of a group's next wave wait for all of the one before.
+    """Blocks in waves: a group's next wave waits for all blocks of the one before.
 
     A block is computed again if it was committed on another basis: under another rule, or on
     results that were computed again since.
@@ -105,7 +105,7 @@ class InWaves:
         return sum(self._settled_shares.values()) / self._waves.groups
 
     def next(self) -> Work | None:
-        """Return what can be computed now."""
+        """Return the blocks that can be computed now."""
         while not self._ready:
             group = next(self._fresh, None)
             if group is None:

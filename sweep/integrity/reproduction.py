@@ -251,7 +251,7 @@ def reproduce(
         A value of each axis, such as "distance_m=0.3,solver=ippe"; the first one of axes that it
         does not name.
     whole_frame
-        Whether the image is that of the whole frame, and not of the marker's surroundings.
+        Whether the image shows the whole frame, not the marker's surroundings alone.
     time_limit_s
         Timeout in seconds.
 

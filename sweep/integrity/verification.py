@@ -39,19 +39,19 @@ from sweep.store.blocks import Receipt, RunStore
 from sweep.store.locations import translate_errors
 
 # --------------------------------------------------------------------------------------------------
-# What a verification finds, in one record that each check adds to.
+# Findings of a verification, in one record that each check adds to.
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What is damaged.
+    """A damage of a store.
 
     Attributes
     ----------
     where
         A key, an array, a block's name, a scene as ``sweep repro`` takes it, or a part's name.
     what
-        What is wrong.
+        The fault.
     block
         Number of the block that is damaged, None if none is.
     """
@@ -80,12 +80,13 @@ class IntegrityReport:
     not_sampled
         Why none was, if none was.
     damage
-        What is damaged; empty for a sound store.
+        Damages; none in a sound store.
     unstable
-        The name of what gives other answers from call to call, or with the other scenes of a call,
-        if recomputed scenes differ for that reason: no block is damaged. It is last in ``damage``.
+        The name of a plug-in or setting that gives other answers from call to call, or with the
+        other scenes of a call, if recomputed scenes differ for that reason: no block is damaged. It
+        is last in ``damage``.
     repaired
-        What was damaged and has been repaired.
+        Damages that have been repaired.
     left_over
         Files that do not belong to the store, such as those that a killed process was writing.
     processors
@@ -134,7 +135,7 @@ def check_blocks(
 
 
 def _checked_block(store: RunStore, number: int) -> tuple[int, Receipt | None, list[Damage]]:
-    """Return the size of a block's chunks, its receipt if that is sound, and what is damaged."""
+    """Return the size of a block's chunks, its receipt if that is sound, and the damages."""
     ((_, receipt, fault),) = blocks.receipts_or_faults(store, [number])
     faults = {blocks.receipt_key(number): fault} if fault else {}
     checksums = {} if receipt is None else receipt.checksums
@@ -317,7 +318,7 @@ def _differing(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _part(pipeline: Pipeline, stage: Stage, configuration: int) -> str:
-    """Return the name of what computes a configuration of a stage, as far as can be told."""
+    """Return the name of the plug-in or setting of a configuration's stage, as far as known."""
     experiment = pipeline.experiment
     if stage is Stage.estimation:
         return experiment.estimators[configuration % len(experiment.estimators)].solver
@@ -383,7 +384,7 @@ def report_on(store: RunStore, sample: int) -> IntegrityReport:
         check_needed(store, sound, report)
     check_scenes(store, sample, sound, report)
     if not lock.is_written(store.storage):
-        # Of an unfinished store, not what is of a block that a run will write again.
+        # Of an unfinished store, no file of a block that a run will write again.
         report.left_over = sorted(key for key in others if report.finished or not (
             key.startswith(f"{blocks.BEGUN}/") or store.chunks.number(key) is not None))
     return report
@@ -466,7 +467,7 @@ def repair(
 
 
 def _rewrite(store: RunStore, keys: Collection[str]) -> None:
-    """Write the files of these keys that follow from the pipeline; delete those of tables.
+    """Write the files of these keys that follow from the pipeline; delete tables.
 
     A finished store's tables are written when it is closed again, but for what was measured.
     """

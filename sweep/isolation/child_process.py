@@ -144,7 +144,7 @@ class Child:
             self._process = subprocess.Popen(  # noqa: S603  (this program)
                 [sys.executable, "-P", "-c", _START, json.dumps(sys.path), self._module,
                  str(theirs.fileno())],
-                # What libraries print is nobody's.
+                # Nobody reads the output of libraries.
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()], env={**os.environ, **SINGLE_THREADED},
                 start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
@@ -170,7 +170,7 @@ class Child:
         Parameters
         ----------
         function, *arguments
-            What is called; it is pickled, so a function of a module.
+            The call; it is pickled, so a function of a module.
         limit_s
             Time limit in seconds; it stands still while code is compiled.
         grace_s

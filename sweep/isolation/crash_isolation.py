@@ -224,7 +224,7 @@ def run_cells_isolated(
     Parameters
     ----------
     pipeline
-        What is computed.
+        The experiment.
     indices
         (N,) indices of the scenes along each scene axis.
     need
@@ -286,7 +286,7 @@ def check_repeatable(
     Parameters
     ----------
     pipeline
-        What was computed.
+        The computed cells.
     indices, need
         (N,) indices of the scenes along each scene axis, and which of their cells were computed,
         as in `sweep.evaluation.block.run_cells`.

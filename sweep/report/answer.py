@@ -74,7 +74,7 @@ class Tile:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a reader wants first.
+    """The answer that a reader wants first.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Answer:
 
 
 def answer(data: ReportData) -> Answer:
-    """Return the answer: to what is required, else the comparison of the configurations.
+    """Return the answer: the decision on requirements, else the comparison of configurations.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def answer(data: ReportData) -> Answer:
 
 
 # --------------------------------------------------------------------------------------------------
-# What is required of a report's store: the decision, how far it holds, with which configuration.
+# Requirements on a report's store: the decision, how far it holds, with which configuration.
 
 ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
 """Decisions, the best first."""
@@ -176,7 +176,7 @@ class Required(NamedTuple):
 
 
 def required(data: ReportData) -> Required:
-    """Return the decisions on what is required of a store.
+    """Return the decisions on the requirements of a store.
 
     The configuration that is named meets all requirements, or else follows them farthest along the
     axis of the conditions; of equals it is the one that the comparison on the same images names.

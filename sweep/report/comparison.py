@@ -121,7 +121,7 @@ class Comparison:
         others = [k for k in range(len(known.names)) if k != self.best]
         if not others:
             return ""
-        # What a wrong belief costs is the question if nothing else varies.
+        # The cost of a wrong belief is the question if nothing else varies.
         others = [k for k in others if not known.wrong[k]] or others
         rival = min(others, key=self.verdict)
         pair = self.differences[rival]
@@ -269,7 +269,7 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
     trade
         With ``cost_ms`` by condition and configuration.
     budget_ms
-        Most milliseconds a frame of what is recommended.
+        Most milliseconds a frame that a recommendation may take.
     """
     results = data.results
     if "renderer" in results.dims:

@@ -41,7 +41,7 @@ WORDS = {
     "rotation_p90_deg": "rotation error, 90 %, \u00b0",
     "range_median_percent": "range error, median, %", "range_p90_percent": "range error, 90 %, %",
 }
-"""What a table calls the statistics."""
+"""Names of the statistics in a table."""
 
 
 def gap_table(gap: xr.Dataset) -> Table:
@@ -61,7 +61,7 @@ def gap_table(gap: xr.Dataset) -> Table:
 
 
 def gap_lines(gap: xr.Dataset) -> list[str]:
-    """Return lines on what was compared, and on what an interval says."""
+    """Return lines on the compared poses, and on the meaning of intervals."""
     photographs, scenes = (int(gap["units"].sel(source=source).max()) for source in SOURCES)
     markers, solved = (int(gap[name].max()) for name in ("looked_for", "solved"))
     first = plural(photographs, "photograph")

@@ -91,7 +91,7 @@ def conditions_of(
 ) -> list[dict[str, Any]]:
     """Return the conditions at which a requirement is not met, or else undecided; worst first.
 
-    ``table`` is that of `sweep.analysis.check_requirements`. Each has its condition, decision,
+    ``table`` is returned by `sweep.analysis.check_requirements`. Each has its condition, decision,
     value, interval and draws. ``every``: all conditions.
     """
     if not every and each.decision not in (Decision.not_met, Decision.undecided):
@@ -133,7 +133,7 @@ def condition_table(found: Sequence[Verdict], table: xr.Dataset, *, every: bool)
 
 
 def regression_table(worse: Sequence[Regression]) -> Table:
-    """Return how results differ from those of an older store, pose by pose."""
+    """Return how results differ from an older store's, pose by pose."""
     return Table.of(
         "Compared with the older store pose by pose, new minus old",
         ("", "quantity", "configuration", "difference", "condition"),
@@ -154,7 +154,7 @@ def valued(value: float, low: float, high: float, units: str) -> str:
 
 
 def needs(each: Cause) -> str:
-    """Return the draws of what is undecided, and how many would decide it."""
+    """Return the draws of an undecided requirement, and how many would decide it."""
     if each.decision is not Decision.undecided or math.isnan(each.draws_needed):
         return ""
     if math.isinf(each.draws_needed):
@@ -177,10 +177,10 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
 
 
 # --------------------------------------------------------------------------------------------------
-# What ``sweep size`` prints: the answer in a line, a table of the alternatives, JSON.
+# Output of ``sweep size``: the answer in a line, a table of the alternatives, JSON.
 
 def headline(choice: Choice) -> str:
-    """Return the line that says what is chosen; without a choice, what is nearest to one."""
+    """Return the line on the choice; without one, on the nearest alternative."""
     rule = choice.rule
     wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
     what = (f"{plural(len(rule.requirements), 'requirement')} at "
@@ -330,7 +330,7 @@ def dimensions(limits: xr.Dataset) -> list[str]:
 def limit_text(one: xr.Dataset) -> str:
     """Return up to where requirements are met in one condition: ``up to 1.2 m``.
 
-    What is not decided is called so, whatever the estimates are.
+    An undecided limit is called so, whatever the estimates are.
     """
     reach, start, value = Reach(int(one["reach"])), float(one["start"]), float(one["value"])
     bound = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
@@ -353,7 +353,7 @@ def met_to(one: xr.Dataset) -> float:
 
 
 def limit_interval(one: xr.Dataset) -> str:
-    """Return the interval of the limit: ``1.1 to 1.3``; an open end is that of the grid."""
+    """Return the interval of the limit: ``1.1 to 1.3``; an open end is the grid's."""
     low, high = float(one["low"]), float(one["high"])
     if math.isnan(low) or math.isnan(high):
         return "none"
@@ -365,7 +365,7 @@ def limit_interval(one: xr.Dataset) -> str:
 
 
 def _failure_texts(one: xr.Dataset) -> tuple[str, str]:
-    """Return what fails first beyond, and whether estimates keep all limits again: perhaps a dip.
+    """Return the requirement that fails first beyond, and where estimates keep all again, if so.
 
     ``1.3 m: detection_rate 0.874 (tilt_deg = 60)``
     """

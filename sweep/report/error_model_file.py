@@ -87,13 +87,13 @@ def error_model_text(models: xr.Dataset, facts: Mapping[str, Any]) -> str:
     models
         As `sweep.analysis.error_models` returns them.
     facts
-        What the models are of: ``store``, ``title``, ``fingerprint``, ``camera``, ``pipeline``.
+        Source of the models: ``store``, ``title``, ``fingerprint``, ``camera``, ``pipeline``.
     """
     return to_json(document(models, facts), indent=1) + "\n"
 
 
 def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the file; what is not a number is null."""
+    """Return the content of the file; NaN and infinities are null."""
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     knots = {name: models[name].values.tolist() for name in PREDICTORS}
     return {
@@ -142,7 +142,7 @@ def _logarithms(name: str, values: Any) -> Any:
 
 
 def _quantity(model: xr.Dataset) -> dict[str, Any]:
-    """Return what a reader computes with, and all variables, of one quantity."""
+    """Return the numbers for a reader's formula, and all variables, of one quantity."""
     metres = str(model["quantity"].item()) in QUANTITIES[:3]
     scale = model["distance_m"].values[:, None, None] if metres else 1.0
     names = np.array([Use(flag).name for flag in model["use"].values.ravel()], dtype=object)
@@ -235,7 +235,7 @@ def models_of(data: ReportData) -> xr.Dataset:
 
 
 def facts_of(data: ReportData) -> dict[str, Any]:
-    """Return what the models are of."""
+    """Return the source of the models."""
     return {
         "store": data.store, "title": data.pipeline.heading,
         "camera": data.pipeline.facts.camera_line,

@@ -237,7 +237,7 @@ class Panel:
     title
         Stands above it.
     lines
-        What is drawn.
+        The lines and points.
     place
         Name of the axis along which values stand.
     curve

@@ -133,7 +133,7 @@ def figure(
 ) -> Figure:
     """Return a figure of `grouped`, the last of whose groups are along x.
 
-    Its caption also says what is pooled, and what is not drawn.
+    Its caption also names pooled axes, and values that are not drawn.
     """
     dims, count = list(groups), summary.sizes[CONFIGURATION]
     if not by and (count > 1 or len(dims) > 1):
@@ -417,7 +417,7 @@ def _ambiguity(data: ReportData) -> Figure | None:
 
 
 def threshold_tables(data: ReportData) -> list[Table]:
-    """Return what the usual threshold on the ambiguity keeps at each size, and the one to take."""
+    """Return the poses that the usual threshold keeps at each size, and the threshold to take."""
     if _ambiguity(data) is None:
         return []
     along = data.size or data.angle_axis
@@ -502,7 +502,7 @@ def errors_table(errors: xr.Dataset, name: str) -> Table:
 
 
 def precision_tables(data: ReportData) -> list[Table]:
-    """Return what a run to a wanted precision reached, by quantity and configuration."""
+    """Return the precision that a run reached, by quantity and configuration."""
     rule = data.pipeline.stopping
     if rule is None or not rule.precision:
         return []

@@ -145,7 +145,7 @@ def _selected(
 
 
 # --------------------------------------------------------------------------------------------------
-# What each configuration costs.
+# The cost of each configuration.
 
 def measure_tradeoff(
     store: str | PathLike[str], *, per: Sequence[str] = (), criterion: str = "rotation_p95_deg",

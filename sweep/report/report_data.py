@@ -93,7 +93,7 @@ class ReportData:
     warnings
         Lines on cells that failed, or a run in which nothing was detected.
     require, per
-        What is required, as `sweep.analysis.check_requirements` takes it, and the conditions.
+        Requirements, as `sweep.analysis.check_requirements` takes them, and the conditions.
     command
         The command line that asked for the report; empty if none did.
     made
@@ -218,7 +218,7 @@ class ReportData:
     # Analyses.
 
     def once(self, key: Any, make: Callable[[], T]) -> T:
-        """Return what ``make`` returns, a dataset loaded; it is called once for each key."""
+        """Return the result of ``make``, a dataset loaded; it is called once for each key."""
         if key not in self.made:
             with store_errors(self.store):
                 made = make()
@@ -233,7 +233,7 @@ def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
     Returns
     -------
     The axis along which a limit is looked for, None if there is none; and the other axes of
-    conditions, those of angles first.
+    conditions, angles first.
     """
     conditions = [name for name in data.per if name not in data.setting_axes]
     numeric = {axis.name for axis in data.pipeline.axes if axis.is_numeric} & {*data.scene_axes}
@@ -266,7 +266,7 @@ def read_report_data(
     url
         Path or URL of the store.
     require, per
-        What is required, by default by the pipeline, and the dimensions whose values are
+        Requirements, by default the pipeline's, and the dimensions whose values are
         conditions, by default those of `sweep.analysis.requirements`.
     command
         The command line that asked for the report.
@@ -368,7 +368,7 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
     settings = [axis for axis in data.pipeline.axes_of(*BOTH) if len(axis) > 1]
     several = [*(data.pipeline.experiment.target_axes if targets else ()), *settings]
     if targets and not several:
-        # Nothing else varies on the same draws: the values of an effect are what is compared.
+        # Nothing else varies on the same draws: the values of an effect are compared.
         several = list(data.effect_axes)
     counts = {axis.name: len(axis) for axis in several}
     while math.prod(counts.values()) > MAX_CONFIGURATIONS and max(counts.values()) > 2:

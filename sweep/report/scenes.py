@@ -186,7 +186,7 @@ def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
 
 
 def _drawn_text(scene: SceneInspection) -> str:
-    """Return what was drawn at random for the scene; empty if nothing was."""
+    """Return the values drawn at random for the scene; empty if there are none."""
     drawn = ", ".join(
         f"{name} {float(value):.5g}" for name, value in scene.values.items()
         if name not in VARIABLES and value.ndim == 0)

@@ -404,7 +404,7 @@ def table_of(
     summary
         Results of an analysis, with the ends of intervals as ``NAME_low`` and ``NAME_high``.
     caption
-        What the table holds.
+        The rows and columns.
     dims
         Dimensions of the columns' variables, all of them; those that lack some are repeated.
     wanted

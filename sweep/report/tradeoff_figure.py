@@ -101,7 +101,7 @@ def trade_figure(
     criterion
         An error of ``trade`` (default: the one asked for when it was measured).
     lines
-        What is recommended.
+        The recommendation.
     """
     criterion = criterion or trade_criterion(trade)
     heading = heading_of(criterion)

@@ -257,7 +257,7 @@ def write_page(
 
 
 def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
-    """Write files into a folder, in the place of what has their names, links too."""
+    """Write files into a folder; files and links of their names are replaced."""
     with write_errors_explained(folder):
         folder.mkdir(exist_ok=True)
         for name, content in pictures.items():

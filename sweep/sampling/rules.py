@@ -25,13 +25,13 @@ from sweep.store.blocks import RunStore, region
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
-# What a rule of stopping is: a pure function of the results of the trials of earlier waves.
+# A rule of stopping is a pure function of the results of the trials of earlier waves.
 #
 # Trials come in waves that end at fixed numbers, ``ends``. Before each wave but the first, which
 # is computed whole, a rule says for every scene of a group whether the wave's trials of it are
 # needed. All configurations of a needed scene are computed, so that they stay paired.
 #
-# A group is what is decided together: all cells along the ``coupled`` axes, and for the sake of
+# A group is decided as one: all cells along the ``coupled`` axes, and for the sake of
 # speed some values of the others, which must not influence each other. A part of a group of which
 # no cell is needed in a wave is settled for good.
 
@@ -217,20 +217,20 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
 
 
 # --------------------------------------------------------------------------------------------------
-# Which scenes of a block are needed: a rule applied to what is committed of earlier waves.
+# Which scenes of a block are needed: a rule applied to the committed blocks of earlier waves.
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the scenes of a block follow from.
+    """Inputs that determine a block's scenes.
 
     Attributes
     ----------
     rule
-        What the pipeline's section says.
+        The content of the pipeline's section.
     wave
         The number of the block's wave, from 1.
     bases
-        For each wave from 1 to that of the block, a digest of the rule and of the results before
+        For each wave from 1 to the block's own, a digest of the rule and of the results before
         it: two decisions on the same bases are the same.
     settled
         Whether nothing was needed in an earlier wave, so that nothing is.
@@ -268,7 +268,7 @@ class Decider:
 
     @staticmethod
     def of(store: RunStore, rule: StoppingRule) -> Decider:
-        """Return what decides by a rule on the blocks of a store."""
+        """Return the decider by a rule on the blocks of a store."""
         pipeline = dataclasses.replace(store.pipeline, stopping=rule)
         sampling = make_rule(pipeline)
         if sampling is None:

@@ -171,7 +171,7 @@ def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Stopping:
 
 
 def _limit(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return what tells at which values of the axis trials decide the limit."""
+    """Return a function that tells at which values of the axis trials decide the limit."""
     check_required(rule.requirements, pipeline.source)
     required = parse_requirements(rule.requirements)
     searched = (*rule.per, *rule.at_all, rule.along)
@@ -270,7 +270,7 @@ def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
 
 
 def _choice(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return what tells which cells decide what the smallest, or the cheapest, choice is."""
+    """Return a function that tells which cells decide the smallest, or the cheapest, choice."""
     shares = choice_shares(pipeline, rule)
     if faults := choice_faults(pipeline, rule, shares):
         raise refusal([f"{pipeline.source}: {line}" for line in faults])
@@ -297,7 +297,7 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> 
 def _precision(
     pipeline: Pipeline, rule: StoppingRule
 ) -> tuple[list[str], Callable[[xr.Dataset], xr.DataArray]]:
-    """Return what is read, and what tells the conditions that are not known well enough."""
+    """Return the variables that are read, and a function that tells the undecided conditions."""
     try:
         wanted = wanted_precisions(dict(rule.precision))
     except ValueError as error:

@@ -44,7 +44,7 @@ class RunStore:
     group
         The root group.
     pipeline
-        What the store was created for.
+        The experiment that the store was created for.
     run_id
         The run that created it.
     blocks
@@ -218,7 +218,7 @@ class FailedCell:
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """What commits a block.
+    """The receipt that commits a block.
 
     Attributes
     ----------
@@ -246,8 +246,8 @@ class Receipt:
     block
         The block's number; None until it is written.
     basis
-        A digest of what the block's needed scenes follow from: the rule by which sampling stops,
-        and the results of earlier waves; None where all scenes are needed.
+        A digest of the inputs that determine the block's needed scenes: the rule by which sampling
+        stops, and the results of earlier waves; None where all scenes are needed.
     """
 
     run_id: str
@@ -413,7 +413,7 @@ def in_writing_order(variables: Sequence[Variable]) -> list[list[str]]:
     """Return the names of variables in the order in which a block's are written: flags last.
 
     So whoever reads the store meanwhile finds no flag that speaks of a number that is not there.
-    What is listed together is written at once.
+    Files that are listed together are written at once.
     """
     numbers = [variable.name for variable in variables if variable.flags is None]
     flags = [variable.name for variable in variables if variable.flags is not None]
@@ -475,7 +475,7 @@ def receipt_of(store: RunStore, block: Block) -> Receipt | None:
 def receipts_or_faults(
     store: RunStore, numbers: Iterable[int]
 ) -> Iterator[tuple[int, Receipt | None, str]]:
-    """Yield blocks' numbers in order, each with its receipt, or None and what is wrong with it.
+    """Yield blocks' numbers in order, each with its receipt, or None and the receipt's fault.
 
     A receipt of another block or run commits nothing.
     """
@@ -494,7 +494,7 @@ def receipts_or_faults(
 
 
 def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
-    """Return those of the committed blocks of which chunks are missing, each with the key of one.
+    """Return the committed blocks that lack chunks, each with the key of one.
 
     A copy that was made while the store was written has such blocks, for instance.
     """

@@ -25,7 +25,7 @@ __all__ = ["sync"]
 
 
 # --------------------------------------------------------------------------------------------------
-# Files that are read and written whole: those of a store by key, and results for a user.
+# Files that are read and written whole: a store's by key, and results for a user.
 
 def read_files(storage: Store, keys: Sequence[str]) -> list[bytes | None]:
     """Return the contents of keys, None for missing ones."""
@@ -70,7 +70,7 @@ def delete_files(storage: Store, keys: Iterable[str]) -> None:
 
 
 def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[str]:
-    """Yield those of the keys, all below a folder, that are missing or empty."""
+    """Yield the keys, of some below a folder, that are missing or empty."""
     if not isinstance(storage, LocalStore):
         present = set(list_files(storage, f"{folder}/"))
         yield from (key for key in keys if key not in present)

@@ -173,7 +173,7 @@ def _coordinate(
 
 
 def _axis(axis: Axis) -> list[PlannedArray]:
-    """Return the coordinates of a dimension, and those of the parameters that go together there."""
+    """Return the coordinates of a dimension, and of the parameters that go together there."""
     together = [Axis(each.name, {each.name: axis.columns[each.name]}, (each,))
                 for each in axis.parameters if axis.zipped]
     return [
@@ -268,7 +268,7 @@ def changed_files(
 
 
 def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
-    """Return the contents of the listed files by key, with or without those of tables."""
+    """Return the contents of the listed files by key, with or without tables."""
     keys = [key for key in store.run_metadata["files"] if tables or not is_of_table(key)]
     return dict(zip(keys, files.read_files(store.storage, keys), strict=True))
 
@@ -406,7 +406,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
 
 
 def _recorded(pipeline: Pipeline) -> dict[str, Any]:
-    """Return what a run's metadata tell of its pipeline beside the text."""
+    """Return the record of a run's pipeline in its metadata, beside the text."""
     plugins = [plugin.to_json() for plugin in pipeline.plugins]
     return {
         "name": pipeline.name, "folder": pipeline.folder, "fingerprint": fingerprint(pipeline),
@@ -499,7 +499,7 @@ def remove_store(url: str) -> None:
 
 
 # --------------------------------------------------------------------------------------------------
-# What readers see of a store: its committed blocks.
+# The readers' view of a store: its committed blocks.
 
 POSES_TOGETHER = 1 << 20
 """Poses of a Dask chunk: a task for each block would take longer than reading the block."""
@@ -519,7 +519,7 @@ def _together(store: RunStore) -> dict[str, int]:
 
 
 def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset:
-    """Open a store's results, lazily; also those of an unfinished one.
+    """Open a store's results, lazily; also an unfinished store's.
 
     Results of at most ``read_bytes`` are read at once, which is faster than through Dask.
 
@@ -583,7 +583,7 @@ def _only_committed(
         variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)
         for variable in store.variables
     }
-    return dataset.assign(masked)  # what is a coordinate stays one
+    return dataset.assign(masked)  # coordinates stay coordinates
 
 
 # --------------------------------------------------------------------------------------------------
@@ -676,7 +676,7 @@ def write_root(
 
 
 # --------------------------------------------------------------------------------------------------
-# What to say of a store that is not finished: who writes it, or how to continue it.
+# Lines on a store that is not finished: who writes it, or how to continue it.
 
 def unfinished_line(store: RunStore) -> str:
     """Return a line on a store that is not finished: its blocks, and what to do.
@@ -759,5 +759,5 @@ def document_of(
 
 
 def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
-    """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
+    """Return the requirements in a TOML file that has faults; none if it is no TOML."""
     return texts_in(document_of(path, settings) or {})

@@ -107,7 +107,7 @@ def checked_url(url: str) -> str:
         raise StoreError(f"{url}: a store on this machine is named by its path: {path}")
     if scheme == "memory" and ":" in url:
         raise StoreError(
-            f"{url}: no other process sees what is in this one's memory; choose a path or s3://"
+            f"{url}: no other process sees this one's memory; choose a path or s3://"
         )
     if url.partition("/")[0] == "~":
         raise StoreError(

@@ -35,7 +35,7 @@ WAIT_S = 2.0
 """How long a lock is waited for: `status` holds one for an instant."""
 
 SILENCE_S = 120.0
-"""Seconds after which a key is taken for that of a process that died."""
+"""Seconds after which a key's process is taken for dead."""
 
 
 @contextlib.contextmanager

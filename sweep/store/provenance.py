@@ -128,7 +128,7 @@ def _contents(files: Any) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """Return what is recorded beside the fingerprint: versions of sweep and Python, the CPU."""
+    """Return the record beside the fingerprint: versions of sweep and Python, the CPU."""
     return {
         "sweep": __version__,
         "python": platform.python_version(),

@@ -8,7 +8,6 @@ interpreter on the default threads.
 """
 
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -18,10 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.tables import header, row
+from support.small_datasets import perfect, with_every_flag
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.store.blocks import STAGES, Receipt, region, write_block
-from sweep.store.lifecycle import create_store, finish
+from sweep.experiment.schema import VARIABLES
+from sweep.measure.flags import EstimateStatus
+from sweep.store.blocks import region
+from sweep.store.lifecycle import create_store
 
 POSES = 10**7
 
@@ -39,6 +40,7 @@ solver = ["ippe_square", "iterative"]
 trial = {trials}
 """
 POSES_A_TRIAL = 50 * 4 * 25 * 2
+DIMS = ("marker_id", "tilt_deg", "side_px", "solver", "trial")
 EXTENTS = (1, 4, 25)
 TRIALS_A_CHUNK = 50  # 10,000 poses
 
@@ -86,53 +88,17 @@ def write_store(folder, poses):
     store = create_store(
         str(Path(folder) / f"{poses}.zarr"), pipeline, (*EXTENTS, min(TRIALS_A_CHUNK, trials)))
     rng = np.random.default_rng(1)
-    flags = {"detection": len(DetectionStatus), "estimate": len(EstimateStatus)}
     for block in store.blocks:
-        values = chunk(rng, pipeline, block)
-        for variable in store.variables:
-            array = store.array(variable.name)
-            some = np.full([len(range(*cut.indices(size))) for cut, size in zip(
-                region(variable, pipeline, block), array.shape, strict=True)],
-                array.fill_value, array.dtype)
-            some[...] = values.get(variable.name, some)
-            values[variable.name] = some
-        counts = {name: np.bincount(values[name].ravel(), minlength=size).tolist()
-                  for name, size in flags.items()}
-        write_block(store, block, values, Receipt(
-            run_id=store.run_id, processors=[], scenes=math.prod(block.shape),
-            computed=dict.fromkeys(("scenes", "detections", "estimates"), 0), **counts,
-            seconds={stage: [] for stage in STAGES}, failures=[], wall_s=0.0, written=0.0))
-    finish(store, {}, {"detection": [0] * len(DetectionStatus),
-                       "estimate": [0] * len(EstimateStatus)})
+        *scene, draws = block.shape
+        sizes = dict(zip(DIMS, (*scene, 2, draws), strict=True))
+        values = with_every_flag(rng, perfect(rng, sizes), good=0.9)
+        solved = values["estimate"] == EstimateStatus.solved
+        for name in ("reprojection_error_px", "alternative_reprojection_error_px"):
+            values[name] = solved.dims, rng.uniform(0.1, 1.0, solved.shape)
+            values[name] = values[name].where(solved)
+        for name in values:
+            store.array(name)[region(VARIABLES[name], pipeline, block)] = values[name].values
     return store.url, trials * POSES_A_TRIAL
-
-
-def chunk(rng, pipeline, block):
-    """Return plausible values of a block: small markers are missed; errors grow as they shrink."""
-    scene = block.shape
-    estimated = (*scene[:-1], len(pipeline.axis("solver")), scene[-1])
-    sides = np.array(pipeline.axis("side_px").values)[block.starts[2]:block.stops[2], None]
-    depth = np.broadcast_to(30.0 / sides, scene)
-    found = rng.random(scene) < 1 - np.exp(-sides / 8)
-    solved = found[..., None, :] & (rng.random(estimated) < 0.995)
-    flipped = solved & (rng.random(estimated) < 0.05)
-    errors = rng.standard_normal((2, *estimated, 3), dtype=np.float32)
-    errors *= 0.3 / sides[..., None, None]
-    errors[:, ~solved] = np.nan
-    return {
-        "true_tvec_m": np.stack([0 * depth, 0 * depth, depth], axis=-1),
-        "marker_area_px": sides**2 * rng.uniform(0.9, 1.0, scene),
-        "detection": np.where(found, DetectionStatus.detected, DetectionStatus.no_candidate),
-        "estimate": np.where(solved, EstimateStatus.solved, np.where(
-            found[..., None, :], EstimateStatus.solver_failed, EstimateStatus.no_detection)),
-        "flipped": np.select(
-            [flipped, solved], [Flipped.flipped, Flipped.not_flipped], Flipped.no_estimate),
-        "rotation_error_rad": errors[0], "translation_error_m": errors[1],
-        "rotation_error_deg": np.degrees(np.linalg.norm(errors[0], axis=-1)),
-        "reprojection_error_px": np.where(solved, 0.1, np.nan),
-        "alternative_reprojection_error_px": np.where(
-            solved, rng.uniform(0.1, 1.0, estimated), np.nan),
-    }
 
 
 def measured(store, call):

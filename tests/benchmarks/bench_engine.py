@@ -5,11 +5,14 @@
 Each part works for about a minute on all cores; ratios within one run.
 """
 
+import functools
 import itertools
 import multiprocessing
 import statistics
 import tempfile
 import time
+from collections import deque
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
@@ -62,33 +65,26 @@ def grid_for(workers):
     return Pipeline.from_text(grid(trials)[0]), trials
 
 
-def bare(text, trials, gate, told):
-    """Run the kernel alone on some of the trials; tell its seconds."""
-    experiment = Pipeline.from_text(text).experiment
-    lengths = [len(axis) for axis in experiment.scene_axes]
-    run_cells(experiment, [np.zeros(1, dtype=np.intp) for _ in lengths])
-    gate.wait()
-    begun = time.perf_counter()
-    for trial in trials:
-        block = Block((0, 0, 0, trial), (*lengths[:3], trial + 1))
-        run_cells(experiment, block.indices())
-    told.put(time.perf_counter() - begun)
+@functools.cache
+def experiment_of(text):
+    return Pipeline.from_text(text).experiment
+
+
+def bare(text, trial):
+    """Run the kernel alone on a trial."""
+    experiment = experiment_of(text)
+    lengths = [len(axis) for axis in experiment.scene_axes[:-1]]
+    run_cells(experiment, Block((0, 0, 0, trial), (*lengths, trial + 1)).indices())
 
 
 def bare_rate(text, trials, workers):
     """Return scenes per second of independent processes that run the bare kernel."""
-    context = multiprocessing.get_context("spawn")
-    told, gate = context.Queue(), context.Barrier(workers)
-    processes = [
-        context.Process(target=bare, args=(text, range(trials)[part::workers], gate, told))
-        for part in range(workers)
-    ]
-    for process in processes:
-        process.start()
-    slowest = max(told.get() for _ in processes)
-    for process in processes:
-        process.join()
-    return trials * grid(1)[1] / slowest
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes:
+        warm = [0] * 4 * workers
+        deque(processes.map(functools.partial(bare, text), warm), maxlen=0)
+        begun = time.perf_counter()
+        deque(processes.map(functools.partial(bare, text), range(trials)), maxlen=0)
+        return trials * grid(1)[1] / (time.perf_counter() - begun)
 
 
 def engine_against_processes():

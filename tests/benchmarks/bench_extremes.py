@@ -6,6 +6,7 @@ In this process, on one core, warnings raised as errors. What breaks a promise (
 :func:`broken_promises`) is told below the table, and the exit status is 1.
 """
 
+import itertools
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,16 +100,6 @@ def broken_promises(result):
                      f"{np.size(holds)}" for text, holds in promises.items() if not np.all(holds)]
 
 
-def groups(pipeline, stage, name, made):
-    """Return {the other treatment axes' values in words: {value of axis ``name``: number}}."""
-    others = [axis.name for axis in pipeline.axes_of(stage) if axis.name != name]
-    found = {}
-    for number, setting in enumerate(made):
-        words = tuple(f"{other} = {getattr(setting, other)}" for other in others)
-        found.setdefault(words, {})[getattr(setting, name)] = number
-    return found
-
-
 def solver_cell(detected, estimate, error_deg, flipped):
     """Return the median and worst error, and the shares that failed or are flipped if any."""
     if not detected.any():
@@ -127,17 +118,21 @@ def solver_cell(detected, estimate, error_deg, flipped):
 def print_rows(name, result):
     """Print the rows of a regime: one for each value of its other treatment axes."""
     pipeline, values = result.pipeline, result.values
-    made = pipeline.experiment
-    for searched, of_refinement in groups(
-            pipeline, Stage.detection, "cornerRefinementMethod", made.detectors).items():
-        d = of_refinement[REFINEMENT]
+    made, rows = pipeline.experiment, {}
+    for (d, detector), (e, estimator) in itertools.product(
+            enumerate(made.detectors), enumerate(made.estimators)):
+        if detector.cornerRefinementMethod != REFINEMENT:
+            continue
         detected = values["detection"][d] == DetectionStatus.detected
-        for solved, of_solver in groups(
-                pipeline, Stage.estimation, "solver", made.estimators).items():
-            row(", ".join((name, *searched, *solved)), detected.sum(), *(
-                solver_cell(detected, *(values[variable][d, of_solver[solver]] for variable in (
-                    "estimate", "rotation_error_deg", "flipped")))
-                for solver in SOLVERS))
+        words = [f"{axis.name} = {getattr(setting, axis.name)}"
+                 for stage, setting in ((Stage.detection, detector), (Stage.estimation, estimator))
+                 for axis in pipeline.axes_of(stage)
+                 if axis.name not in ("cornerRefinementMethod", "solver")]
+        cells = rows.setdefault(", ".join([name, *words]), {"detected": detected.sum()})
+        cells[estimator.solver] = solver_cell(detected, *(
+            values[variable][d, e] for variable in ("estimate", "rotation_error_deg", "flipped")))
+    for label, cells in rows.items():
+        row(label, *(cells[column] for column in ("detected", *SOLVERS)))
 
 
 def main():

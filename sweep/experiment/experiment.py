@@ -219,13 +219,18 @@ class Experiment:
         self, indices: Sequence[NDArray[np.intp]]
     ) -> tuple[dict[str, Column], NDArray[np.int64]]:
         """Return the scene parameters as they are given at ``indices``, and the trials (N,)."""
-        parameters = self.grid.parameters
-        values = {name: Column(value, constant=True) for name, value in self.grid.fixed.items()
-                  if parameters[name].stage is Stage.scene}
+        values = dict(self._constants)
         for axis, index in zip(self.scene_axes, indices, strict=True):
             values |= {name: _column(along, index) for name, along in axis.columns.items()}
         count = len(indices[0]) if self.scene_axes else 1
         return values, values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+
+    @cached_property
+    def _constants(self) -> dict[str, Column]:
+        """The scene's parameters that are fixed; made once, not for each block."""
+        parameters = self.grid.parameters
+        return {name: Column(value, constant=True) for name, value in self.grid.fixed.items()
+                if parameters[name].stage is Stage.scene}
 
     def scene_values(self, indices: Sequence[NDArray[np.intp]]) -> dict[str, Column]:
         """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.

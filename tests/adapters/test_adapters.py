@@ -5,8 +5,6 @@ References are the packages themselves; tests skip where one is missing.
 
 import ctypes
 import importlib.metadata
-import subprocess
-import sys
 from pathlib import Path
 from unittest import mock
 
@@ -96,18 +94,6 @@ def test_a_run_is_a_plain_loop_with_the_package(tmp_path):
         assert np.abs(opencv).max() < 2
 
 
-def test_settings_of_adapters_reach_their_packages():
-    pytest.importorskip("pyapriltags")
-    plugin = load("detector", "pyapriltags", ".")
-    single = cell(Pipeline.from_dict(RUN), "tilt_deg=35,detector=pyapriltags")
-    image = np.ascontiguousarray(scene_image(single, whole_frame=True))
-    fine, coarse, strict = (
-        plugin.make(plugin.settings(**settings), "tag36h11")(image) for settings in (
-            {"quad_decimate": 1.0}, {"quad_decimate": 2.0}, {"min_decision_margin": 250.0}))
-    assert [len(found.ids) for found in (fine, coarse, strict)] == [1, 1, 0]
-    assert not np.array_equal(fine.corners, coarse.corners)
-
-
 def test_a_missing_package_is_told_with_its_command(monkeypatch):
     if not importlib.metadata.entry_points(group="sweep.detectors", name="locus-tag"):
         pytest.skip("installed before there were adapters")
@@ -182,18 +168,6 @@ def test_boards_that_locus_lacks_are_failures_that_say_why(settings, expected):
     assert expected in results.failures[0].text
 
 
-@pytest.mark.parametrize(("board", "settings", "expected"), [
-    (GRID, ["points='each_marker'"], "markers beside solver = locus-board, which chooses by"),
-    (GRID, ["refine='lm'"], "none beside solver = locus-board, which chooses by itself"),
-    ({}, [], "a solver of single markers, or a board: give kind under [board]"),
-])
-def test_settings_of_other_solvers_are_one_line_beside_locus(board, settings, expected):
-    pytest.importorskip("locus")
-    told = refusal(board_document(board), *settings)
-    assert expected in told
-    assert "\n" not in told
-
-
 # Markers of AprilTag's and STag's own families.
 
 def family_document(dictionary, marker_id, **scene):
@@ -244,29 +218,6 @@ def test_modules_of_tag_families_are_those_that_apriltag_draws(family):
         assert ours[~used].all()
 
 
-CODES = """
-import sys
-from sweep.model import marker
-marker.PACKAGES = (sys.argv[1],)
-for family in marker.TAG_FAMILIES:
-    print(family, [part.tolist() for part in marker._codes(family)])
-"""
-
-
-@pytest.mark.system
-def test_both_packages_have_the_same_codes():
-    # Each in a process of its own: both packages wrap versions of one library.
-    for package in families.PACKAGES:
-        pytest.importorskip(package)
-    first, *others = [
-        subprocess.run(
-            [sys.executable, "-c", CODES, package], capture_output=True, check=True
-        ).stdout for package in families.PACKAGES
-    ]
-    assert first
-    assert all(each == first for each in others)
-
-
 @pytest.mark.parametrize("library", families.STAG_LIBRARIES)
 def test_stag_reads_the_markers_that_are_drawn(library):
     package = pytest.importorskip("stag")
@@ -303,9 +254,20 @@ def test_renderers_agree_on_families_with_data_outside(renderer, most):
     assert np.abs(exact - other).mean() < most
 
 
-@pytest.mark.parametrize(("dictionary", "marker_id", "scene", "named"), [
-    ("tagCircle21h7", 38, {}, "IDs from 0 to 37, which is what tagCircle21h7 has"),
-    ("STAG_HD21", 1, {"renderer": "warp"}, "exact for STag's markers"),
+CIRCLE, WARPED = ("tagCircle21h7", 38), ("STAG_HD21", 1)
+
+
+@pytest.mark.parametrize(("document", "settings", "named"), [
+    (board_document(GRID), ["points='each_marker'"],
+     "markers beside solver = locus-board, which chooses by"),
+    (board_document(GRID), ["refine='lm'"],
+     "none beside solver = locus-board, which chooses by itself"),
+    (board_document({}), [], "a solver of single markers, or a board: give kind under [board]"),
+    (family_document(*CIRCLE), [], "IDs from 0 to 37, which is what tagCircle21h7 has"),
+    (family_document(*WARPED), ["renderer=warp"], "exact for STag's markers"),
 ])
-def test_what_a_family_lacks_is_refused(dictionary, marker_id, scene, named):
-    assert named in refusal(family_document(dictionary, marker_id, **scene))
+def test_what_a_solver_or_a_family_lacks_is_refused_in_a_line(document, settings, named):
+    pytest.importorskip("locus")
+    told = refusal(document, *settings)
+    assert named in told
+    assert "\n" not in told

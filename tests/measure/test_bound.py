@@ -218,21 +218,6 @@ def test_bound_under_a_lens_or_blurred_is_that_of_differences(count, unknown_blu
     assert worst <= TOLERANCE
 
 
-@pytest.mark.long
-def test_bound_lies_above_that_of_the_whole_frame_by_what_the_background_beyond_it_knows():
-    """Measured over 300 scenes: 0.0098 of markers that are whole, 0.0131 of those that are cut."""
-    worst = {0.01: 0.0, 0.02: 0.0}
-    for value in (value for value in drawn(60, 7) if known(value)):
-        part, frame = Reference(value), Reference(value)
-        frame.low, frame.high = np.zeros(2, int), frame.frame
-        excess = part.found().std[0] / frame.deviations(1e-6) - 1
-        assert excess.min() > -1e-5
-        whole = (part.boxes[0] % [320, 240, 320, 240] != 0).all()
-        kind = 0.01 if whole else 0.02
-        worst[kind] = max(worst[kind], excess.max())
-    assert all(1e-4 < excess < most for most, excess in worst.items())
-
-
 # Boards.
 
 def marker(marker_id, x, y, z=0.0, tilt=0.0, azimuth=0.0, size=0.03):

@@ -156,14 +156,12 @@ BOARD = np.array([[0.03 * x - 0.09, 0.06 - 0.03 * y, 0.0] for y in range(5) for 
 
 
 def image_of(points, camera=TRUTH):
-    """Pixels (..., 2) of points in the camera frame: OpenCV's documented lens model, written out"""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = camera
-    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.stack([fx * u + cx, fy * v + cy], axis=-1)
+    """OpenCV's pixels (..., 2) of points in the camera frame."""
+    fx, fy, cx, cy = camera[:4]
+    pixels, _ = cv2.projectPoints(
+        points.reshape(-1, 3), np.zeros(3), np.zeros(3),
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), camera[4:])
+    return pixels.reshape(*points.shape[:-1], 2)
 
 
 def views(count, noise_px, draw, tilt_deg=45.0):
@@ -171,10 +169,10 @@ def views(count, noise_px, draw, tilt_deg=45.0):
     pixels = []
     for _ in range(count):
         tilt, around, roll = draw.uniform(0, math.radians(tilt_deg)), *draw.uniform(0, 6.28, 2)
-        rotation = scipy.spatial.transform.Rotation.from_rotvec(
-            [tilt * math.cos(around), tilt * math.sin(around), 0.0]
-        ).as_matrix() @ np.diag([1.0, -1.0, -1.0]) @ scipy.spatial.transform.Rotation.from_rotvec(
-            [0.0, 0.0, roll]).as_matrix()
+        rotation = (
+            Rotation.from_rotvec([tilt * math.cos(around), tilt * math.sin(around), 0.0])
+            * Rotation.from_euler("x", np.pi) * Rotation.from_rotvec([0.0, 0.0, roll])
+        ).as_matrix()
         at = np.array([*draw.uniform(-0.05, 0.05, 2), draw.uniform(0.3, 0.5)])
         pixels.append(image_of(BOARD @ rotation.T + at) + draw.normal(0, noise_px, (35, 2)))
     return [BOARD] * count, pixels

@@ -3,7 +3,6 @@
 Errors are grey levels before quantisation, over all pixels of the frame.
 """
 
-import dataclasses
 import math
 import time
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.blurred import FineImage, sharp_of
+from support.blurred import FineImage, exposure_of, frame_of, sharp_of
 from support.exact_image import LENSES, modules_of, plane_of, values, visible
 from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
@@ -21,7 +20,6 @@ from sweep.model.effects import NEUTRAL, VELOCITIES
 from sweep.model.exposure import (
     defocus_px,
     marker_boxes,
-    marker_exposure,
     not_modelled,
     seen_sheets,
 )
@@ -60,21 +58,6 @@ def poses(count, seed, sides=(10, 40), max_tilt=75, **given):
         if visible(value):
             found.append(value)
     return found
-
-
-def exposure_of(value, box):
-    scenes = build_scenes(value, 1)
-    areas = [value["background"], value["black"], value["white"], value["occluder"]]
-    return marker_exposure(scenes, 0, box, np.array(areas))
-
-
-def frame_of(value):
-    """Levels (height, width) of the frame under test: the background beyond the marker's box."""
-    frame = np.full((value["height_px"], value["width_px"]), value["background"])
-    left, top, right, bottom = marker_boxes(build_scenes(value, 1))[0].tolist()
-    if right > left:
-        frame[top:bottom, left:right] = exposure_of(value, (left, top, right, bottom))
-    return frame
 
 
 def image_of(value, window=None):
@@ -235,9 +218,7 @@ pixel meets a few. Quantisation follows, to half a level. Measured 0.03 over the
 def blurred_of(value, box, plane):
     """As :func:`sharp_of`, with the value's own blur."""
     still = value | dict.fromkeys(("exposure_s", "row_time_s", *VELOCITIES), 0.0)
-    scenes = dataclasses.replace(build_scenes(still, 1), plane=np.ascontiguousarray(plane)[None])
-    areas = np.array([value[name] for name in ("background", "black", "white", "occluder")])
-    return marker_exposure(scenes, 0, box, areas)
+    return exposure_of(still, box, plane)
 
 
 MOVING = {

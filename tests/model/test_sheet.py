@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from support.bent_sheets import flat_points
+from support.blurred import frame_of
 from support.exact_image import LENSES, modules_of, plane_of, values
 from support.lengths import first_of
 from sweep.model import lens
@@ -13,11 +14,10 @@ from sweep.model.exposure import (
     areas_px,
     hidden,
     marker_boxes,
-    marker_exposure,
     not_modelled,
     shift_waves,
 )
-from sweep.model.renderers import marker_levels, render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 
 LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
@@ -28,21 +28,6 @@ def scenes_of(**given):
         "width_px": 48, "height_px": 44, "fx_px": 60.0, "size_m": 0.1, "side_px": 24.0,
     } | LEVELS | given))
     return value, build_scenes(value, 1)
-
-
-def exact_frame(scenes, value):
-    """Levels of the whole frame before the sensor."""
-    box = marker_boxes(scenes)[0]
-    frame = np.full((value["height_px"], value["width_px"]), value["background"])
-    areas = np.array([value[name] for name in ("background", "black", "white", "occluder")])
-    if box[2] > box[0]:
-        if not scenes.effects.active[0]:
-            mean, share = marker_levels(scenes, 0, tuple(box.tolist()))
-            inner = mean + (1 - share) * value["background"]
-        else:
-            inner = marker_exposure(scenes, 0, tuple(box.tolist()), areas)
-        frame[box[1] : box[3], box[0] : box[2]] = inner
-    return frame
 
 
 def on_bent_sheet(directions, value):
@@ -116,11 +101,11 @@ def assert_sampled(found, expected, per_side):
 def test_an_image_under_a_lens_or_a_sheet_is_that_of_samples_traced_back(
     distortion, hidden_share, hidden_deg
 ):
-    value, scenes = scenes_of(
+    value, _ = scenes_of(
         distortion=distortion, tilt_deg=35.0, azimuth_deg=70.0, roll_deg=25.0, bearing_x_deg=8.0,
         quiet_zone_modules=1.5, occlusion=hidden_share, occlusion_deg=hidden_deg, occluder=170.0,
     )
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 16), 16)
+    assert_sampled(frame_of(value), sampled_frame(value, 16), 16)
 
 
 @pytest.mark.parametrize("curve", first_of([
@@ -134,7 +119,7 @@ def test_bent_marker_is_what_rays_meet(curve):
         azimuth_deg=40.0, roll_deg=15.0,
     )
     assert not not_modelled(scenes)[0]
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 16), 16)
+    assert_sampled(frame_of(value), sampled_frame(value, 16), 16)
 
 
 def test_true_pose_and_corners_are_those_of_the_tangent_plane():
@@ -204,7 +189,7 @@ def test_shifted_image_is_that_of_samples_shifted_by_each_field(fields):
     keys = {name: scenes.patch(0, 0, 0).stream_key(f"{name}_px") for name in fields}
     waves = [shift_of(shift_waves(*field, keys[name])) for name, field in fields.items()]
     expected = sampled_frame(value, 6, lambda points: sum(wave(points) for wave in waves))
-    assert_sampled(exact_frame(scenes, value), expected, 6)
+    assert_sampled(frame_of(value), expected, 6)
 
 
 def test_shifts_are_normal_and_correlated_as_said():

@@ -169,24 +169,6 @@ def test_turned_deep_and_coloured_photographs_have_the_poses_of_plain_ones(fault
                 home=tmp_path)
 
 
-BOARDS = [
-    ({"legacy_pattern": True}, "legacy_pattern = false fits"),
-    ({"squares_x": 4, "squares_y": 5}, "squares_x = 5, squares_y = 4 fits"),
-    ({"marker_m": 0.015}, "the photographs show about 0.02"),
-    ({"first_id": 20}, "correct first_id or ids"),
-]
-
-
-@pytest.mark.parametrize(("changes", "expected"), BOARDS)
-def test_another_board_is_found_out(faulty, tmp_path, changes, expected):
-    path = tmp_path / "other.toml"
-    path.write_text(toml(**changes))
-    with pytest.raises(ArgumentError, match=expected) as caught:
-        prepare([faulty / "shots"], faulty / "camera.json", board=path, home=tmp_path)
-    assert "\n" not in str(caught.value)
-    assert not list(tmp_path.glob("*.npz"))
-
-
 @pytest.mark.parametrize(("name", "options", "expected"), [
     ("other", {}, "other.png: less than 60 % of the markers"),
     ("mixed", {}, "expected photographs of one size: most are 360 x 270, not 2.png"),
@@ -198,16 +180,23 @@ def test_another_board_is_found_out(faulty, tmp_path, changes, expected):
     ("shots", {"settings": ["size_m=0.1"]}, "expected none beside a board"),
     ("shots", {"camera": None, "stereo": "camera.json"}, "K1, D1, K2, D2, R and T"),
     ("shots", {"camera": "half.json"}, "if its numbers are times 2: it is of another"),
+    ("shots", {"board": {"legacy_pattern": True}}, "legacy_pattern = false fits"),
+    ("shots", {"board": {"squares_x": 4, "squares_y": 5}}, "squares_x = 5, squares_y = 4 fits"),
+    ("shots", {"board": {"marker_m": 0.015}}, "the photographs show about 0.02"),
+    ("shots", {"board": {"first_id": 20}}, "correct first_id or ids"),
 ])
 def test_a_fault_is_one_line(faulty, tmp_path, name, options, expected):
-    given = {"camera": "camera.json", "board": "board.toml", **options}
+    given = {"camera": "camera.json", "board": {}, **options}
+    board = tmp_path / "board.toml"
+    board.write_text(toml(**given.pop("board")))
     paths = {
         key: faulty / value if isinstance(value, str) and "." in value else value
         for key, value in given.items()
     }
     with pytest.raises(SweepError, match=expected) as caught:
-        prepare([faulty / name], paths.pop("camera"), home=tmp_path, **paths)
+        prepare([faulty / name], paths.pop("camera"), board=board, home=tmp_path, **paths)
     assert "\n" not in str(caught.value)
+    assert "board" not in options or not list(tmp_path.glob("*.npz"))
 
 
 def test_what_is_left_out_and_converted_is_said(faulty, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from sweep.model.effects import NEUTRAL
+from sweep.model.exposure import marker_boxes, marker_exposure
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
 
@@ -23,6 +24,26 @@ def sharp_of(value, box, plane=None):
         scenes = dataclasses.replace(scenes, plane=np.ascontiguousarray(plane)[None])
     mean, share = marker_levels(scenes, 0, box)
     return mean + (1 - share) * value["background"]
+
+
+def exposure_of(value, box, plane=None):
+    """Levels of a box with all effects, optionally of a marker in another place."""
+    scenes = build_scenes(value, 1)
+    if plane is not None:
+        scenes = dataclasses.replace(scenes, plane=np.ascontiguousarray(plane)[None])
+    areas = np.array([value[name] for name in ("background", "black", "white", "occluder")])
+    return marker_exposure(scenes, 0, box, areas)
+
+
+def frame_of(value):
+    """Levels (height, width) of the frame under test: the background beyond the marker's box."""
+    frame = np.full((value["height_px"], value["width_px"]), value["background"])
+    scenes = build_scenes(value, 1)
+    box = left, top, right, bottom = marker_boxes(scenes)[0].tolist()
+    if right > left:
+        exposed = exposure_of if scenes.effects.active[0] else sharp_of
+        frame[top:bottom, left:right] = exposed(value, box)
+    return frame
 
 
 def finer(value):

@@ -1,9 +1,10 @@
 """Change constants, signs and comparisons one at a time; name the changes that no test notices.
 
 ``python tests/mutants.py COUNT [SEED] [ROOM ...]`` copies the repository, changes one place of
-the copy, and runs those tests of the room that import the changed module, the nearest first. It
-prints a line a mutant: killed, lives, no test, or "fails unchanged" where these tests fail on the
-unchanged copy, too; then the number of each.
+the copy, and runs tests: first those of the room that import the changed module, the nearest first,
+then the room's others and those of rooms that use it. It prints a line a mutant: killed, lives, no
+test, or "fails unchanged" where the first tests fail on the unchanged copy, too; then the number of
+each.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import tempfile
 from pathlib import Path
 
 TOP = Path(__file__).parents[1]
-ROOMS = ("model", "measure", "analysis")
+ROOMS = {"model": "evaluation", "measure": "evaluation", "analysis": "report"}
+"""Room -> the room above it whose tests use it."""
+
 FILES_A_MUTANT = 6
 LIMIT_S = 240.0
 
@@ -117,8 +120,10 @@ def main(count: int, seed: int = 38, *rooms: str) -> int:
                 sound[tuple(tests)] = verdict(copy, tests) in {"lives", "no test"}
             source = file.read_text(encoding="utf-8")
             (copy / name).write_text(replaced(source, old, new), encoding="utf-8")
-            results.append(
-                verdict(copy, tests) if sound[tuple(tests)] else "fails unchanged")
+            results.append(verdict(copy, tests) if sound[tuple(tests)] else "fails unchanged")
+            if results[-1] in {"lives", "no test"}:
+                room = name.parts[1]
+                results[-1] = verdict(copy, [f"tests/{room}", f"tests/{ROOMS[room]}"])
             (copy / name).write_text(source, encoding="utf-8")
             before, after = (" ".join(ast.unparse(part).split())[:50] for part in (old, new))
             print(f"| {name}:{old.lineno} | `{before}` | `{after}` | {results[-1]} |", flush=True)

@@ -51,11 +51,13 @@ T = TypeVar("T")
 
 def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     """Return a parameter's values along an axis at indices (N,)."""
-    if isinstance(values, range):
-        return Column.of(values.start + values.step * indices)
-    part = [values[index] for index in indices.tolist()]
-    numbers = all(type(value) in (int, float) for value in part)
-    return Column.of(np.array(part, dtype=np.float64) if numbers else part)
+    low, high = int(indices.min()), int(indices.max()) + 1
+    part = values[low:high]
+    if isinstance(part, range):
+        return Column.of(part.start + part.step * (indices - low))
+    if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
+        return Column.of(np.asarray(part, dtype=np.float64)[indices - low])
+    return Column.of([part[index] for index in (indices - low).tolist()])
 
 
 ANY_MARKER = {

@@ -243,8 +243,13 @@ LENS = [-0.2, 0.05, 0.0, 0.0]
 BOARD_METHODS = ("iterative", "sqpnp", "ippe", "epnp")
 
 
+MIN_MARKERS = 0
+"""Not OpenCV's default, which is 2."""
+
+
 def board_pipeline(name, trials):
-    points = ["markers", "chessboard"] if "square_m" in KINDS[name] else ["markers"]
+    squares = "square_m" in KINDS[name]
+    points = ["markers", "chessboard"] if squares else ["markers"]
     return Pipeline.from_dict({
         "seed": 8,
         "camera": {"width_px": 320, "height_px": 240, "fx_px": 300, "fy_px": 300},
@@ -256,7 +261,9 @@ def board_pipeline(name, trials):
         },
         "scene": {"window": "full", "black": 30, "white": 220, "background": 100,
                   "noise_grey": 3, "blur_px": 0.5},
-        "detector": {"cornerRefinementMaxIterations": 1}, "estimator": {"guarded": False},
+        "detector": {"cornerRefinementMaxIterations": 1} | (
+            {"minMarkers": MIN_MARKERS} if squares else {}),
+        "estimator": {"guarded": False},
         "axes": {
             "distance_m": [0.13, 0.25], "trial": trials, "distortion": [[], LENS],
             "cornerRefinementMethod": ["none", "subpix"], "solver": list(BOARD_METHODS),
@@ -282,8 +289,9 @@ class Sighting:
         self.points = [markers.matchImagePoints(self.corners, ids) if self.listed else (None, None)]
         self.chessboard = None
         if isinstance(self.board, cv2.aruco.CharucoBoard) and self.listed:
-            search = cv2.aruco.CharucoDetector(
-                self.board, cv2.aruco.CharucoParameters(), parameters)
+            neighbours = cv2.aruco.CharucoParameters()
+            neighbours.minMarkers = MIN_MARKERS
+            search = cv2.aruco.CharucoDetector(self.board, neighbours, parameters)
             cross, numbers, _, _ = search.detectBoard(
                 image, markerCorners=self.corners, markerIds=ids)
             self.points.append((None, None) if numbers is None

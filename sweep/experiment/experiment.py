@@ -709,7 +709,7 @@ class Facts:
         switch, drawn = effect.switch, self.grid.distributions.get(effect.switch)
         if drawn is not None:
             return Part(effect.label, True, f"{switch} is drawn: {drawn}", switch)
-        values = [value for value in self.grid.values_of(switch) if effect.is_on(value)]
+        values = [value for value in self.grid.values_of(switch) if value != effect.off]
         coded = effects.is_coded(effect.off) or not values
         text = ", ".join(dict.fromkeys(map(label, values))) if coded else _text(values)
         return Part(effect.label, bool(values), f"{switch} is {text or effect.off_text}", switch)

@@ -473,12 +473,7 @@ def sheet_boxes(board: Board) -> Floats:
 @lru_cache(maxsize=64)
 def sheets_m(board: Board) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the board's frame."""
-    return outlines(board, sheet_planes(board, np.eye(3), np.zeros(3), 1.0))
-
-
-def outlines(board: Board, planes: Floats) -> Floats:
-    """Return the corners (P, 4, 3) of all sheets in the camera frame."""
-    return in_space(sheet_boxes(board), planes)
+    return in_space(sheet_boxes(board), sheet_planes(board, np.eye(3), np.zeros(3), 1.0))
 
 
 def own_sheets(board: Board) -> int:
@@ -491,13 +486,13 @@ def facing(board: Board, planes: Floats) -> Masks:
     # Columns run right and rows down, so that their cross product points away from the viewer.
     away = np.cross(planes[:, :, 0], planes[:, :, 1])
     shown = np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0
-    return np.asarray(shown & (outlines(board, planes)[..., 2] > 0).any(axis=1))
+    return np.asarray(shown & (in_space(sheet_boxes(board), planes)[..., 2] > 0).any(axis=1))
 
 
 def _faces(board: Board, planes: Floats) -> list[_Face]:
     """Return the sheets that face the camera."""
     numbers = np.flatnonzero(facing(board, planes))
-    around = outlines(board, planes)[numbers]
+    around = in_space(sheet_boxes(board)[numbers], planes[numbers])
     normals = np.cross(around, np.roll(around, -1, axis=1))
     normals /= np.linalg.norm(normals, axis=2)[..., None]
     normals *= np.sign(np.einsum("pkj,pj->pk", normals, around.mean(axis=1)))[..., None]
@@ -662,7 +657,7 @@ def boxes_px(
     Of those that face the camera, if any does; NaN if a part of one is not before it.
     """
     planes = sheet_planes(board, rotation, translation, scale)
-    facing_it, around = facing(board, planes), outlines(board, planes)
+    facing_it, around = facing(board, planes), in_space(sheet_boxes(board), planes)
     boxes = []
     for count in (own_sheets(board), len(planes)):
         seen, corners = facing_it[:count], around[:count]

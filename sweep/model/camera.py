@@ -118,29 +118,18 @@ def intrinsics(
     elif pixel_size_um is not None:
         fx = fy = 1e3 * focal_length_mm / pixel_size_um
     else:
-        fx, fy = _of_sensor(width_px, height_px, sensor_width_mm, sensor_height_mm, focal_length_mm)
+        # Where the default side makes pixels square, it is used: the bits are those of the side
+        # given.
+        width = DEFAULT_SENSOR_MM[0] if sensor_width_mm is None else sensor_width_mm
+        height = DEFAULT_SENSOR_MM[1] if sensor_height_mm is None else sensor_height_mm
+        fx, fy = focal_length_mm / width * width_px, focal_length_mm / height * height_px
+        if sensor_width_mm is None or sensor_height_mm is None:
+            known, square = fx if sensor_height_mm is None else fy, are_square(fx, fy)
+            # Exact: what is added is a difference of almost equal numbers, or 0.
+            fx, fy = known + (fx - known) * square, known + (fy - known) * square
     cx = (width_px - 1) / 2 if cx_px is None else cx_px
     cy = (height_px - 1) / 2 if cy_px is None else cy_px
     return fx, fy, cx, cy
-
-
-def _of_sensor(
-    width_px: Any, height_px: Any, sensor_width_mm: Any, sensor_height_mm: Any,
-    focal_length_mm: Any,
-) -> tuple[Any, Any]:
-    """Return fx and fy of a lens before a sensor; square pixels if one of its sides is missing.
-
-    Where the default side makes them square, it is used: the bits are those of the side given.
-    """
-    width, height = DEFAULT_SENSOR_MM
-    fx = focal_length_mm / (width if sensor_width_mm is None else sensor_width_mm) * width_px
-    fy = focal_length_mm / (height if sensor_height_mm is None else sensor_height_mm) * height_px
-    if sensor_width_mm is not None and sensor_height_mm is not None:
-        return fx, fy
-    known = fx if sensor_height_mm is None else fy
-    square = are_square(fx, fy)
-    # Exact: what is added is a difference of almost equal numbers, or 0.
-    return known + (fx - known) * square, known + (fy - known) * square
 
 
 def are_square(fx: Any, fy: Any) -> Any:
@@ -185,8 +174,7 @@ class Cameras:
 
     def matrix(self, row: int) -> NDArray[np.float64]:
         """Return OpenCV's camera matrix (3, 3) of one row."""
-        fx, fy, cx, cy = self.view[row]
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return np.asarray(self.take(np.array([row])).matrices[0])
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pixels (N, M, 2) of points (N, M, 3) in metres in the camera frame.
@@ -401,22 +389,18 @@ class Framing:
 
     def _step(self, rows: NDArray[np.intp], centre_xy: Floats, share: Floats) -> Floats:
         """Return the places (n, 2) at their share between the limits at ``centre_xy``."""
-        low, high = self._limits(rows, centre_xy)
-        low, high = low + self.margin[rows], high - self.margin[rows]
-        tight = high < low
-        chosen = low + np.where(tight, 0.5, share) * (high - low) + self.shift[rows]
-        return np.where(np.isfinite(chosen), chosen, centre_xy)
-
-    def _limits(self, rows: NDArray[np.intp], centre_xy: Floats) -> tuple[Floats, Floats]:
-        """Return the first and last places (n, 2) along each axis that keep all points inside."""
         offsets = self.offsets(rows, centre_xy)
         depth = self.depth[rows, None] + offsets[..., 2]
         depth = np.where(depth > 0, depth, np.nan)
-        ends = []
-        for side in (0, 1):
-            rays = self._rays(rows, centre_xy, offsets, side)
-            ends.append(rays * depth[..., None] - offsets[..., :2])
-        return np.asarray(ends[0].max(axis=1)), np.asarray(ends[1].min(axis=1))
+        # The first and last places along each axis that keep each point inside, (n, M, 2).
+        first, last = (
+            self._rays(rows, centre_xy, offsets, side) * depth[..., None] - offsets[..., :2]
+            for side in (0, 1)
+        )
+        low, high = first.max(axis=1) + self.margin[rows], last.min(axis=1) - self.margin[rows]
+        tight = high < low
+        chosen = low + np.where(tight, 0.5, share) * (high - low) + self.shift[rows]
+        return np.where(np.isfinite(chosen), chosen, centre_xy)
 
     def _rays(
         self, rows: NDArray[np.intp], centre_xy: Floats, offsets: Floats, side: int

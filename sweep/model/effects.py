@@ -150,10 +150,6 @@ class Effect:
             return "[]"
         return self.off if isinstance(self.off, str) else f"{self.off:g}"
 
-    def is_on(self, value: Any) -> bool:
-        """Return whether its switch has another value than its neutral one."""
-        return bool(value != self.off)
-
     def is_active(self, strength: Any) -> Any:
         """Return whether it is on: numbers (...) as scenes hold them, NaN if not given."""
         if self.off is None:

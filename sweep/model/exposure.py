@@ -348,9 +348,8 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         if not len(points):
             continue
         low[row], high[row] = points.min(axis=0) - 2, points.max(axis=0) + 2
-    warp_rows = np.flatnonzero([name == "warp" for name in scenes.renderer])
-    if len(warp_rows):
-        low[warp_rows], high[warp_rows] = _warp_extent(scenes, warp_rows)
+    for row in np.flatnonzero([name == "warp" for name in scenes.renderer]).tolist():
+        low[row], high[row] = _warp_extent(scenes, row)
     for row in np.flatnonzero(((low < 0) | (high > limit - 1)).any(axis=1)).tolist():
         low[row], high[row] = _in_frame(scenes, row, low[row], high[row])
     widened = scenes.effects.any_active(
@@ -396,30 +395,25 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
     return np.maximum(low, least[seen].min(axis=0)), np.minimum(high, most[seen].max(axis=0))
 
 
-def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return the least and greatest pixels (n, 2) that the ``warp`` renderer may touch.
+def _warp_extent(scenes: Scenes, row: int) -> tuple[Floats, Floats]:
+    """Return the least and greatest pixels (2,) that the ``warp`` renderer may touch.
 
     It maps bitmap to image by the homography of the black square's corners, distorted by the lens,
     so that its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
     pixel of the bitmap. If the homography's horizon crosses it, it may touch every pixel.
     """
-    low, high = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
-    for i, row in enumerate(rows.tolist()):
-        corners = scenes.corners_px[row]
-        if not np.isfinite(corners).all():
-            continue
-        extent = extent_of(scenes.targets[row])
-        square = rectangles(extent.ink[None])[0].astype(np.float32)
-        transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
-        half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
-        plane = np.array([transform], dtype=np.float64)
-        (points,) = board.in_space(extent.sheet[None] + half_px, plane)
-        if (points[:, 2] > 0).all():
-            flat = points[:, :2] / points[:, 2:]
-            low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
-        else:
-            low[i], high[i] = -0.5, scenes.frame[row] - 0.5
-    return low, high
+    corners, extent = scenes.corners_px[row], extent_of(scenes.targets[row])
+    if not np.isfinite(corners).all():
+        return np.full(2, np.nan), np.full(2, np.nan)
+    square = rectangles(extent.ink[None])[0].astype(np.float32)
+    transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
+    half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
+    plane = np.array([transform], dtype=np.float64)
+    (points,) = board.in_space(extent.sheet[None] + half_px, plane)
+    if (points[:, 2] > 0).all():
+        flat = points[:, :2] / points[:, 2:]
+        return flat.min(axis=0) - 1, flat.max(axis=0) + 1
+    return np.full(2, -0.5), scenes.frame[row] - 0.5
 
 
 MAX_INSTANTS = 8193
@@ -768,7 +762,7 @@ def _expose(
     its middle alone. Instants at which the exposed rows see no part of the layer cost next to
     nothing.
     """
-    at_rest = layer.sheet.plane
+    at_rest, extent, margin = layer.sheet.plane, np.empty(4), REACH * sigma + 2.0 + sheet.largest_px
     groups = cover.shape[0] if motion.row_time_s > 0.0 else 1
     for group in range(groups):
         rows = cover[group : group + 1] if motion.row_time_s > 0.0 else cover
@@ -783,29 +777,18 @@ def _expose(
                     continue
                 plane = moved_plane(at_rest, motion, instant) if instant != 0.0 else at_rest
                 projection = Projection(plane, optics)
-                if _is_seen(
-                    projection, layer.outline, left, top + group, rows.shape[0],
-                    rows.shape[1] - 2, REACH * sigma + 2.0 + sheet.largest_px,
+                behind, _ = outline_extent(projection, layer.outline, extent)
+                if (
+                    behind == 0
+                    and extent[2] - left > -margin
+                    and extent[0] - left < rows.shape[1] - 2 + margin
+                    and extent[3] - (top + group) > -margin
+                    and extent[1] - (top + group) < rows.shape[0] + margin
                 ):
                     coverage.accumulate(
                         rows, layer.edges, levels * (weight / max(panels, 1)), projection, left,
                         top + group, sigma, sheet,
                     )
-
-
-@compiled
-def _is_seen(
-    projection: Projection, outline: Floats, left: int, top: int, height: int, width: int,
-    margin: float,
-) -> bool:
-    """Return whether a marker is in front of the camera and within ``margin`` px of a box."""
-    extent = np.empty(4)
-    behind, _ = outline_extent(projection, outline, extent)
-    return (
-        behind == 0
-        and extent[2] - left > -margin and extent[0] - left < width + margin
-        and extent[3] - top > -margin and extent[1] - top < height + margin
-    )
 
 
 def _spreads(wanted: Floats) -> tuple[list[float], bool]:

@@ -112,30 +112,6 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
     return codes, positions
 
 
-def tag_cells(name: str, marker_id: int) -> NDArray[np.bool_]:
-    """Return the modules (n + 2 overhang,) squared of a tag, True for white, top row first.
-
-    Modules without a bit beyond the black ring, and in the middle of Custom48h12, are white: on
-    the published images they are transparent.
-
-    Raises
-    ------
-    MissingPackageError
-        No package with an AprilTag library is installed.
-    """
-    family = TAG_FAMILIES[name]
-    codes, positions = _codes(name)
-    n, start = family.modules, family.overhang
-    white = np.ones((n + 2 * start, n + 2 * start), dtype=np.bool_)
-    ring = np.s_[start - 1 : start + n + 1]
-    white[ring, ring] = False
-    white[start : start + n, start : start + n] = True
-    shift = np.arange(len(positions) - 1, -1, -1, dtype=np.uint64)
-    column, row = (positions + start).T
-    white[row, column] = (codes[marker_id] >> shift & np.uint64(1)).astype(np.bool_)
-    return white
-
-
 # --------------------------------------------------------------------------------------------------
 # STag's markers: dots in a white circle in a black square, their codes from an installed package.
 #
@@ -327,11 +303,27 @@ def has_circles(dictionary: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def modules(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """Return a marker's modules (n + 2 overhang,) squared, True for white, top row first."""
+    """Return a marker's modules (n + 2 overhang,) squared, True for white, top row first.
+
+    Modules of a tag without a bit beyond the black ring, and in the middle of Custom48h12, are
+    white: on the published images they are transparent.
+
+    Raises
+    ------
+    MissingPackageError
+        No package with an AprilTag library is installed.
+    """
+    n, start = module_count(dictionary), overhang(dictionary)
     if dictionary in TAG_FAMILIES:
-        white = tag_cells(dictionary, marker_id)
+        codes, positions = _codes(dictionary)
+        white = np.ones((n + 2 * start, n + 2 * start), dtype=np.bool_)
+        ring = np.s_[start - 1 : start + n + 1]
+        white[ring, ring] = False
+        white[start : start + n, start : start + n] = True
+        shift = np.arange(len(positions) - 1, -1, -1, dtype=np.uint64)
+        column, row = (positions + start).T
+        white[row, column] = (codes[marker_id] >> shift & np.uint64(1)).astype(np.bool_)
     else:
-        n = module_count(dictionary)
         bitmap = cv2.aruco.generateImageMarker(opencv_dictionary(dictionary), marker_id, n)
         white = np.asarray(bitmap) > 127
     white.setflags(write=False)

@@ -86,8 +86,6 @@ def sensed(
 
 def _cut(image: Grey, computed: Box, window: Box) -> Grey:
     """Return the pixels of ``window`` from those of ``computed`` around it."""
-    if computed == window:
-        return image
     left, top = computed[:2]
     return np.ascontiguousarray(
         image[window[1] - top : window[3] - top, window[0] - left : window[2] - left]
@@ -349,14 +347,6 @@ def _grey_bitmap(target: Board, black: float, white: float, behind: float) -> Gr
     return quantise(_bitmap(target, black, white).astype(np.float64) + (1.0 - share) * behind)
 
 
-@lru_cache(maxsize=1024)
-def _bitmap_corners(target: Board) -> NDArray[np.float32]:
-    """Return the corners (4, 2) of what is black, TL, TR, BR, BL, in pixels of a bitmap."""
-    extent = extent_of(target)
-    square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
-    return np.asarray(board.rectangles(square[None])[0], dtype=np.float32)
-
-
 def _warped(
     scenes: Scenes, row: int, box: Box, bitmap: NDArray[Any], border: int = 0
 ) -> NDArray[Any]:
@@ -364,8 +354,11 @@ def _warped(
 
     A bitmap's pixels have their edges at halves; beyond it is the level ``border``.
     """
-    corners = (scenes.corners_px[row] - box[:2]).astype(np.float32)
-    transform = cv2.getPerspectiveTransform(_bitmap_corners(scenes.targets[row]), corners)
+    extent, corners = extent_of(scenes.targets[row]), scenes.corners_px[row] - box[:2]
+    square = (extent.ink - np.tile(extent.sheet[:2], 2)) * WARP_PX_PER_MODULE - 0.5
+    transform = cv2.getPerspectiveTransform(
+        board.rectangles(square[None])[0].astype(np.float32), corners.astype(np.float32)
+    )
     return cv2.warpPerspective(
         bitmap, transform, (box[2] - box[0], box[3] - box[1]), flags=cv2.INTER_LINEAR,
         borderValue=(border,),

@@ -167,27 +167,6 @@ def noise_kernel(correlation: float) -> Floats:
     return np.array(kernel) / math.sqrt(at_lag(kernel, 0))
 
 
-@compiled
-def filter_field(white: Floats, kernel: Floats, field: Floats) -> None:
-    """Write the separable sums of ``white`` (h + 2 n, w + 2 n) by ``kernel`` to ``field`` (h, w).
-
-    Each number is summed in the same order, wherever it lies.
-    """
-    taps = len(kernel)
-    height, width = field.shape
-    across = np.zeros((white.shape[0], width))
-    for i in range(white.shape[0]):
-        for k in range(taps):
-            for j in range(width):
-                across[i, j] += kernel[k] * white[i, j + k]
-    for i in range(height):
-        for j in range(width):
-            field[i, j] = 0.0
-        for k in range(taps):
-            for j in range(width):
-                field[i, j] += kernel[k] * across[i + k, j]
-
-
 def normal_field(
     key: np.uint64, draw: int, left: int, top: int, shape: tuple[int, ...], correlation: float
 ) -> Floats:
@@ -203,8 +182,12 @@ def normal_field(
     standard_normals(key, draw, left - reach, top - reach, white)
     if not reach:
         return white
-    field = np.empty(shape)
-    filter_field(white, kernel, field)
+    # Each number is summed in the same order, wherever it lies.
+    across, field = np.zeros((len(white), shape[1])), np.zeros(shape)
+    for k, weight in enumerate(kernel):
+        across += weight * white[:, k : k + shape[1]]
+    for k, weight in enumerate(kernel):
+        field += weight * across[k : k + shape[0]]
     return field
 
 

@@ -13,7 +13,6 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import minimize
 
 import sweep
 from benchmarks.tables import header, row
@@ -35,7 +34,6 @@ PLANE = [0, 2, 4]
 QUICK = {
     "REFINEMENTS": ("subpix",),
     "SETTINGS": ('cornerRefinementMethod=["subpix"]', "trial=180"),
-    "FORMS": {},
 }
 
 
@@ -92,21 +90,15 @@ def print_row(name, whitened, sample, used):
         for kl in (divergences, divergences - chance)))
 
 
-def loss(p, form, sample):
-    """Return the mean of -2 log-likelihood of a form's numbers."""
-    log = form(p, sample)[~sample.flipped]
-    return float((log + sample.errors[~sample.flipped][:, PLANE] ** 2 * np.exp(-log)).mean())
-
-
 FORMS = {
-    "0.02 d2, fitted (2 numbers)": (
-        lambda p, s: np.stack([p[0] + 4 * np.log(s.distance)] * 2
-                              + [p[1] + 4 * np.log(s.distance)], axis=-1), [-10.0, -10.0]),
+    "0.02 d2, fitted (2 numbers)": (lambda d: d**2 * np.ones(3), ([0, 1], [2])),
     "(4, 4, 8)(1 + d2/30), fitted (1)": (
-        lambda p, s: p[0] + 2 * np.log(np.array([4, 4, 8]) * (
-            1 + s.distance[:, None] ** 2 / 30)), [-12.0]),
+        lambda d: np.array([4, 4, 8]) * (1 + d**2 / 30), ([0, 1, 2],)),
 }
-"""Form -> ln(variance) of x, z and yaw of numbers and a sample, and where the fit begins."""
+"""Form -> deviations (N, 3) of x, z and yaw at distances (N, 1), and which of them share a factor.
+
+The likeliest factor is the root mean square of the errors in units of the form.
+"""
 
 
 def flip_bins(chance, flipped):
@@ -140,11 +132,12 @@ def main():
             root = np.linalg.cholesky(found["covariance"].values[used][:, some][:, :, some])
             whitened = np.linalg.solve(root, left[:, some, None])[..., 0]
             print_row(name, whitened, b, used)
-        for name, (form, start) in FORMS.items():
-            p = np.array(start)
-            for _ in range(4):
-                p = minimize(loss, p, (form, a), method="Nelder-Mead",
-                             options={"maxiter": 400}).x
-            print_row(name, b.errors[used][:, PLANE] * np.exp(-0.5 * form(p, b)[used]), b, used)
+        for name, (form, factors) in FORMS.items():
+            fitted, judged = (
+                sample.errors[rows][:, PLANE] / form(sample.distance[rows, None])
+                for sample, rows in ((a, ~a.flipped), (b, used)))
+            for each in factors:
+                judged[:, each] /= np.sqrt((fitted[:, each] ** 2).mean())
+            print_row(name, judged, b, used)
         inside = list(flip_bins(found["flip_probability"].values[known], b.flipped[known]))
         print(f"\nflips within the interval in {sum(inside)} of {len(inside)} bins")

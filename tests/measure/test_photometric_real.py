@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from support.blocks import run_cells
@@ -23,6 +24,7 @@ from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE
+from sweep.model.pose import rotation_of_angles
 
 ALARM = 1e-7
 CHARUCO = Charuco(
@@ -37,11 +39,9 @@ LENS = (-0.2, 0.05, 0.001, -0.001)
 TONED = PhotometricReal(refined=False, spread_free=True, tone=True)
 
 
-def rotation(tilt, azimuth, roll):
-    """Return that of DESIGN's angles in degrees, by OpenCV."""
-    tilt, azimuth, roll = np.radians([tilt, azimuth, roll])
-    turn = cv2.Rodrigues(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))[0]
-    return turn @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0] @ np.diag([1.0, -1.0, -1.0])
+def rotation(*angles_deg):
+    """Return the rotation of a tilt, an azimuth and a roll."""
+    return rotation_of_angles(*np.radians(angles_deg)[:, None])[0]
 
 
 def camera_of(view, lens):
@@ -61,11 +61,7 @@ def photograph(
         share = cv2.remap(share.astype(np.float32), *shift, cv2.INTER_CUBIC).astype(np.float64)
     level = 40 + 150 * (share + tone * share * (1 - share))
     white = rng.normal(size=(240, 320 + 50))
-    for column in range(1, white.shape[1]):
-        white[:, column] = (
-            correlation * white[:, column - 1]
-            + np.sqrt(1 - correlation**2) * white[:, column]
-        )
+    white = lfilter([np.sqrt(1 - correlation**2)], [1, -correlation], white)  # along rows
     return np.clip(np.rint(level + noise * white[:, 50:]), 0, 255).astype(np.uint8)
 
 

@@ -7,27 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board import edges_on_sheet, first_overlap
+from support.small_scenes import image_of
+from sweep.model.board import first_overlap
 from sweep.model.board_kinds import AprilGrid, Charuco
 
 DICTIONARY = "DICT_4X4_250"
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
-
-
-def painted(board, low, high, px_per_m):
-    """The board's picture, 0 or 255 a pixel, with outside 128: a pixel's level is the sum of the
-    jumps at the edges that a ray from its left crosses. ``low``, ``high``: right and down, m."""
-    edges, (left, top) = edges_on_sheet(board.prints), low
-    width, height = np.round((np.array(high) - low) * px_per_m).astype(int)
-    x = left + (np.arange(width) + 0.5) / px_per_m
-    y = top + (np.arange(height) + 0.5) / px_per_m
-    level = np.array([128.0, 0.0, 255.0])
-    image = np.full((height, width), level[0])
-    for (x0, y0, x1, y1), (before, after) in zip(edges.ends, edges.sides, strict=True):
-        rows = (min(y0, y1) <= y) & (y < max(y0, y1))
-        at = x0 + (x1 - x0) * (y[rows] - y0) / (y1 - y0) if y0 != y1 else y[rows]
-        image[rows] += np.sign(y1 - y0) * (level[after] - level[before]) * (x > at[:, None])
-    return image
 
 
 def in_our_frame(points, middle):
@@ -82,17 +67,19 @@ def test_an_april_grid_in_kalibrs_words_is_what_kalibr_prints():
     That is what kalibr_create_target_pdf draws of its codes (rotation=2): of ID 0,
     0xd5d628584, bit 6 i + j is row i, column j of a matrix turned by 180 degrees.
     """
-    board = AprilGrid(
-        dictionary="DICT_APRILTAG_36h11", tagCols=4, tagRows=3, tagSize=0.016, tagSpacing=0.25,
-    ).board()
+    grid = {"tagCols": 4, "tagRows": 3, "tagSpacing": 0.25}
+    board = AprilGrid(dictionary="DICT_APRILTAG_36h11", tagSize=0.016, **grid).board()
     assert board.marker_ids == tuple(range(12))
     corners = board.corners_m
     assert corners[0, :, :2].max() < 0  # at the bottom left
     assert np.allclose(corners[1] - corners[0], [0.02, 0, 0])
     assert np.allclose(corners[4] - corners[0], [0, 0.02, 0])
-    middle = np.array([0.038, 0.028])
-    low = -middle - 0.004
-    image = painted(board, low, -low, 1000)  # 2 px a module
+    image = image_of(text={  # 1 px a mm, 2 a module, and 4 around
+        "camera": {"width_px": 84, "height_px": 64, "fx_px": 1000, "fy_px": 1000},
+        "marker": {"dictionary": "DICT_APRILTAG_36h11", "size_m": 0.016},
+        "board": {"kind": "aprilgrid", **grid}, "pose": {"distance_m": 1},
+        "scene": {"background": 255}, "estimator": {"solver": "iterative"},
+    })
     expected = np.full(image.shape, 255.0)
     theirs = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     code = np.array([[0xD5D628584 >> (6 * i + j) & 1 for j in range(6)] for i in range(6)])

@@ -64,15 +64,13 @@ def turned(each):
     return (tilt * Rotation.from_euler("z", each["roll_deg"], degrees=True)).as_matrix()
 
 
-def traced(markers, camera, pose, per_side):
+def traced(markers, scenes, per_side):
     """The mean levels (height, width) of ``per_side``² rays a pixel.
 
-    Each ray takes the nearest sheet. ``markers`` have quiet zones of one module; ``camera``: width,
-    height, f, cx, cy; ``pose``: rotation and translation of the target. ``ground``: returns the
-    level of points (n, 2) of the target's plane, NaN where nothing is printed.
+    Each ray takes the nearest sheet. ``markers`` have quiet zones of one module.
     """
-    width, height, focal, cx, cy = camera
-    rotation, translation = pose
+    width, height, focal, cx, cy = 160, 120, 150.0, 79.5, 59.5
+    rotation, translation = scenes.rotation[0], scenes.translation[0]
     u = (np.arange(width * per_side) + 0.5) / per_side - 0.5
     v = (np.arange(height * per_side) + 0.5) / per_side - 0.5
     x, y = np.meshgrid((u - cx) / focal, (v - cy) / focal)
@@ -100,11 +98,6 @@ def traced(markers, camera, pose, per_side):
     return level.reshape(height, per_side, width, per_side).mean(axis=(1, 3))
 
 
-def rays_of(markers, scenes, per_side):
-    return traced(markers, (160, 120, 150.0, 79.5, 59.5),
-                  (scenes.rotation[0], scenes.translation[0]), per_side)
-
-
 BOARDS = {
     "cube": {"kind": "markers", "markers": CUBE},
     "field": {"kind": "markers", "markers": FIELD},
@@ -126,7 +119,7 @@ def test_an_image_is_that_of_rays(name, tilt_deg):
     image = image_of(scenes)
     shown = [*declared.get("markers", []), *declared.get("distractors", [])]
     coarse, fine = (
-        np.sqrt(((image - rays_of(shown, scenes, n)) ** 2).mean()) for n in (3, 9)
+        np.sqrt(((image - traced(shown, scenes, n)) ** 2).mean()) for n in (3, 9)
     )
     assert fine < 0.8
     assert fine < 0.3 * coarse or fine == coarse == 0

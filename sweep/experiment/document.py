@@ -17,18 +17,9 @@ import tomlkit
 import tomlkit.items
 
 from sweep.declaration import Declared, TablesError, check_table
-from sweep.experiment import parameters
+from sweep.experiment import grid, parameters
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.grid import (
-    MAX_LISTED,
-    TRIAL,
-    Axis,
-    Grid,
-    axis_along,
-    axis_values,
-    parse_distribution,
-    trial_numbers,
-)
+from sweep.experiment.grid import TRIAL, Axis, Grid
 from sweep.experiment.parameters import PARAMETERS, Parameter
 from sweep.messages import MAX_FAULTS, plain, refusal, shown, similar
 from sweep.model.image_file import read_regular
@@ -374,7 +365,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
     reading.written[key] = path, value
     with reading.noting(path, key, value):
         if isinstance(value, dict):
-            reading.distributions[key] = parse_distribution(parameter, value)
+            reading.distributions[key] = grid.parse_distribution(parameter, value)
         elif isinstance(value, list) and tuple not in parameter.types and not parameter.reads:
             raise ValueError(f"{parameter.expected()}; several values are an axis: they go under "
                              "[axes]")
@@ -383,7 +374,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
 
 
 def _read_axes(reading: Reading) -> None:
-    quota = MAX_LISTED
+    quota = grid.MAX_LISTED
     for key, value in reading.table("axes").items():
         together = parameters.is_zip(value) and key not in (*reading.parameters, TRIAL)
         axis = _read_axis(reading, key, value["zip"] if together else {key: value}, quota,
@@ -409,13 +400,13 @@ def _read_axis(
             if name == TRIAL and together:
                 raise ValueError("it as an axis of its own: every cell has the same trials")
             if name == TRIAL:
-                columns[name] = trial_numbers(value)
+                columns[name] = grid.trial_numbers(value)
             elif name in reading.given:
                 other, _ = reading.written[name]
                 raise ValueError(f"it once: {other} is given too; delete one of them")
             elif name in reading.parameters:
                 reading.written[name] = f"{path}.{name}", value
-                values = axis_values(reading.parameters[name], value, quota, repeats=together)
+                values = grid.axis_values(reading.parameters[name], value, quota, repeats=together)
                 if together and len(values) > quota:
                     raise ValueError("at most 10^6 values, all axes together")
                 columns[name] = values
@@ -431,7 +422,7 @@ def _read_axis(
     if len(columns) < max(len(members), 1 + together):
         return None
     try:
-        return axis_along(key, columns, reading.parameters, together=together)
+        return grid.axis_along(key, columns, reading.parameters, together=together)
     except ValueError as error:
         reading.note(path, f"expected {error}")
         return None

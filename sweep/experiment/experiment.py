@@ -20,24 +20,13 @@ from sweep.experiment.parameters import NAMED_BY, PARAMETERS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure import detectors
-from sweep.measure.detectors import (
-    OPENCV,
-    AnyDetectorSetting,
-    BoardDetectorSetting,
-    DetectorSetting,
-)
+from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.likelihood import BoundSetting
 from sweep.messages import label
 from sweep.model import camera, effects
 from sweep.model.board_kinds import ARRANGING, arranged_board
-from sweep.model.camera import (
-    VIEW_PARAMETERS,
-    Column,
-    canonical_distortion,
-    intrinsics,
-    map_columns,
-)
+from sweep.model.camera import Column, canonical_distortion, map_columns
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
 from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
@@ -331,7 +320,7 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     {'solver': 'ippe'}
     """
     # Each setting that some detectors or solvers have and others lack, with its owner.
-    owned = [("detector", OPENCV, {*OPENCV_FIELDS})]
+    owned = [("detector", detectors.OPENCV, {*OPENCV_FIELDS})]
     owned += [("solver", name, {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded})
               for name, solver in SOLVERS.items()]
     owned += [(NAMED_BY[plugin.kind].name, plugin.name, {each.name for each in plugin.settings})
@@ -377,8 +366,8 @@ def wrong_beliefs(pipeline: Grid, axis: Axis) -> tuple[bool, ...]:
     truths |= {"believed": "truth", "believed_focal_scale": 1.0}
     if "distortion" in fixed:
         truths["believed_distortion"] = canonical_distortion(fixed["distortion"])
-    if fixed.keys() >= {*VIEW_PARAMETERS}:
-        view = intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))
+    if fixed.keys() >= {*camera.VIEW_PARAMETERS}:
+        view = camera.intrinsics(*(fixed[name] for name in camera.VIEW_PARAMETERS))
         truths |= zip((f"believed_{name}_px" for name in ("fx", "fy", "cx", "cy")), view,
                       strict=True)
     return tuple(

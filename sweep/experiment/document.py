@@ -345,7 +345,9 @@ def read_keys(
     for section in parameters.SECTIONS:
         for key, value in reading.table(section).items():
             _read_key(reading, section, key, value)
-    _read_axes(reading)
+    for key, value in reading.table("axes").items():
+        together = parameters.is_zip(value) and key not in (*reading.parameters, TRIAL)
+        _read_axis(reading, key, value["zip"] if together else {key: value}, together=together)
     reading.fixed.update({name: each.default for name, each in reading.parameters.items()
                           if name not in reading.given})
     return reading
@@ -373,28 +375,18 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
             reading.fixed[key] = parameter.check(value)
 
 
-def _read_axes(reading: Reading) -> None:
-    quota = grid.MAX_LISTED
-    for key, value in reading.table("axes").items():
-        together = parameters.is_zip(value) and key not in (*reading.parameters, TRIAL)
-        axis = _read_axis(reading, key, value["zip"] if together else {key: value}, quota,
-                          together=together)
-        if axis is not None:
-            reading.axes.append(axis)
-            listed = [v for v in axis.columns.values() if not isinstance(v, range)]
-            quota -= len(axis) * len(listed)
-
-
 def _read_axis(
-    reading: Reading, key: str, members: Mapping[str, Any], quota: int, *, together: bool
-) -> Axis | None:
-    """Return the axis of a parameter, or of several that go together; note why there is none."""
+    reading: Reading, key: str, members: Mapping[str, Any], *, together: bool
+) -> None:
+    """Add the axis of a parameter, or of several that go together, or note why there is none."""
     path = f"axes.{key}" if together else "axes"
     if together and not key.isidentifier():
         reading.note(plain(path), "expected a name of letters, digits and underscores")
-        return None
+        return
     columns: dict[str, Sequence[Any]] = {}
-    quota //= max(len(members), 1)
+    listed = sum(len(values) for axis in reading.axes for values in axis.columns.values()
+                 if not isinstance(values, range))
+    quota = (grid.MAX_LISTED - listed) // max(len(members), 1)
     for name, value in members.items():
         with reading.noting(f"{path}.{name}", name, value):
             if name == TRIAL and together:
@@ -420,9 +412,9 @@ def _read_axis(
     if together and len(members) < 2:
         reading.fault(path, {"zip": members}, "at least two parameters that go together")
     if len(columns) < max(len(members), 1 + together):
-        return None
+        return
     try:
-        return grid.axis_along(key, columns, reading.parameters, together=together)
+        reading.axes.append(
+            grid.axis_along(key, columns, reading.parameters, together=together))
     except ValueError as error:
         reading.note(path, f"expected {error}")
-        return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from hashlib import blake2b
 from typing import Any
 
@@ -297,22 +297,21 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     frame = np.stack(_numbers(values, ("width_px", "height_px"), count), axis=1)
     share = np.stack(_numbers(values, SHARES, count, np.nan), axis=1)
     centres = np.empty((count, 2))
+
+    def offsets(
+        rows: NDArray[np.intp], points: Floats, part: NDArray[np.intp], centre_xy: Floats
+    ) -> Floats:
+        position = np.column_stack([centre_xy, depth[rows[part]]])
+        return pose.transform_points(
+            points[part], facing(rows[part], position), np.zeros_like(position))
+
     # What a scene gets must not depend on whether others have a lens.
     for curved in (False, True):
         rows = np.flatnonzero(cameras.distorted == curved)
         points = along_sides(outline[rows], camera.PER_SIDE if curved else 1)
-
-        def offsets(
-            part: NDArray[np.intp], centre_xy: Floats, rows: NDArray[np.intp] = rows,
-            points: Floats = points,
-        ) -> Floats:
-            position = np.column_stack([centre_xy, depth[rows[part]]])
-            rotation = facing(rows[part], position)
-            return pose.transform_points(points[part], rotation, np.zeros_like(position))
-
         centres[rows] = camera.Framing(
-            cameras.take(rows), frame[rows], depth[rows], offsets, share[rows], given[rows],
-            margin[rows], shift[rows],
+            cameras.take(rows), frame[rows], depth[rows], partial(offsets, rows, points),
+            share[rows], given[rows], margin[rows], shift[rows],
         ).centres()
     return tuple(centres.T)
 

@@ -377,16 +377,17 @@ def targets_are_solved(reading: Reading) -> None:
             "points", "kind = charuco or diamond, which have a chessboard", "chessboard")
     of_boards = [name for name, each in SOLVERS.items() if each.of_boards]
     of_corners = [name for name, each in SOLVERS.items() if each.method is not None]
-    apart(("solver", "points"),
-          lambda solver, points: solver not in (*of_boards, *plugged) and not (
-              points == "largest_marker" and solver in of_corners),
-          f"one of {', '.join(of_boards)} for boards; others with points = largest_marker if they "
-          "take corners alone; plug-ins with of_boards=True")(reading)
+    for solver, points in reading.meeting("solver", "points"):
+        able = [*of_boards, *plugged, *(of_corners if points == "largest_marker" else ())]
+        if solver not in able:
+            reading.refuse("solver", f"one of {', '.join(of_boards)} for boards; others with "
+                           "points = largest_marker if they take corners alone; plug-ins with "
+                           "of_boards=True", solver)
     for name, whole in (("points", "markers"), ("refine", "none")):
-        apart((name, "solver"), lambda chosen, solver, whole=whole: (
-                  chosen != whole and solver in ("photometric", *plugged)),
-              lambda _, solver, whole=whole: (
-                  f"{whole} beside solver = {solver}, which chooses by itself"))(reading)
+        for chosen, solver in reading.meeting(name, "solver"):
+            if chosen != whole and solver in ("photometric", *plugged):
+                reading.refuse(
+                    name, f"{whole} beside solver = {solver}, which chooses by itself", chosen)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -413,18 +414,15 @@ def what_is_installed(reading: Reading) -> None:
     for dictionary in reading.values_of("dictionary") if reading.recorded is None else ():
         if (missing := marker.missing_package(dictionary)) is not None:
             reading.refuse("dictionary", missing, dictionary)
-    known: dict[str, tuple[str, ...]] = {
-        OPENCV: marker.opencv_dictionary_names(),
-        **{plugin.name: plugin.dictionaries for plugin in reading.plugins
-           if plugin.kind == "detector" and plugin.dictionaries},
-    }
-    apart(
-        ("dictionary", "detector"),
-        lambda dictionary, detector: dictionary not in known.get(detector, (dictionary,)),
-        lambda _, detector: "one of OpenCV's for its detector; give another detector"
-        if detector == OPENCV
-        else f"one that the detector {detector} has: {', '.join(known[detector])}",
-    )(reading)
+    known = {OPENCV: marker.opencv_dictionary_names()} | {
+        plugin.name: plugin.dictionaries for plugin in reading.plugins
+        if plugin.kind == "detector" and plugin.dictionaries}
+    for dictionary, detector in reading.meeting("dictionary", "detector"):
+        if dictionary not in known.get(detector, (dictionary,)):
+            reading.refuse(
+                "dictionary", "one of OpenCV's for its detector; give another detector"
+                if detector == OPENCV else f"one that the detector {detector} has: "
+                f"{', '.join(known[detector])}", dictionary)
 
 
 def something_random_to_repeat(reading: Reading) -> None:

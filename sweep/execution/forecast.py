@@ -21,7 +21,6 @@ from sweep.execution import TIME_LIMIT_S
 from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
-from sweep.experiment.photographs import along_photographs
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation import child_process
 from sweep.isolation.child_process import Child
@@ -98,8 +97,7 @@ def _photographs(pipeline: Pipeline) -> Blocks:
     axes = pipeline.experiment.scene_axes
     lengths = tuple(len(axis) for axis in axes)
     return Blocks(lengths, tuple(
-        1 if along else length
-        for along, length in zip(along_photographs(axes), lengths, strict=True)))
+        1 if axis.name == TRIAL or "photographs" in axis.columns else len(axis) for axis in axes))
 
 
 def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:

@@ -229,9 +229,7 @@ class Reading(Grid):
         One line each, once: source, key, value, expectation.
     """
 
-    fixed: dict[str, Any]
     axes: list[Axis]
-    files: dict[str, str]
     document: Mapping[str, Any]
     source: str
     title: str

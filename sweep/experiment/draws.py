@@ -327,15 +327,9 @@ STEPS = (
     Step(("side_px",), (*VIEW_PARAMETERS, "size_m"), ("distance_m",), _from_side),
     Step(WORLD, (), (*ANGLES, *CENTRE, "distance_m"), _from_world),
     Step(("yaw_deg", "pitch_deg"), ("roll_deg",), ANGLES, _from_yaw_and_pitch),
-    Step(
-        SHARES,
-        (*_POSITION, *ANGLES, "view_angle_deg", "distortion", "jitter_px", "size_m",
-         "quiet_zone_modules", "dictionary"),
-        CENTRE, _from_frame,
-    ),
-    Step(
-        ("view_angle_deg",), ("azimuth_deg", "roll_deg", *_POSITION), ANGLES, _from_view_angle,
-    ),
+    Step(SHARES, (*_POSITION, *ANGLES, "view_angle_deg", "distortion", "jitter_px", "size_m",
+                  "quiet_zone_modules", "dictionary"), CENTRE, _from_frame),
+    Step(("view_angle_deg",), ("azimuth_deg", "roll_deg", *_POSITION), ANGLES, _from_view_angle),
 )
 """Every step, each after those that make what it reads."""
 

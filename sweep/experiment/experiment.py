@@ -64,8 +64,6 @@ def _names(declaring: type) -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(declaring))
 
 
-OPENCV_FIELDS = _names(DetectorSetting)
-
 NOT_IN_IMAGE = {
     "window", "camera_file", "calibration_sd", "calibration_covariance", *_names(BoundSetting),
 }
@@ -79,14 +77,9 @@ def _made(declaring: type[T], values: Mapping[str, Any]) -> T:
 
 def effect_of(plugin: DeclaredPlugin) -> Effect:
     """Return the effect of a plug-in, which is not imported for it: it lacks its function."""
-    widens: Any = plugin.widens
-    step: Any = plugin.step
     parameters = {setting.name: setting for setting in plugin.settings}
-    return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
-
-
-TARGET_SECTIONS = ("marker", "board", "target")
-"""Sections of a pipeline whose parameters tell targets apart."""
+    return Effect(plugin.name, cast("Any", plugin.step), parameters, random=plugin.random,
+                  widens=cast("Any", plugin.widens))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -120,7 +113,7 @@ class Experiment:
         """The axes along which targets differ by more than a number: compared, never averaged."""
         return tuple(
             axis for axis in self.scene_axes if len(axis) > 1 and not axis.is_numeric
-            and any(each.section in TARGET_SECTIONS for each in axis.parameters))
+            and any(each.section in ("marker", "board") for each in axis.parameters))
 
     @cached_property
     def detectors(self) -> list[AnyDetectorSetting]:
@@ -320,7 +313,7 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     {'solver': 'ippe'}
     """
     # Each setting that some detectors or solvers have and others lack, with its owner.
-    owned = [("detector", detectors.OPENCV, {*OPENCV_FIELDS})]
+    owned = [("detector", detectors.OPENCV, {*_names(DetectorSetting)})]
     owned += [("solver", name, {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded})
               for name, solver in SOLVERS.items()]
     owned += [(NAMED_BY[plugin.kind].name, plugin.name, {each.name for each in plugin.settings})

@@ -372,12 +372,12 @@ class Grid:
 
     seed: int
     sampling: str
-    fixed: Mapping[str, Any]
+    fixed: dict[str, Any]
     given: AbstractSet[str]
     distributions: dict[str, Distribution]
     axes: Sequence[Axis]
     plugins: tuple[DeclaredPlugin, ...]
-    files: Mapping[str, str]
+    files: dict[str, str]
     folder: str
 
     @property

@@ -80,7 +80,6 @@ IN_CAMERA = tuple(
 )
 """Parameters that place the marker in the camera's frame."""
 
-FOCAL_LENGTHS = ("fx_px", "fy_px")
 SENSOR_SIDES = ("sensor_width_mm", "sensor_height_mm")
 IN_MM = (*SENSOR_SIDES, "focal_length_mm", "pixel_size_um")
 FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg", "dfov_deg")
@@ -91,7 +90,7 @@ CHOICES: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("bearing_y_deg",), ("y_m",), ("frame_y",)),
     (("tilt_deg",), ("view_angle_deg",), ("yaw_deg", "pitch_deg")),
     (("azimuth_deg",), ("yaw_deg", "pitch_deg")),
-    (FOCAL_LENGTHS, IN_MM, *((name,) for name in FIELDS_OF_VIEW)),
+    (("fx_px", "fy_px"), IN_MM, *((name,) for name in FIELDS_OF_VIEW)),
     (SENSOR_SIDES, ("pixel_size_um",)),
     (("believed_focal_scale",), ("believed_fx_px", "believed_fy_px")),
 )

@@ -7,7 +7,7 @@ and the poses are those of the record; with ``simulated`` the images are not the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from sweep.declaration import Declared, check_table, declared_fields
 from sweep.errors import PluginError, SweepError
 from sweep.experiment.document import file_text, read_document, refusing
-from sweep.experiment.grid import TRIAL, Axis
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown
 from sweep.model.board import Board
@@ -186,11 +185,6 @@ farther out influences the marker's corners."""
 def _board(document: str) -> Board:
     """Return the board of a record, the same object for the same document."""
     return board_of(json.loads(document), "board")
-
-
-def along_photographs(axes: Iterable[Axis]) -> list[bool]:
-    """Return of each axis whether its values are other photographs."""
-    return [axis.name == TRIAL or "photographs" in axis.columns for axis in axes]
 
 
 def recorded_poses(

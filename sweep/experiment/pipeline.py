@@ -766,10 +766,9 @@ class Pipeline(Grid):
         if settings:
             # Other settings may be of plug-ins that settings name.
             named = copy.deepcopy(document)
-            keys = [each.partition("=")[0].strip().rpartition(".")[2] for each in settings]
             apply_settings(named, parse_settings([
-                each for key, each in zip(keys, settings, strict=True)
-                if key in parameters.NAMING]))
+                each for each in settings
+                if each.partition("=")[0].strip().rpartition(".")[2] in parameters.NAMING]))
             declared, _ = parameters.read_plugins(named, str(folder), plugins)
             known = parameters.parameters_with(tuple(declared))
             chosen = parse_settings(settings, known)

@@ -92,11 +92,6 @@ class StoppingRule:
     precision: tuple[tuple[str, float], ...] = ()
 
     @property
-    def is_choice(self) -> bool:
-        """Whether something is chosen."""
-        return self.kind in CHOICES
-
-    @property
     def largest(self) -> bool:
         """Whether the largest value of the axis is chosen."""
         return self.kind == "largest"

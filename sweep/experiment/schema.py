@@ -321,7 +321,6 @@ class Variable:
 _S, _D, _E = Stage.scene, Stage.detection, Stage.estimation
 _TRUTH = FlagRule("detection", "unless_lost")
 _BOUND, _MAYBE_BOUND = FlagRule("bound", "always"), FlagRule("bound", "only")
-_DETECTED = FlagRule("detection", "always")
 _POSE, _MAYBE_POSE = FlagRule("estimate", "always"), FlagRule("estimate", "only")
 _EQUAL = Tolerance("equal")
 _ANGLE = Tolerance("absolute", math.degrees(ROTATION_ATOL_RAD))
@@ -352,8 +351,8 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("detection", _D, "u1", "what became of the marker", flags=DetectionStatus,
              tolerance=_EQUAL),
     Variable("corner_error_px", _D, "f4", "found corner minus true corner", "px",
-             ("corner", "xy"),
-             present_when=_DETECTED, tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
+             ("corner", "xy"), present_when=FlagRule("detection", "always"),
+             tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
     Variable("estimate", _E, "u1", "what became of the pose", flags=flags.EstimateStatus,
              tolerance=_EQUAL),
     Variable("translation_error_m", _E, "f4", "estimated minus true, camera frame", "m",
@@ -392,15 +391,13 @@ SCHEMA: tuple[Variable, ...] = (
 )
 """Every variable, in the order in which the stages make them."""
 
-_BOARD_MARKER = FlagRule("marker_detection", "always")
-
 BOARD_SCHEMA: tuple[Variable, ...] = (
     Variable("board_marker_id", _S, "f4", "ID of each marker of the board, in the board's order",
              inner=("marker",)),
     Variable("marker_detection", _D, "u1", "what became of each marker of the board",
              inner=("marker",), flags=DetectionStatus, tolerance=_EQUAL),
     Variable("marker_corner_error_px", _D, "f4", "found corner minus true corner, of each marker",
-             "px", ("marker", "corner", "xy"), present_when=_BOARD_MARKER,
+             "px", ("marker", "corner", "xy"), present_when=FlagRule("marker_detection", "always"),
              tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
     Variable("chessboard_corner_error_px", _D, "f4",
              "interpolated corner of the chessboard minus true corner; NaN: not found", "px",

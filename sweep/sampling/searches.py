@@ -41,7 +41,7 @@ from sweep.errors import DatasetError
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import StoppingRule
+from sweep.experiment.sampling import CHOICES, StoppingRule
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.messages import refusal
 from sweep.sampling.rules import GroupResults, Stopping, condition_axes, result_dimensions
@@ -156,7 +156,7 @@ def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Stopping:
         open_cells = (_limit if rule.kind == "along" else _choice)(pipeline, rule)
         variables = [name for each in parse_requirements(rule.requirements)
                      for name in each.requirable.variables]
-    free = rule.among if rule.is_choice else rule.per
+    free = rule.among if rule.kind in CHOICES else rule.per
 
     def needed(results: GroupResults) -> Masks:
         dataset = group_dataset(results)

@@ -20,7 +20,7 @@ from sweep.execution.runner import execute
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import StoppingRule
+from sweep.experiment.sampling import CHOICES, StoppingRule
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
 from sweep.sampling.searches import store_cells
@@ -279,7 +279,7 @@ def search_choice(
 def chosen_by(pipeline: Pipeline) -> StoppingRule:
     """Return what a pipeline chooses; PipelineError if it has no section [search]."""
     rule = pipeline.stopping
-    if rule is not None and rule.is_choice:
+    if rule is not None and rule.kind in CHOICES:
         return rule
     example = 'smallest = "size_m", max_trials = 5000'
     raise refusal([f"{pipeline.source}: expected what is chosen: [{SEARCH}] {example}"])

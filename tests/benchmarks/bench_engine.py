@@ -77,11 +77,18 @@ def bare(text, trial):
     run_cells(experiment, Block((0, 0, 0, trial), (*lengths, trial + 1)).indices())
 
 
+def begin(text, gate):
+    """Compile, and wait until all processes have."""
+    bare(text, 0)
+    gate.wait()
+
+
 def bare_rate(text, trials, workers):
     """Return scenes per second of independent processes that run the bare kernel."""
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes:
-        warm = [0] * 4 * workers
-        deque(processes.map(functools.partial(bare, text), warm), maxlen=0)
+    spawn = multiprocessing.get_context("spawn")
+    gate = spawn.Barrier(workers)
+    with ProcessPoolExecutor(workers, spawn, begin, (text, gate)) as processes:
+        deque(processes.map(functools.partial(bare, text), [0] * workers), maxlen=0)
         begun = time.perf_counter()
         deque(processes.map(functools.partial(bare, text), range(trials)), maxlen=0)
         return trials * grid(1)[1] / (time.perf_counter() - begun)

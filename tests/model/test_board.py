@@ -38,10 +38,8 @@ def test_charuco_board_is_opencvs(shape, legacy):
     assert np.abs(ours.chessboard_m - chessboard).max() < 1e-8
 
 
-def squares(centres, sides, rolls):
-    return np.array([
-        np.column_stack([cv2.boxPoints((centre, (side, side), np.degrees(roll))), np.zeros(4)])
-        for centre, side, roll in zip(centres, sides, rolls, strict=True)])
+def squares(boxes):
+    return np.array([np.column_stack([cv2.boxPoints(box), np.zeros(4)]) for box in boxes])
 
 
 def test_squares_overlap_as_their_clipped_polygons_do():
@@ -49,16 +47,16 @@ def test_squares_overlap_as_their_clipped_polygons_do():
     seen = set()
     for _ in range(300):
         centres, sides = rng.uniform(-1, 1, (2, 2)), rng.uniform(0.3, 1.5, 2)
-        rolls = rng.uniform(0, 7, 2)
         boxes = [((float(x), float(y)), (float(s), float(s)), float(np.degrees(r)))
-                 for (x, y), s, r in zip(centres, sides, rolls, strict=True)]
+                 for (x, y), s, r in zip(centres, sides, rng.uniform(0, 7, 2), strict=True)]
         state, region = cv2.rotatedRectangleIntersection(*boxes)
         area = 0.0 if region is None else cv2.contourArea(cv2.convexHull(region))
         if state == cv2.INTERSECT_NONE or area > 1e-4:
             seen.add(area > 0)
-            assert (first_overlap(squares(centres, sides, rolls)) is not None) == (area > 0)
+            assert (first_overlap(squares(boxes)) is not None) == (area > 0)
     assert seen == {True, False}
-    assert first_overlap(squares([[0, 0], [1.0, 0]], [1.0, 1.0], [0.0, 0.0])) is None
+    beside = [((x, 0.0), (1.0, 1.0), 0.0) for x in (0.0, 1.0)]
+    assert first_overlap(squares(beside)) is None
 
 
 def test_an_april_grid_in_kalibrs_words_is_what_kalibr_prints():

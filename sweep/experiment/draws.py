@@ -262,8 +262,10 @@ def _facing(
         rotation = pose.rotation_of_angles(tilt, azimuth, roll)
         return lambda rows, _: rotation[rows]
     view = np.radians(values["view_angle_deg"].broadcast(count))
-    return lambda rows, position: pose.rotation_of_view_angle(
-        view[rows], azimuth[rows], roll[rows], position
+    # After the smallest rotation of the optical axis to the line of sight, the angle between this
+    # and the marker's normal is the view angle wherever the marker is.
+    return lambda rows, position: np.asarray(
+        pose.towards(position) @ pose.rotation_of_angles(view[rows], azimuth[rows], roll[rows])
     )
 
 

@@ -549,8 +549,8 @@ class VisiblePrint(NamedTuple):
     ----------
     number
         Of :func:`sheets_of` the board.
-    edges, plane
-        Its edges, and what takes (column, row, 1) to the camera frame, (3, 3).
+    edges
+        Its edges.
     mover
         (E,) the number of the sheet with which the image of each edge moves: of an edge at which
         another sheet hides this one, the other's.
@@ -558,7 +558,6 @@ class VisiblePrint(NamedTuple):
 
     number: int
     edges: MarkerEdges
-    plane: Floats
     mover: Integers
 
 
@@ -584,7 +583,7 @@ def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[Visible
                     MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
                 )
                 movers.append(mover)
-        seen.append(VisiblePrint(face.number, joined(parts), face.plane, np.concatenate(movers)))
+        seen.append(VisiblePrint(face.number, joined(parts), np.concatenate(movers)))
     return seen
 
 
@@ -598,7 +597,7 @@ def moving_edges(seen: VisiblePrint, planes: Floats) -> list[tuple[MarkerEdges, 
         ends, sides = (each[seen.mover == number] for each in seen.edges)
         if number != seen.number:
             points = np.column_stack([ends.reshape(-1, 2), np.ones(2 * len(ends))])
-            moved = points @ np.linalg.solve(planes[number], seen.plane).T
+            moved = points @ np.linalg.solve(planes[number], planes[seen.number]).T
             ends = np.ascontiguousarray((moved[:, :2] / moved[:, 2:]).reshape(-1, 4))
         groups.append((MarkerEdges(ends, sides), planes[number]))
     return groups

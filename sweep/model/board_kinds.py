@@ -293,19 +293,6 @@ def listing_faults(listed: Sequence[Sequence[Any]] | None, dictionary: str) -> l
     return []
 
 
-def overlap_faults(target: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]:
-    """Return the first overlap of a distractor with its board, or with another distractor."""
-    pair = board.first_overlap(board.sheets_m(target))
-    if pair is None:
-        return []
-    other, number = (sheet - board.own_sheets(target) for sheet in pair)
-    name = f"distractors[{other}]" if other >= 0 else "the board"
-    return [Fault(
-        f"distractors[{number}].x_m", listed[number][1],
-        f"no overlap with {name}, white quiet zones included; move it",
-    )]
-
-
 # --------------------------------------------------------------------------------------------------
 # The kinds of boards on one sheet: what a user writes of each, what it must fulfil, its layout.
 #
@@ -405,15 +392,13 @@ class _OnSheet:
         row, column = np.indices(shape).reshape(2, -1)
         middle = (np.array(shape[::-1]) * step - gap_m) / 2
         centres = np.stack([column, row], axis=1) * step + marker_m / 2 - middle
-        others, half = [], middle
-        if squares:
-            row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
-            low = np.stack([column, row], axis=1) * step - gap_m - middle
-            others = [board.rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
-            half = middle + gap_m
-        if kalibr:
-            return self._on_sheet(centres, marker_m, others, half, 180.0)
-        return self._on_sheet(centres * [1.0, -1.0], marker_m, others, half)
+        centres, roll_deg = (centres, 180.0) if kalibr else (centres * [1.0, -1.0], 0.0)
+        if not squares:
+            return self._on_sheet(centres, marker_m, [], middle, roll_deg)
+        row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
+        low = np.stack([column, row], axis=1) * step - gap_m - middle
+        others = [board.rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
+        return self._on_sheet(centres, marker_m, others, middle + gap_m, roll_deg)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -677,7 +662,16 @@ def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
     listed = given["distractors"]
     faults = arranged(values).faults() + listing_faults(listed, given["dictionary"])
     if listed and not faults:
-        faults = overlap_faults(arranged_board(*values), listed)
+        # The first overlap of a distractor with its board, or with another distractor.
+        target = arranged_board(*values)
+        pair = board.first_overlap(board.sheets_m(target))
+        if pair is not None:
+            other, number = (sheet - board.own_sheets(target) for sheet in pair)
+            name = f"distractors[{other}]" if other >= 0 else "the board"
+            faults.append(Fault(
+                f"distractors[{number}].x_m", listed[number][1],
+                f"no overlap with {name}, white quiet zones included; move it",
+            ))
     return [fault._replace(key=PIPELINE_NAMES.get(fault.key, fault.key)) for fault in faults]
 
 

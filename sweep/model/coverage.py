@@ -199,18 +199,12 @@ def _add_projected(cover: Floats, jump: float, segment: Segment) -> None:
     # Left of the box: on [lower, upper] minus where x >= 0.
     inner_lower, inner_upper = clip(x0, x1, lower, upper)
     if inner_lower >= inner_upper:
-        _, ya = _clamped_pixel(lower, width, height, segment)
-        _, yb = _clamped_pixel(upper, width, height, segment)
-        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
-        return
-    if inner_lower > lower:
-        _, ya = _clamped_pixel(lower, width, height, segment)
-        _, yb = _clamped_pixel(inner_lower, width, height, segment)
-        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
-    if inner_upper < upper:
-        _, ya = _clamped_pixel(inner_upper, width, height, segment)
-        _, yb = _clamped_pixel(upper, width, height, segment)
-        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
+        inner_lower = inner_upper = upper
+    for begin, end in ((lower, inner_lower), (inner_upper, upper)):
+        if begin < end:
+            _, ya = _clamped_pixel(begin, width, height, segment)
+            _, yb = _clamped_pixel(end, width, height, segment)
+            _add_segment(cover, jump, 0.0, ya, 0.0, yb)
     lower, upper = clip(width * z0 - x0, width * z1 - x1, inner_lower, inner_upper)
     if lower >= upper:
         return

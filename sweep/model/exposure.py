@@ -213,16 +213,6 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet:
     )
 
 
-def sheet_outline_px(scenes: Scenes, row: int) -> Floats:
-    """Return points (M, 2) along the images of the sheets; NaN if not before the camera."""
-    optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
-    return np.concatenate([np.empty((0, 2)), *(
-        polygon.sheet_pixels(rectangles(each.box[None], CHORDS_PER_SIDE)[0],
-                     Projection(each.plane, optics), bend)
-        for each in seen_sheets(scenes, row)
-    )])
-
-
 def sheet_folds(scenes: Scenes, row: int) -> bool:
     """Return whether a part of a sheet of one scene hides another, or is not before the camera.
 
@@ -344,7 +334,13 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         points = scenes.cameras.take(lenses).project(_outlines(scenes, lenses, CHORDS_PER_SIDE))
         low[lenses], high[lenses] = points.min(axis=1) - 2, points.max(axis=1) + 2
     for row in np.flatnonzero((bulging & solid) | scenes.effects.outlines("curved")).tolist():
-        points = sheet_outline_px(scenes, row)
+        # Points along the images of the sheets; NaN if not before the camera.
+        optics, bend = scenes.cameras.optics(row), scene_sheet(scenes, row)
+        points = np.concatenate([np.empty((0, 2)), *(
+            polygon.sheet_pixels(rectangles(each.box[None], CHORDS_PER_SIDE)[0],
+                                 Projection(each.plane, optics), bend)
+            for each in seen_sheets(scenes, row)
+        )])
         if not len(points):
             continue
         low[row], high[row] = points.min(axis=0) - 2, points.max(axis=0) + 2

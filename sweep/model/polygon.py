@@ -126,15 +126,6 @@ def homogeneous_pixel(
 
 
 @compiled
-def distance_from_chord(px: float, py: float, x0: float, y0: float, x1: float, y1: float) -> float:
-    """Return the distance of a point from the straight line through two others."""
-    length = math.hypot(x1 - x0, y1 - y0)
-    if length == 0.0:
-        return math.hypot(px - x0, py - y0)
-    return abs((px - x0) * (y1 - y0) - (py - y0) * (x1 - x0)) / length
-
-
-@compiled
 def clip(a: float, b: float, lower: float, upper: float) -> tuple[float, float]:
     """Narrow the interval [lower, upper] of t to where a + t (b - a) >= 0; empty: lower > upper."""
     if a >= 0.0 and b >= 0.0:
@@ -297,10 +288,14 @@ def chord_count(
     the square of their number.
     """
     x0, y0, x1, y1 = ends
-    distance = 0.0
+    distance, length = 0.0, math.hypot(x1 - x0, y1 - y0)
     for quarter in range(1, 4):
         x, y = edge_pixel((piece + 0.25 * quarter) / pieces, edge, projection, sheet)
-        distance = max(distance, distance_from_chord(x, y, x0, y0, x1, y1))
+        # From the straight line through the ends, or from the one point that both are.
+        away = math.hypot(x - x0, y - y0)
+        if length != 0.0:
+            away = abs((x - x0) * (y1 - y0) - (y - y0) * (x1 - x0)) / length
+        distance = max(distance, away)
     return min(max(math.ceil(math.sqrt(distance / CHORD_TOLERANCE_PX)), 1), 4096)
 
 

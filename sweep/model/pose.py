@@ -266,15 +266,6 @@ def towards(sight: Floats) -> Floats:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def rotation_of_view_angle(view: Floats, azimuth: Floats, roll: Floats, sight: Floats) -> Floats:
-    """Return S · Rot((cos azimuth, sin azimuth, 0), view) · Rz(roll) · Rx(180°), (N, 3, 3).
-
-    S is the smallest rotation of the optical axis to the line of sight (N, 3), so that the angle
-    between the marker's normal and the line of sight is ``view`` wherever the marker is.
-    """
-    return np.asarray(towards(sight) @ rotation_of_angles(view, azimuth, roll))
-
-
 def angles_of_rotation(rotation: Floats) -> tuple[Floats, Floats, Floats]:
     """Return tilt in [0, π], azimuth and roll in [-π, π] of rotations (N, 3, 3).
 

@@ -107,7 +107,7 @@ def background_image(path: str) -> Grey:
     return grey
 
 
-def quantise(levels: NDArray[np.float64]) -> Grey:
+def quantise(levels: NDArray[Any]) -> Grey:
     """Return grey levels rounded to 8 bits (half up, as ``coverage.sum_grey``) and clipped."""
     shifted = levels + (0.5 + coverage.ROUNDING_SNAP)
     return np.clip(shifted, 0.0, 255.0).astype(np.uint8)
@@ -153,25 +153,25 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
     left, top, right, bottom = computed = sensed_window(scenes, row, asked) if active else asked
     x0, y0, x1, y1 = marker_box = (box[0], box[1], box[2], box[3])
     inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
-    if isinstance(background, str):
-        behind = image = background_image(background)[top:bottom, left:right].copy()
-    else:
-        image = np.full((bottom - top, right - left), quantise(np.array(background)))
-        if not active and scenes.renderer[row] == "warp":
-            if x1 > x0:
-                image[inner] = _warp_grey(scenes, row, marker_box)
-            return image
-        behind = np.broadcast_to(float(background), image.shape)
+    even = not isinstance(background, str)
+    behind = (
+        np.full((bottom - top, right - left), float(background)) if even
+        else background_image(str(background))[top:bottom, left:right]
+    )
     if not active:
+        image = quantise(behind)
         if x1 > x0:
-            image[inner] = quantise(_exposed(scenes, row, marker_box, behind[inner]))
+            image[inner] = (
+                _warp_grey(scenes, row, marker_box) if even and scenes.renderer[row] == "warp"
+                else quantise(_exposed(scenes, row, marker_box, behind[inner]))
+            )
         return image
     levels, overshoot, effect = behind.astype(np.float64), None, scenes.effects.of(row)
     if x1 > x0:
         plain = _exposed(scenes, row, marker_box, levels[inner])
         if effect["sharpening"] != 0:
             wide = _exposed(scenes, row, marker_box, levels[inner], blurred=True)
-            overshoot = np.zeros(image.shape)
+            overshoot = np.zeros(levels.shape)
             overshoot[inner] = effect["sharpening"] * (plain - wide)
         levels[inner] = plain
     if effect["bloom"] != 0:

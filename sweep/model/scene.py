@@ -316,12 +316,11 @@ class Scenes:
 
         And of one plane.
         """
-        exact = [
+        exact = np.array([
             self.renderer[row] == "exact" and not isinstance(self.background[row], str)
             for row in rows.tolist()
-        ]
-        flat = self.targets.take(rows).each(lambda board: board.is_flat)
-        return np.asarray(np.array(exact, dtype=bool) & flat & ~self.effects.active[rows])
+        ], dtype=bool)
+        return np.asarray(exact & ~self.solid[rows] & ~self.effects.active[rows])
 
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""

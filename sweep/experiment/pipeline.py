@@ -132,7 +132,7 @@ RECORDS: tuple[Check, ...] = (
           f"a frame of at most {MAX_PIXELS:,} pixels"),
     # Renderers.
     apart(("renderer", "dictionary"),
-          lambda renderer, dictionary: renderer != "exact" and marker.has_circles(dictionary),
+          lambda renderer, dictionary: renderer != "exact" and dictionary in marker.STAG_LIBRARIES,
           "exact for STag's markers, which have circles"),
     apart(("renderer", "kind", "distractors"),
           lambda renderer, kind, beside: not is_renderer(renderer) and (kind != SINGLE or beside),

@@ -278,8 +278,6 @@ class Extent(NamedTuple):
         The same without what stands beside a board.
     ink
         The same of a marker's black square, or of a board's markers and squares.
-    modules_beyond
-        How far data extends beyond ``ink``.
     origin, middle
         (2,) each: the pose's origin, and the middle of the target.
     modules
@@ -289,7 +287,6 @@ class Extent(NamedTuple):
     sheet: Floats
     target: Floats
     ink: Floats
-    modules_beyond: float
     origin: Floats
     middle: Floats
     modules: float
@@ -303,13 +300,12 @@ def extent_of(target: Board) -> Extent:
         margin, middle = target.margin, np.array([n / 2, n / 2])
         sheet = np.array([-margin, -margin, n + margin, n + margin])
         ink = np.array([0.0, 0.0, n, n])
-        beyond = float(marker.overhang(target.dictionary))
-        return Extent(sheet, sheet, ink, beyond, middle, middle, n)
+        return Extent(sheet, sheet, ink, middle, middle, n)
     outline = target_edges(target)
     black = (outline.sides == BLACK).any(axis=1)
     own = _box(outline.ends)
     return Extent(
-        _box(edges_of(target).ends), own, _box(outline.ends[black]), 0.0, np.zeros(2),
+        _box(edges_of(target).ends), own, _box(outline.ends[black]), np.zeros(2),
         (own[:2] + own[2:]) / 2, n,
     )
 
@@ -405,7 +401,8 @@ def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> Mar
     angle = math.radians(occlusion_deg)
     towards = np.array([math.cos(angle), -math.sin(angle)])
     # Rows count downwards; the sheet's edge lies where towards · (column, row) = limit.
-    hideable = extent.ink[2:] - extent.ink[:2] + 2 * extent.modules_beyond
+    beyond = marker.overhang(target.dictionary) if target.is_marker else 0
+    hideable = extent.ink[2:] - extent.ink[:2] + 2 * beyond
     middle = (extent.ink[:2] + extent.ink[2:]) / 2
     width = float(hideable @ np.abs(towards))
     limit = float(towards @ middle) + width * (0.5 - occlusion)

@@ -332,14 +332,8 @@ class _OnSheet:
         "marker)", 0, 1e6,
     )
 
-    @property
-    def counts(self) -> tuple[int, int]:
-        """How many markers and chessboard corners it has."""
-        raise NotImplementedError
-
-    def _id_faults(self, sized_by: str, order: str = "in reading order") -> list[Fault]:
-        """Return the faults of the IDs; ``sized_by`` is a key on which their number depends."""
-        count = self.counts[0]
+    def _id_faults(self, count: int, sized_by: str, order: str = "in reading order") -> list[Fault]:
+        """Return the faults of ``count`` IDs, a number that depends on the key ``sized_by``."""
         if self.ids is not None and self.first_id is not None:
             expected = "ids or first_id, not both; delete one of them"
             return [Fault("first_id", self.first_id, expected)]
@@ -348,15 +342,14 @@ class _OnSheet:
             return [Fault(sized_by, getattr(self, sized_by), expected)]
         if self.ids is None:
             key = "first_id" if self.first_id is not None else "dictionary"
-            return id_faults(key, list(self._ids), self.dictionary, getattr(self, key))
+            return id_faults(key, [*self._numbered(count)], self.dictionary, getattr(self, key))
         if len(self.ids) != count:
             return [Fault("ids", list(self.ids), f"{count} IDs, one for each marker {order}")]
         return id_faults("ids", list(self.ids), self.dictionary)
 
-    @property
-    def _ids(self) -> tuple[int, ...]:
+    def _numbered(self, count: int) -> tuple[int, ...]:
         first = self.first_id or 0
-        return tuple(range(first, first + self.counts[0])) if self.ids is None else self.ids
+        return tuple(range(first, first + count)) if self.ids is None else self.ids
 
     def _on_sheet(
         self, centres_m: Floats, marker_m: float, others: Sequence[Print], half_m: Floats,
@@ -366,16 +359,17 @@ class _OnSheet:
 
         The sheet extends ``half_m`` (2,) and the margin from the origin.
         """
+        ids = self._numbered(len(centres_m))
         module_m = marker_m / marker.module_count(self.dictionary)
         beyond = half_m + (module_m if self.margin_m is None else self.margin_m)
         prints, corners = zip(
             *(board.marker_print(self.dictionary, marker_id, marker_m, None, (x, y, 0.0), roll_deg)
-              for marker_id, (x, y) in zip(self._ids, centres_m.tolist(), strict=True)),
+              for marker_id, (x, y) in zip(ids, centres_m.tolist(), strict=True)),
             strict=True,
         )
         sheet = board.rectangles_print(np.array([[*-beyond, *beyond]]), OUTSIDE, WHITE)
         return Board(
-            self.dictionary, self._ids, np.array(corners), (*prints, *others, sheet),
+            self.dictionary, ids, np.array(corners), (*prints, *others, sheet),
             np.empty((0, 3)),
         )
 
@@ -431,7 +425,7 @@ class Charuco(_OnSheet):
         if whole >= self.square_m:
             expected = f"below square_m = {self.square_m:g}{beyond}"
             faults.append(Fault("marker_m", self.marker_m, expected))
-        return faults + self._id_faults("squares_x")
+        return faults + self._id_faults(self.counts[0], "squares_x")
 
     def board(self) -> Board:
         """Return the board; it must have no faults."""
@@ -486,7 +480,7 @@ class Grid(_OnSheet):
                 "corner_squares", self.corner_squares,
                 f"false: the markers of {self.dictionary} have modules where the squares are",
             ))
-        return faults + self._id_faults("rows")
+        return faults + self._id_faults(self.counts[0], "rows")
 
     def board(self) -> Board:
         """Return the board; it must have no faults."""
@@ -522,7 +516,7 @@ class AprilGrid(_OnSheet):
                 "dictionary", self.dictionary,
                 "another one: its markers have modules where an AprilGrid has squares",
             )]
-        return self._id_faults("tagRows", "from the bottom left")
+        return self._id_faults(self.counts[0], "tagRows", "from the bottom left")
 
     def board(self) -> Board:
         """Return the board; it must have no faults."""

@@ -296,11 +296,6 @@ def overhang(dictionary: str) -> int:
     return FAMILIES[dictionary].overhang if dictionary in FAMILIES else 0
 
 
-def has_circles(dictionary: str) -> bool:
-    """Return whether a dictionary's markers are more than square modules."""
-    return dictionary in STAG_LIBRARIES
-
-
 @lru_cache(maxsize=4096)
 def modules(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
     """Return a marker's modules (n + 2 overhang,) squared, True for white, top row first.

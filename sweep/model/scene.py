@@ -180,8 +180,6 @@ class SceneEffects:
 
     def active_in(self, row: int) -> list[Effect]:
         """Return the effects that are active in one scene."""
-        if not self.active[row]:
-            return []
         return [
             each for each in self.present if each.is_active(self.values[each.switch][row])
         ]

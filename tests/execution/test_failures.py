@@ -1,11 +1,14 @@
 """What a run says of failures, what it tries again, and faults of machines, never data."""
 
-import contextlib
+import errno
+import itertools
+import os
 import shutil
 
 import numpy as np
 import pytest
 import xarray as xr
+import zarr.storage._local as local
 from distributed import Client
 
 import sweep
@@ -15,7 +18,7 @@ from support.commands import pieces
 from support.poison import Poison, poisoned
 from support.stores import by_hand, same
 from sweep.cli import main
-from sweep.errors import MachineFaultError, RunError
+from sweep.errors import MachineFaultError, RunError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.on_cluster import OnCluster
 from sweep.execution.runner import compute, execute
@@ -35,7 +38,6 @@ from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import FailedCell, begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.locations import exists
 from sweep.store.lock import writing
 
 TRACEBACK = """Traceback (most recent call last):
@@ -173,7 +175,7 @@ def copied(failed, tmp_path):
 
 
 @pytest.mark.system
-def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
+def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied, capsys):
     before = status(copied)
     assert [len(before.failed), len(before.crashed)] == [1, 1]
     assert execute(pipeline, copied).computed_blocks == 0
@@ -185,22 +187,17 @@ def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
     with xr.open_zarr(copied, group="failures") as table:
         assert table.sizes["failure"] == 0
         assert (table.attrs["failed_cells"], table.attrs["crashed_cells"]) == (0, 0)
-    again = execute(pipeline, copied, retry_failed=True)
-    assert (again.retried, again.computed_blocks) == (0, 0)
-
-
-@pytest.mark.system
-def test_command_says_that_there_is_nothing_to_try_again(clean, capsys):
-    assert main(["run", clean, "--retry-failed"]) == 0
+    assert main(["run", copied, "--retry-failed"]) == 0
     assert "no cell failed or crashed; nothing is tried again" in capsys.readouterr().out
+    assert same(copied, clean)
 
 
 @pytest.mark.evidence
 def test_retry_that_is_killed_at_any_write_is_continued(pipeline, clean, failed, tmp_path):
     shutil.copytree(failed, tmp_path / "complete.zarr")
     (tmp_path / "retried.toml").write_text(RETRIED)
-    with pieces("dropping", tmp_path, tmp_path / "retried.toml") as (_, count):
-        assert count >= 4  # a mark, two blocks, and the end
+    count = pieces("dropping", tmp_path, tmp_path / "retried.toml")
+    assert count >= 4  # a mark, two blocks, and the end
     for number in range(count + 1):
         url = str(tmp_path / f"{number}.zarr")
         store = open_store(url)
@@ -232,21 +229,12 @@ def undisturbed(tmp_path_factory):
     return url
 
 
-@contextlib.contextmanager
-def workers():
-    with local_cluster(2) as cluster, Client(cluster, set_as_default=False) as client:
-        yield client
-
-
 def run_on(client, url):
-    """Run the pipeline in blocks of one scene, or continue; return how many scenes failed."""
-    store = open_store(str(url), "r+") if exists(str(url)) else create_store(
-        str(url), FAULTY, (1,)
-    )
-    done = committed(store)
-    left = (number for number in range(len(store.blocks)) if number not in done)
+    """Run the pipeline in blocks of one scene; return how many scenes failed."""
+    store = create_store(str(url), FAULTY, (1,))
+    waiting = AnyOrder(range(len(store.blocks)))
     with writing(store.url, store.storage), Interrupts() as interrupts:
-        compute(store, AnyOrder(left, done), OnCluster(client), (), 600.0, interrupts)
+        compute(store, waiting, OnCluster(client), (), 600.0, interrupts)
         close(store)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
@@ -267,12 +255,28 @@ def test_block_that_a_machine_failed_is_not_committed(fault, place, tmp_path):
     assert committed(store) == set()
 
 
+@pytest.mark.parametrize("room", [0, 3, 9])
+def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(room, tmp_path, monkeypatch):
+    """A disk with room for so many files."""
+    left, put = itertools.count(room, -1), local._put
+
+    def put_while_there_is_room(*arguments, **options):
+        if next(left) <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return put(*arguments, **options)
+
+    monkeypatch.setattr(local, "_put", put_while_there_is_room)
+    with pytest.raises(StoreError, match="cannot be written: No space left on device"):
+        create_store(str(tmp_path / "full.zarr"), FAULTY, (12,))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.system
 def test_blocks_of_a_worker_whose_machine_is_at_fault_are_computed_by_others(
     tmp_path, undisturbed, capfd
 ):
     url = tmp_path / "one.zarr"
-    with workers() as client:
+    with local_cluster(2) as cluster, Client(cluster, set_as_default=False) as client:
         faulty, _ = client.nthreads()
         client.run(machine_faults.inject, "disk", "render_all", 0, workers=[faulty])
         assert run_on(client, url) == 0

@@ -1,6 +1,5 @@
 """Who may write, change, close and delete a store, and files that are whole or not there."""
 
-import stat
 import subprocess
 import time
 import uuid
@@ -17,7 +16,7 @@ from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
-from sweep.store.files import files_in, whole_file, write_files, write_whole
+from sweep.store.files import files_in, write_files, write_whole
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.lock import changing, is_written, writing
 
@@ -116,18 +115,6 @@ def test_where_folders_cannot_be_locked_nobody_is_excluded(store, monkeypatch):
     with changing(store.url, store.storage), writing(store.url, store.storage):
         assert not is_written(store.storage)
     assert any(Path(store.url).iterdir())
-
-
-def test_a_file_is_replaced_whole_or_not_at_all_and_keeps_its_permissions(tmp_path):
-    path = tmp_path / "result"
-    write_whole(path, b"first")
-    path.chmod(0o640)
-    with pytest.raises(TypeError), whole_file(path) as file:
-        file.writelines([b"half", None])
-    assert path.read_bytes() == b"first"
-    write_whole(path, b"second")
-    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"second", 0o640)
-    assert [each.name for each in tmp_path.iterdir()] == ["result"]
 
 
 def test_nothing_is_written_through_links_that_wait(tmp_path, monkeypatch):

@@ -136,27 +136,6 @@ def test_opened_store_shows_the_blocks_that_were_committed_when_it_was_opened(pi
         assert (results.estimate == 1).all()
 
 
-def swap(url, name):
-    """Swap what two blocks have of an array."""
-    one, other = (path for path in sorted((url / name / "c").iterdir()))
-    kept = one.with_name("kept")
-    one.rename(kept)
-    other.rename(one)
-    kept.rename(other)
-
-
-def test_blocks_that_were_swapped_with_their_receipts_are_found(pipeline, tmp_path):
-    url = tmp_path / "read.zarr"
-    close(by_hand(str(url), pipeline, (2,)))
-    assert [r.block for _, r in receipts(open_store(str(url)), [0, 1])] == [0, 1]
-    for name in ("commits/receipt", *(variable.name for variable in SCHEMA)):
-        swap(url, name)
-    found = verify(str(url), 0)
-    assert {damage.block for damage in found.damage} == {0, 1}
-    with pytest.raises(StoreError, match=r"receipt of block 0 is damaged.*verify --repair"):
-        status(str(url))
-
-
 def copy_of(url, to, draw):
     """Copy a store as one that was written meanwhile: receipts without some of their chunks."""
     shutil.copytree(url, to)

@@ -15,19 +15,6 @@ from sweep.measure.flags import (
     Flipped,
     present_values,
 )
-from sweep.store.blocks import region
-
-
-def contradictions(store):
-    """Return the contradictions within the blocks of a store."""
-    found = (
-        contradiction(store.pipeline, store.variables, {
-            variable.name: np.asarray(
-                store.array(variable.name)[region(variable, store.pipeline, block)])
-            for variable in store.variables})
-        for block in store.blocks
-    )
-    return [each for each in found if each]
 
 
 def contradiction(pipeline, variables, values):

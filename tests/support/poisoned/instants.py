@@ -1,12 +1,10 @@
-"""Run a piece of work again and again, each time in a fork that ends or stops at a later instant.
+"""Run a piece of work again and again, each time in a fork that is killed at a later instant.
 
 An instant is the beginning of a write to the store (a temporary file), of a renaming or of a
-removal. Arguments: the work, the store or the folder of stores, a pipeline's file, the name of a
-signal, a step. Piece k meets the signal at instant k times the step; the first that meets none is
-the last.
+removal. Arguments: the work, the store or the folder of stores, a pipeline's file, a step. Piece k
+is killed at instant k times the step; the first that ends before is the last.
 
-Prints how many met the signal. After SIGSTOP, it then waits for a line, has all go on, and prints
-whether all ended well.
+Prints how many were killed.
 """
 
 import itertools
@@ -52,26 +50,26 @@ def creating(folder, file, number):
     create_store(f"{folder}/{number}.zarr", Pipeline.from_toml(file), (1, 1, 10))
 
 
-def watched(function, left, number):
-    """Return a function before whose calls this process counts down, and meets a signal at 0."""
+def watched(function, left):
+    """Return a function before whose calls this process counts down, and is killed at 0."""
     def watch(*arguments, **options):
         if next(left) == 0:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGKILL)
         return function(*arguments, **options)
 
     return watch
 
 
-def fork(work, number, at, met):
+def fork(work, number, at):
     """Run a piece in a process; return it."""
     if pid := os.fork():
         return pid
     code = 1
     try:
         left = itertools.count(at, -1)
-        local._put = watched(local._put, left, met)
+        local._put = watched(local._put, left)
         for name in ("replace", "rename", "unlink"):
-            setattr(Path, name, watched(getattr(Path, name), left, met))
+            setattr(Path, name, watched(getattr(Path, name), left))
         work(number)
         code = 0
     except Exception as error:
@@ -81,7 +79,7 @@ def fork(work, number, at, met):
 
 
 def main():
-    name, url, file, met, step = sys.argv[1:]
+    name, url, file, step = sys.argv[1:]
     signal.alarm(PATIENCE_S)
     work = {"block": block, "closing": closing, "creating": creating, "dropping": dropping}[name]
     # What a process does once is done here: compiled code is loaded, libraries are digested.
@@ -90,21 +88,13 @@ def main():
     assert pipeline.facts.notes is not None
     xr.Dataset({"any": ("one", np.zeros(1, dtype="U1"))})
     run_cells(pipeline.experiment, pipeline.experiment.all_scenes.indices(np.arange(1)))
-    stopped = []
     for number in itertools.count():
-        pid = fork(lambda number: work(url, file, number), number, number * int(step),
-                   signal.Signals[met])
-        _, status = os.waitpid(pid, os.WUNTRACED)
+        pid = fork(lambda number: work(url, file, number), number, number * int(step))
+        _, status = os.waitpid(pid, 0)
         if os.WIFEXITED(status):
             assert os.WEXITSTATUS(status) == 0
             break
-        stopped += [pid] if os.WIFSTOPPED(status) else []
     print(number, flush=True)
-    if stopped:
-        sys.stdin.readline()
-        for pid in stopped:
-            os.kill(pid, signal.SIGCONT)
-        print(all(os.WEXITSTATUS(os.waitpid(pid, 0)[1]) == 0 for pid in stopped), flush=True)
 
 
 if __name__ == "__main__":

@@ -373,9 +373,7 @@ def _read_key(reading: Reading, section: str, key: str, value: Any) -> None:
             reading.fixed[key] = parameter.check(value)
 
 
-def _read_axis(
-    reading: Reading, key: str, members: Mapping[str, Any], *, together: bool
-) -> None:
+def _read_axis(reading: Reading, key: str, members: Mapping[str, Any], *, together: bool) -> None:
     """Add the axis of a parameter, or of several that go together, or note why there is none."""
     path = f"axes.{key}" if together else "axes"
     if together and not key.isidentifier():
@@ -412,7 +410,6 @@ def _read_axis(
     if len(columns) < max(len(members), 1 + together):
         return
     try:
-        reading.axes.append(
-            grid.axis_along(key, columns, reading.parameters, together=together))
+        reading.axes.append(grid.axis_along(key, columns, reading.parameters, together=together))
     except ValueError as error:
         reading.note(path, f"expected {error}")

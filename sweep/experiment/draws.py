@@ -89,9 +89,7 @@ def scrambled(digits: NDArray[np.uint64], keys: NDArray[np.uint64]) -> Floats:
     return np.asarray((result + 0.5) * 2.0**-53)
 
 
-def sobol_uniform(
-    dimension: int, keys: NDArray[np.uint64], trials: Integers
-) -> Floats:
+def sobol_uniform(dimension: int, keys: NDArray[np.uint64], trials: Integers) -> Floats:
     """Return uniform numbers in (0, 1) of scenes, (N,), evenly spread over the trials.
 
     Parameters

@@ -55,11 +55,6 @@ ANY_MARKER = {
 """Values of what differs from marker to marker in a photograph, as if it did not."""
 
 
-def _absolute(folder: str, background: Any) -> Any:
-    """Return an image's absolute path; a grey level as it is."""
-    return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
-
-
 def _names(declaring: type) -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(declaring))
 
@@ -130,11 +125,9 @@ class Experiment:
     @cached_property
     def estimators(self) -> list[EstimatorSetting]:
         """The estimators, in the order of the estimation axes."""
-        return [
-            _made(PluggedEstimatorSetting, values | {"own": own}) if own
-            else _made(EstimatorSetting, values)
-            for values, own in self._settings("estimator")
-        ]
+        return [_made(PluggedEstimatorSetting, values | {"own": own}) if own
+                else _made(EstimatorSetting, values)
+                for values, own in self._settings("estimator")]
 
     def _settings(self, section: str) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
         """Yield the values of a section at all combinations of its axes, in their order.
@@ -230,7 +223,8 @@ class Experiment:
             values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
         drawn = grid.distributions
         if "background" not in drawn:
-            values["background"] = values["background"].map(partial(_absolute, grid.folder))
+            values["background"] = values["background"].map(lambda value: (
+                str((Path(grid.folder) / value).resolve()) if isinstance(value, str) else value))
         jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
         values |= dict.fromkeys(draws.SHIFTS, Column.of(0.0))
         noisy = any(effect.switch in drawn or values[effect.switch].differs_from(effect.off)

@@ -175,7 +175,6 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     ValueError
         The expectation, if the table is not a distribution of the parameter.
     """
-    ends: Any
     kind, ends = next(iter(table.items()), ("", []))
     if len(table) != 1 or kind not in DISTRIBUTION_FORMS:
         if kind in (*AXIS_FORMS, "values"):

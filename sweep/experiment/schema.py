@@ -274,14 +274,12 @@ class Variable:
         A store's boards have as many markers as the largest of its grid: what is cut or filled
         lies beyond the boards of the cells that two grids share.
         """
-        lengths = self.inner_shape
-        cut: list[Any] = [..., *map(slice, lengths)]
-        kept: NDArray[Any] = values[tuple(cut)]
-        outer = kept.ndim - len(lengths)
-        widths = [(0, 0)] * outer + [
-            (0, length - own) for length, own in zip(lengths, kept.shape[outer:], strict=True)]
-        beyond = DetectionStatus.not_on_board if self.flags is DetectionStatus else math.nan
-        return np.pad(kept, widths, constant_values=beyond) if np.any(widths) else kept
+        lengths, outer = self.inner_shape, values.ndim - len(self.inner_shape)
+        beyond = DetectionStatus.not_on_board if self.flags is DetectionStatus else self.fill
+        result = np.full((*values.shape[:outer], *lengths), beyond, dtype=values.dtype)
+        shared: Any = (..., *map(slice, np.minimum(lengths, values.shape[outer:])))
+        result[shared] = values[shared]
+        return result
 
     def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return its axes in the pipeline's order: those of its stage and of the stages before."""

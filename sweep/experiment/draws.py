@@ -49,12 +49,9 @@ def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
     from scipy.stats import qmc  # noqa: PLC0415  (slow to import, for few pipelines)
 
     engine = qmc.Sobol(dimension + 1, scramble=False, bits=BITS)
-    corners = []
-    for k in range(count):
-        engine.reset().fast_forward(1 << k)
-        corners.append(engine.random()[0, dimension] * 2.0**BITS)
+    corners = [engine.reset().fast_forward(1 << k).random()[0, dimension] for k in range(count)]
     # Point 2^k is the sum of the directions k and k - 1, which its Gray code has.
-    return np.bitwise_xor.accumulate(np.array(corners).astype(np.uint64))
+    return np.bitwise_xor.accumulate((np.array(corners) * 2.0**BITS).astype(np.uint64))
 
 
 def points(dimension: int, index: Integers) -> NDArray[np.uint64]:

@@ -131,9 +131,7 @@ def is_zip(value: Any) -> bool:
 # --------------------------------------------------------------------------------------------------
 # The plug-ins that a document names, and their settings as parameters beside our own.
 
-NAMED_BY: dict[str, Parameter] = {
-    each.plugin: each for each in PARAMETERS.values() if each.plugin
-}
+NAMED_BY = {each.plugin: each for each in PARAMETERS.values() if each.plugin}
 """Kind of plug-in -> the parameter whose values name it."""
 
 EFFECTS_KEY = "effects"

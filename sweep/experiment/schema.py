@@ -408,9 +408,7 @@ BOARD_SCHEMA: tuple[Variable, ...] = (
 
 NOT_OF_BOARDS = frozenset({"corner_error_px"})
 
-VARIABLES: dict[str, Variable] = {
-    variable.name: variable for variable in (*SCHEMA, *BOARD_SCHEMA)
-}
+VARIABLES = {each.name: each for each in (*SCHEMA, *BOARD_SCHEMA)}
 """Every variable by its name, those of boards included."""
 
 

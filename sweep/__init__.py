@@ -81,13 +81,13 @@ class RunOptions(LocalOptions, total=False):
     yes: bool
 
 
+#: Modules of public names that have all that they need.
 _IMPORTED_ON_USE = {
     "sweep.experiment.pipeline": ("Pipeline",), "sweep.execution.progress": ("Progress",),
     "sweep.analysis.dataset": ("decode_flags",), "sweep.diagnosis.detection": ("error_model",),
     "sweep.diagnosis.diagnosis": ("diagnose",), "sweep.report.reference": ("reference",),
     "sweep.report.questions": ("measure_tradeoff", "require", "write_report"),
 }
-"""Modules of public names that have all that they need."""
 
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone

@@ -161,11 +161,11 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+#: Ending of a field's name -> its unit, unless it declares another one; the first that fits.
 UNITS = {
     "_m_s": "m/s", "_deg_s": "degree/s", "_per_m": "1/m", "_px": "px", "_mm": "mm", "_um": "um",
     "_deg": "degree", "_s": "s", "_m": "m", "_e": "e-", "_modules": "module",
 }
-"""Ending of a field's name -> its unit, unless it declares another one; the first that fits."""
 
 
 def parameter(

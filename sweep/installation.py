@@ -9,17 +9,17 @@ from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from sweep.errors import StoreError
 from sweep.messages import notice
 
+#: The distribution of OpenCV that this project requires.
 OPENCV = "opencv-contrib-python-headless"
-"""The distribution of OpenCV that this project requires."""
 
+#: Other distributions that install the package ``cv2``, into the same files.
 OTHER_OPENCV = ("opencv-contrib-python", "opencv-python", "opencv-python-headless")
-"""Other distributions that install the package ``cv2``, into the same files."""
 
+#: A distribution of another project, whose package has the same name as this one's.
 NAMESAKE = "sweep"
-"""A distribution of another project, whose package has the same name as this one's."""
 
+#: The entry point of this project's distributions, under whichever name.
 COMMAND = "sweep.cli:main"
-"""The entry point of this project's distributions, under whichever name."""
 
 REMEDY = f"`pip install --force-reinstall {OPENCV}`"
 

@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from sweep.store import lifecycle, locations, lock
     from sweep.tradeoff import choice_search
 
+#: Folders of modules: of two modules of one name it is the one in the first of them.
 ROOMS = (
     "report", "sampling", "analysis", "conformance", "diagnosis", "evaluation", "exchange",
     "execution", "experiment", "fitting", "integrity", "photographs", "plugins", "store",
     "tradeoff",
 )
-"""Folders of modules: of two modules of one name it is the one in the first of them."""
 
 
 if not TYPE_CHECKING:  # so that mypy knows the names above alone

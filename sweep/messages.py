@@ -22,8 +22,8 @@ from typing import Any
 
 from sweep.errors import PipelineError
 
+#: Faults that are listed; the others are counted.
 MAX_FAULTS = 20
-"""Faults that are listed; the others are counted."""
 
 MAX_QUOTE_LENGTH = 120
 MAX_LINE_LENGTH = 1000
@@ -98,11 +98,11 @@ def label(value: Any) -> str:
     return value if isinstance(value, str) else repr(value)
 
 
+#: Names of a folder among which a similar one is searched.
 MAX_FILES = 10_000
-"""Names of a folder among which a similar one is searched."""
 
+#: Longer words are not compared with known ones.
 MAX_WORD_LENGTH = 60
-"""Longer words are not compared with known ones."""
 
 
 def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
@@ -133,8 +133,8 @@ def nearest(word: str, known: Collection[str]) -> str:
     return f"; did you mean {close}?" if close else ""
 
 
+#: Names of which a word may be a part that are listed.
 MAX_SIMILAR = 6
-"""Names of which a word may be a part that are listed."""
 
 
 def similar_names(word: str, known: Sequence[str]) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 
+#: OpenCV's number of a feature that its line leaves out.
 _FMA3 = 12
-"""OpenCV's number of a feature that its line leaves out."""
 
 
 @cache

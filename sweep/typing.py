@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+#: Numbers: coordinates, lengths, angles, errors.
 Floats = NDArray[np.float64]
-"""Numbers: coordinates, lengths, angles, errors."""
 
+#: Pixels of boxes and windows, IDs, counts.
 Integers = NDArray[np.int64]
-"""Pixels of boxes and windows, IDs, counts."""
 
+#: Which elements are meant.
 Masks = NDArray[np.bool_]
-"""Which elements are meant."""
 
+#: (h, w) grey levels of an image.
 Grey = NDArray[np.uint8]
-"""(h, w) grey levels of an image."""

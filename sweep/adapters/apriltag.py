@@ -15,24 +15,24 @@ from sweep.plugins import DetectorPlugin, Markers, parameter
 # --------------------------------------------------------------------------------------------------
 # Common to the wrappers of AprilTag's C library: families, settings, the order of corners.
 
+#: AprilTag's corners run counter-clockwise from the bottom left of its own bitmap, which OpenCV's
+#: dictionaries have turned by 180°.
 CORNER_ORDER = (1, 0, 3, 2)
-"""AprilTag's corners run counter-clockwise from the bottom left of its own bitmap, which OpenCV's
-dictionaries have turned by 180°."""
 
+#: AprilTag's coordinates have the image's top left corner at the origin.
 PIXEL_CENTER = 0.5
-"""AprilTag's coordinates have the image's top left corner at the origin."""
 
+#: Dictionaries of OpenCV by AprilTag's names. (DICT_APRILTAG_36h10 no wrapper offers.)
 OPENCV_FAMILIES = {
     "DICT_APRILTAG_16h5": "tag16h5",
     "DICT_APRILTAG_25h9": "tag25h9",
     "DICT_APRILTAG_36h11": "tag36h11",
 }
-"""Dictionaries of OpenCV by AprilTag's names. (DICT_APRILTAG_36h10 no wrapper offers.)"""
 
+#: Families that OpenCV lacks; they are drawn as AprilTag draws them.
 OWN_FAMILIES = (
     "tagCircle21h7", "tagCircle49h12", "tagCustom48h12", "tagStandard41h12", "tagStandard52h13",
 )
-"""Families that OpenCV lacks; they are drawn as AprilTag draws them."""
 
 FAMILIES = {**OPENCV_FAMILIES, **{name: name for name in OWN_FAMILIES}}
 

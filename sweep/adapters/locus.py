@@ -64,11 +64,11 @@ DETECTOR = DetectorPlugin(
 
 Floats = NDArray[np.float64]
 
+#: From our board's frame (y up, z out) to Locus', which has the same origin (y down, z in).
 _Z_IN = np.diag([1.0, -1.0, -1.0])
-"""From our board's frame (y up, z out) to Locus', which has the same origin (y down, z in)."""
 
+#: How far a corner may be from where Locus has it, in sides: rounding.
 SAME = 1e-6
-"""How far a corner may be from where Locus has it, in sides: rounding."""
 
 
 @dataclass(frozen=True)

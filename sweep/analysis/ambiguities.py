@@ -38,9 +38,9 @@ from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.typing import Floats, Masks
 
+#: Thresholds that are tried by default; the infinite one keeps all poses.
 THRESHOLDS = (
     0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, np.inf)
-"""Thresholds that are tried by default; the infinite one keeps all poses."""
 
 MAX_THRESHOLDS = 200
 
@@ -234,6 +234,7 @@ def _rates(threshold: float) -> list[Rate[AmbiguousPoses]]:
     ]
 
 
+#: Variables at the chosen threshold: name there -> description.
 CHOSEN = {
     "threshold": ("threshold", "largest threshold that is shown to keep the wanted flip rate"),
     "kept_rate": ("kept_rate", "kept of the solved poses, at the chosen threshold"),
@@ -242,7 +243,6 @@ CHOSEN = {
     "right_rejected_rate": (
         "right_rejected_rate", "rejected of the poses not flipped, at the chosen threshold"),
 }
-"""Variables at the chosen threshold: name there -> description."""
 
 
 def _with_choice(

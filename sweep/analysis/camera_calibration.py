@@ -21,13 +21,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import CalibrationStatus
-from sweep.measure.intrinsics import (
-    FREE_COEFFICIENTS,
-    INTRINSICS,
-    MIN_VIEWS,
-    Intrinsics,
-    calibrate,
-)
+from sweep.measure.intrinsics import FREE_COEFFICIENTS, INTRINSICS, MIN_VIEWS, Intrinsics, calibrate
 from sweep.measure.solver import GuardedPoints
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -35,14 +29,14 @@ from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.scene import build_cameras
 from sweep.typing import Floats
 
+#: Where in the frame the target is whose position is estimated with the calibrated camera.
 DIRECTIONS = ("centre", "corner")
-"""Where in the frame the target is whose position is estimated with the calibrated camera."""
 
+#: The points of a calibration -> the variable that has their errors.
 POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_error_px"}
-"""The points of a calibration -> the variable that has their errors."""
 
+#: Share of the way from the principal point to the frame's corner.
 _AT_CORNER = 0.8
-"""Share of the way from the principal point to the frame's corner."""
 
 
 @describes

@@ -66,11 +66,11 @@ from sweep.typing import Floats, Integers, Masks
 # --------------------------------------------------------------------------------------------------
 # The same poses with two configurations, of a store or of two stores, as statistics read them.
 
+#: Variables that are the same for both poses of a pair.
 TRUTH = ("true_tvec_m", "true_rvec")
-"""Variables that are the same for both poses of a pair."""
 
+#: Name of the mask of the pairs whose truth differs.
 DIFFERING = "differing"
-"""Name of the mask of the pairs whose truth differs."""
 
 
 class Pair:
@@ -339,8 +339,8 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
 CORNERS = "corner_error_px"
 OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
 
+#: Groups, cells, draws and settings: what stands before the dimensions of a pose's corners.
 _POSE_DIMENSIONS = 4
-"""Groups, cells, draws and settings: what stands before the dimensions of a pose's corners."""
 
 
 def corners_of(results: xr.Dataset) -> str:
@@ -451,12 +451,11 @@ def _corner_shift(pair: Pair, corners: str) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # Whether a new store's results are significantly worse than an older one's, pose by pose.
 
+#: Part of the older store's mean absolute error by which errors may grow: less is no regression.
+#:
+#: Another version of a library changes last digits of all poses in one direction: that is
+#: significant, and of no account.
 MARGIN = 0.01
-"""Part of the older store's mean absolute error by which errors may grow: less is no regression.
-
-Another version of a library changes last digits of all poses in one direction: that is
-significant, and of no account.
-"""
 
 
 @dataclass(frozen=True)
@@ -567,14 +566,14 @@ def _worst(
 # --------------------------------------------------------------------------------------------------
 # Differences between two stores of one pipeline, such as two versions of OpenCV made.
 
+#: Variables of corners: of a single marker, or of a board's markers and of its chessboard.
 CORNER_VARIABLES = ("corner_error_px", "marker_corner_error_px", "chessboard_corner_error_px")
-"""Variables of corners: of a single marker, or of a board's markers and of its chessboard."""
 
+#: Coordinates of the dimension ``statistic``.
 STATISTICS = ("median", "p99", "worst")
-"""Coordinates of the dimension ``statistic``."""
 
+#: Relative difference of true poses up to which they are one: other processors round otherwise.
 TRUTH_RTOL = 1e-9
-"""Relative difference of true poses up to which they are one: other processors round otherwise."""
 
 
 @describes

@@ -28,8 +28,8 @@ from sweep.plugins.declared import recorded_plugins
 # --------------------------------------------------------------------------------------------------
 # The kinds of a dataset's dimensions, and which of them the caller keeps.
 
+#: The dimension of random draws.
 DRAWS = "trial"
-"""The dimension of random draws."""
 
 Labelled = TypeVar("Labelled", xr.Dataset, xr.DataArray)
 
@@ -290,8 +290,8 @@ def replicate_order(results: xr.Dataset, draws: Sequence[str]) -> NDArray[np.int
 # pooled cells have: each counts as it does in a store of equally many trials. Cells in which no
 # pose was looked for have nothing to count, and do not lessen these trials.
 
+#: Flags of the trials that a cell does not have.
 NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
-"""Flags of the trials that a cell does not have."""
 
 
 def common_trials(
@@ -339,11 +339,11 @@ def computed_scenes(results: xr.Dataset) -> xr.DataArray:
 # --------------------------------------------------------------------------------------------------
 # The side of the black square in pixels, over the axes that change it.
 
+#: The usual axes along which the size in the image changes.
 SIZE_AXES = ("side_px", "distance_m")
-"""The usual axes along which the size in the image changes."""
 
+#: Parameters that determine the side: itself, or distance, size and camera.
 SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
-"""Parameters that determine the side: itself, or distance, size and camera."""
 
 
 def image_sides(results: xr.Dataset) -> xr.DataArray:
@@ -410,8 +410,8 @@ def _checked(sides: xr.DataArray) -> xr.DataArray:
 
 P = ParamSpec("P")
 
+#: The attribute of tables of datasets whose sampling was stopped.
 SAMPLING = "sampling"
-"""The attribute of tables of datasets whose sampling was stopped."""
 
 
 def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
@@ -446,11 +446,11 @@ def sampling_text(results: xr.Dataset) -> str:
 # --------------------------------------------------------------------------------------------------
 # Flags in words: the labels that a dataset's attributes give to the values of its flags.
 
+#: Label of a value that the attributes do not name.
 UNKNOWN = "unknown"
-"""Label of a value that the attributes do not name."""
 
+#: Where a table of labels has :data:`UNKNOWN`: flags are stored as uint8, and none has so many.
 UNNAMED = 255
-"""Where a table of labels has :data:`UNKNOWN`: flags are stored as uint8, and none has so many."""
 
 def decode_flags(results: Labelled) -> Labelled:
     """Return results with every flag in words: ``"detected"`` in place of 1.

@@ -558,8 +558,8 @@ def least_draws(requirement: Requirement, share: float) -> int:
 
 Decisions = NDArray[np.uint8]
 
+#: Probability with which an answer meets the requirements.
 CONFIDENCE = 0.95
-"""Probability with which an answer meets the requirements."""
 
 
 def shares_of_choice(
@@ -868,17 +868,16 @@ def _answer(
 # relative to the value. The intervals are those that the analysis shows of a store whose sampling
 # was stopped (`sweep.analysis.estimator`).
 
+#: Draws below which no interval of a mean or a root mean square is narrow enough.
+#:
+#: Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.
 MIN_MEAN_DRAWS = 450
-"""Draws below which no interval of a mean or a root mean square is narrow enough.
 
-Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.
-"""
-
+#: Poses that count below which a rate is not worth waiting for.
 MIN_OF_RATE = 50
-"""Poses that count below which a rate is not worth waiting for."""
 
+#: Level of the interval that says that too few numbers will come.
 NEVER_LEVEL = 0.999
-"""Level of the interval that says that too few numbers will come."""
 
 
 class Reached(Flag):

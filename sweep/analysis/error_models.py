@@ -48,29 +48,29 @@ from sweep.typing import Floats, Integers, Masks
 # ln(side) and the viewing angle. With two knots of the distance the standard deviation is a power
 # of it: more knots are for curves that are no power law.
 
+#: Smallest mean square of an error: its unit is a radian or a share of the distance.
 FLOOR = 1e-18
-"""Smallest mean square of an error: its unit is a radian or a share of the distance."""
 
+#: Weight, relative to the mean knot's data, with which a knot follows its neighbours: those without
+#: data do so entirely, others by 0.1 % of the difference.
 RIDGE = 1e-3
-"""Weight, relative to the mean knot's data, with which a knot follows its neighbours: those without
-data do so entirely, others by 0.1 % of the difference."""
 
+#: Weight, relative to the same, that makes every system of equations regular.
 REGULAR = 1e-9
-"""Weight, relative to the same, that makes every system of equations regular."""
 
 ITERATIONS = 50
+#: Largest step of ln(variance) at which the iteration ends.
 CONVERGED = 1e-9
-"""Largest step of ln(variance) at which the iteration ends."""
 
+#: Log-likelihood that a knot must add: a bias that is off by 0.2 standard deviations in 100 poses,
+#: or a standard deviation that is off by 10 %.
 GAIN = 2.0
-"""Log-likelihood that a knot must add: a bias that is off by 0.2 standard deviations in 100 poses,
-or a standard deviation that is off by 10 %."""
 
+#: Numbers of knots of an axis that are tried.
 KNOTS = (2, 3, 4, 6, 8)
-"""Numbers of knots of an axis that are tried."""
 
+#: Sums of the powers 1 to 4 of the errors are kept.
 POWERS = 4
-"""Sums of the powers 1 to 4 of the errors are kept."""
 
 
 @dataclass(frozen=True)
@@ -321,31 +321,31 @@ def select_knots(
 # --------------------------------------------------------------------------------------------------
 # Conditions of error models: their bins in a dataset, and the joint region that was seen.
 
+#: Distinct values up to which each has a bin of its own.
 MAX_VALUES = 24
-"""Distinct values up to which each has a bin of its own."""
 
+#: Values that differ by less, relatively (angles: in degrees / 100), are the same.
 SAME = 1e-6
-"""Values that differ by less, relatively (angles: in degrees / 100), are the same."""
 
+#: Smallest viewing angles and bearings up to here: the model begins at 0.
 FRONTAL_DEG = 5.0
-"""Smallest viewing angles and bearings up to here: the model begins at 0."""
 
+#: Poses that a cell should have, on average, where cells can be made wider.
 POSES_A_CELL = 150
-"""Poses that a cell should have, on average, where cells can be made wider."""
 
+#: Cells along a drawn condition in which the seen region is told.
 MAX_REGION_CELLS = 12
-"""Cells along a drawn condition in which the seen region is told."""
 
+#: Poses that such a cell should have, on average, so that none is empty by chance.
 POSES_A_REGION_CELL = 15
-"""Poses that such a cell should have, on average, so that none is empty by chance."""
 
+#: Shares of two conditions' ranges by which their sum and difference may leave the seen ones; to it
+#: comes that of `CORNER`.
 SLACK = 0.05
-"""Shares of two conditions' ranges by which their sum and difference may leave the seen ones; to it
-comes that of `CORNER`."""
 
+#: Of n draws uniform in a square none lies in a corner of area 3 / n with a probability of 5 %: by
+#: the root of it sums and differences may leave the seen ones, too.
 CORNER = 3.0
-"""Of n draws uniform in a square none lies in a corner of area 3 / n with a probability of 5 %:
-by the root of it sums and differences may leave the seen ones, too."""
 
 
 @dataclass(frozen=True)
@@ -430,6 +430,7 @@ class Condition:
         return self.middles(groups)
 
 
+#: Models do not depend on the last, but hold where it was seen.
 CONDITIONS = {
     "distance_m": Condition("the distance along the optical axis", "m", True, 1.02, 16, 12),
     "side_px": Condition("the side of the black square, were it parallel to the image", "px",
@@ -439,10 +440,9 @@ CONDITIONS = {
     "bearing_deg": Condition("the angle between the line of sight and the optical axis", "degree",
                              False, 1.0),
 }
-"""Models do not depend on the last, but hold where it was seen."""
 
+#: Conditions on which models depend.
 PREDICTORS = ("distance_m", "side_px", "viewing_angle_deg")
-"""Conditions on which models depend."""
 
 
 @dataclass(frozen=True)
@@ -636,30 +636,30 @@ def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
 # --------------------------------------------------------------------------------------------------
 # Error models: bias and standard deviation of a pose over distance, side and viewing angle.
 
+#: Share of normal errors within two standard deviations.
 NOMINAL = 0.9545
-"""Share of normal errors within two standard deviations."""
 
+#: Shares of held-out errors within two standard deviations between which a model holds.
 COVERAGE = (0.93, 0.97)
-"""Shares of held-out errors within two standard deviations between which a model holds."""
 
+#: Held-out poses from which on a cell is judged.
 MIN_JUDGED = 100
-"""Held-out poses from which on a cell is judged."""
 
+#: Share of flipped poses up to which a cell's errors are described without them: were they counted
+#: as outside, 93 % of normal errors would still lie within two standard deviations.
 MAX_FLIPS = 0.02
-"""Share of flipped poses up to which a cell's errors are described without them: were they counted
-as outside, 93 % of normal errors would still lie within two standard deviations."""
 
+#: Share of solved poses down to which a cell's errors are described.
 MIN_DETECTION = 0.9
-"""Share of solved poses down to which a cell's errors are described."""
 
+#: Solved poses, not flipped, from which on a model is fitted.
 MIN_POSES = 200
-"""Solved poses, not flipped, from which on a model is fitted."""
 
+#: Distances at which every model is given, although it may need fewer knots.
 SHOWN_DISTANCES = 6
-"""Distances at which every model is given, although it may need fewer knots."""
 
+#: Models up to which they are made together.
 MAX_MODELS = 64
-"""Models up to which they are made together."""
 
 
 class Use(Flag):
@@ -843,8 +843,8 @@ def _check_drawn(results: xr.Dataset, kept: Sequence[str]) -> None:
             "more, and with something drawn, such as azimuth_deg = { uniform = [0, 360] }")
 
 
+#: Variables of one model: dimensions, values, attributes.
 Table = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
-"""Variables of one model: dimensions, values, attributes."""
 
 
 def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:
@@ -972,17 +972,17 @@ def _exponents(moments: Floats) -> Table:
 # --------------------------------------------------------------------------------------------------
 # Sums of a block's poses, in bins: moments of errors, and how many lie within two sigma.
 
+#: Errors in the sight frame: of the position (m), and the rotation vector (rad).
 QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
-"""Errors in the sight frame: of the position (m), and the rotation vector (rad)."""
 
+#: The even trials and the odd ones.
 HALVES = 2
-"""The even trials and the odd ones."""
 
+#: Names of a block's arrays: the half, fx times the marker's side.
 HALF, FOCAL_SIZE = "half", "focal_size"
-"""Names of a block's arrays: the half, fx times the marker's side."""
 
+#: Columns that are judged before the shares.
 COUNTS = ("looked_for", "solved", "flipped", "judged")
-"""Columns that are judged before the shares."""
 
 
 class SightErrors(Poses):

@@ -41,11 +41,11 @@ from sweep.experiment.schema import LABELS, cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.typing import Floats, Integers, Masks
 
+#: Arrays of poses, (groups, cells, draws, settings, ...), by name.
 Arrays = dict[str, NDArray[Any]]
-"""Arrays of poses, (groups, cells, draws, settings, ...), by name."""
 
+#: Values of variables (groups,), by name.
 Variables = dict[str, NDArray[Any]]
-"""Values of variables (groups,), by name."""
 
 
 class DrawnPoses(Protocol):
@@ -64,20 +64,20 @@ ResultT = TypeVar("ResultT")
 # --------------------------------------------------------------------------------------------------
 # Columns in memory; quantities of single poses are computed a block at a time.
 
+#: Poses in a block: a thread needs 25 MB for so many.
 MAX_BLOCK = 1 << 17
-"""Poses in a block: a thread needs 25 MB for so many."""
 
+#: Poses of which views are kept for all statistics: what they compute takes some 200 MB.
 MAX_SHARED = 1 << 20
-"""Poses of which views are kept for all statistics: what they compute takes some 200 MB."""
 
+#: Blocks that are computed side by side; with more, reading memory is what takes time.
 MAX_THREADS = 4
-"""Blocks that are computed side by side; with more, reading memory is what takes time."""
 
+#: Settings up to which they are summed one by one, for NumPy's loop along a short axis is slow.
 MAX_SLICES = 8
-"""Settings up to which they are summed one by one, for NumPy's loop along a short axis is slow."""
 
+#: Axes of cells, draws and settings.
 OVER_ALL = (1, 2, 3)
-"""Axes of cells, draws and settings."""
 
 
 class Columns(Generic[ViewT]):
@@ -207,18 +207,18 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
 # enumeration (`tests/sampling/test_stopped_rate.py`) those of rates then cover 95 % at least at any
 # rate; the others by simulation (`tests/sampling/test_stopped_coverage.py`).
 
+#: Tails of intervals of stores whose sampling was stopped, of those that they would have.
+#:
+#: The interval of 95 % is one of 97 %. The least coverage of a rate, over all rates, half-widths
+#: from 0.005 to 0.25, waves of 5 to 99 draws at first and any largest number of trials, is then
+#: 0.954.
 TAIL_SHARE = 0.6
-"""Tails of intervals of stores whose sampling was stopped, of those that they would have.
 
-The interval of 95 % is one of 97 %. The least coverage of a rate, over all rates, half-widths from
-0.005 to 0.25, waves of 5 to 99 draws at first and any largest number of trials, is then 0.954.
-"""
-
+#: Photographs with the rarer outcome from which the spread between photographs is estimated.
 MIN_SPREAD = 5
-"""Photographs with the rarer outcome from which the spread between photographs is estimated."""
 
+#: The most draws that a rate is said to be worth.
 MAX_DRAWS = 1e9
-"""The most draws that a rate is said to be worth."""
 
 
 def stopped_level(level: float) -> float:
@@ -427,8 +427,8 @@ def estimate_mean(
     return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
 
 
+#: Value, low and high, each (groups,).
 Interval = tuple[Floats, Floats, Floats]
-"""Value, low and high, each (groups,)."""
 
 
 def half_width(estimate: MeanEstimate, level: float) -> Floats:
@@ -451,16 +451,15 @@ def exponential(estimate: MeanEstimate, level: float) -> Interval:
                 np.where(mean == 0.0, high, mean * factor))
 
 
+#: Errors that no draw showed are taken to be at most so many times as large as the largest seen.
+#:
+#: The first is that of intervals: they then cover a root mean square with 0.94 to 0.98, also of
+#: Student's t with 4 degrees of freedom and of lognormal errors, with 0.84 to 0.90 without (`pytest
+#: -m evidence tests/analysis/test_coverage.py`). The second is that of decisions: on draws whose
+#: worst 1 % carries half of the squares, and on those errors, a root mean square at its limit is
+#: met in less than 5 % of the samples of 50, 100 and 400; without, in up to 49 % (`pytest -m
+#: evidence tests/analysis/test_requirements_at_the_limit.py`).
 UNSEEN_FACTOR, GUARDED_UNSEEN_FACTOR = 1.0, 2.0
-"""Errors that no draw showed are taken to be at most so many times as large as the largest seen.
-
-The first is that of intervals: they then cover a root mean square with 0.94 to 0.98, also of
-Student's t with 4 degrees of freedom and of lognormal errors, with 0.84 to 0.90 without (`pytest -m
-evidence tests/analysis/test_coverage.py`). The second is that of decisions: on draws whose worst
-1 % carries half of the squares, and on those errors, a root mean square at its limit is met in less
-than 5 % of the samples of 50, 100 and 400; without, in up to 49 % (`pytest -m evidence
-tests/analysis/test_requirements_at_the_limit.py`).
-"""
 
 
 def with_unseen_tail(
@@ -538,9 +537,9 @@ class Output(NamedTuple):
         return cf_attributes(self.meaning, self.units, self.flags)
 
 
+#: Endings of names, of a value and of its interval's ends, with what meanings begin with.
 INTERVAL = {"": "", "_low": "lower end of the 95 % interval: ",
             "_high": "upper end of the 95 % interval: "}
-"""Endings of names, of a value and of its interval's ends, with what meanings begin with."""
 
 
 def with_interval(name: str, meaning: str, units: str) -> list[Output]:
@@ -625,8 +624,8 @@ class Rate(Statistic[ViewT]):
     successes: Callable[[ViewT], Masks]
     used: Callable[[ViewT], Masks]
     level: float = LEVEL
+    #: Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted.
     counts: Sequence[tuple[str, str]] = ()
-    """Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted."""
     with_jeffreys: bool = False
     exact: bool = False
 
@@ -901,8 +900,8 @@ class StandardDeviation(RootMeanSquare[ViewT]):
 # sample alone says nothing of the mean square. What bounds it is how many flips the sample may
 # have missed, and that no rotation error is larger than half a turn.
 
+#: The share of flips among the solved.
 FLIPS: Rate[Poses] = Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
-"""The share of flips among the solved."""
 
 
 @dataclass(frozen=True)
@@ -923,13 +922,13 @@ class FlipMixture(Statistic[Poses]):
     meaning: str
     units: str
     squares: Callable[[Poses], Floats]
+    #: The largest error that exists, in the unit of the errors.
     bound: float
-    """The largest error that exists, in the unit of the errors."""
+    #: The share of flips, p.
     flips: Rate[Poses] = FLIPS
-    """The share of flips, p."""
     level: float = LEVEL
+    #: Of the ends of u and v, as `PositiveMean` has it.
     unseen_factor: float = UNSEEN_FACTOR
-    """Of the ends of u and v, as `PositiveMean` has it."""
 
     def used(self, poses: Poses) -> Masks:
         """Return the poses that count."""
@@ -980,11 +979,11 @@ class IntervalOf(Flag):
     too_few_draws = flag(3, "An end lies beyond the smallest or the largest draw.")
 
 
+#: Values of a column that are sorted at once: 1.6 GB.
 MAX_VALUES = 2 * 10**8
-"""Values of a column that are sorted at once: 1.6 GB."""
 
+#: Share of a pose by which a rank may be above a whole number.
 ROUNDING = 1e-9
-"""Share of a pose by which a rank may be above a whole number."""
 
 
 def values_at(ascending: NDArray[Any], ranks: Integers) -> Floats:
@@ -1061,8 +1060,8 @@ class Quantiles(Statistic[ViewT]):
     as errors are stored. Intervals: `quantile_intervals`.
     """
 
+    #: With {} in place of the statistic, such as ``rotation_{}_deg``.
     name: str
-    """With {} in place of the statistic, such as ``rotation_{}_deg``."""
     meaning: str
     units: str
     errors: Callable[[ViewT], Floats]
@@ -1147,11 +1146,11 @@ def draws_to_see(share: float, level: float = LEVEL) -> int:
 # --------------------------------------------------------------------------------------------------
 # Bins of a variable of the scene, as a dimension of a table.
 
+#: Edges of bins, by the name of the variable or coordinate that is binned.
 Bins = Mapping[str, Sequence[float]]
-"""Edges of bins, by the name of the variable or coordinate that is binned."""
 
+#: Prefix of the name of a binned array, among a block's arrays.
 PREFIX = "bin "
-"""Prefix of the name of a binned array, among a block's arrays."""
 
 
 @dataclass(frozen=True)

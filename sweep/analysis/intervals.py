@@ -16,14 +16,14 @@ from sweep.typing import Floats, Masks
 # Brown, Cai and DasGupta, "Interval Estimation for a Binomial Proportion", Statistical Science
 # 16(2), 2001, doi:10.1214/ss/1009213286, recommends both for small n.
 
+#: Probability with which every interval of a table holds its value.
 LEVEL = 0.95
-"""Probability with which every interval of a table holds its value."""
 
+#: Probability beyond each end.
 TAIL = (1.0 - LEVEL) / 2.0
-"""Probability beyond each end."""
 
+#: Standard deviations from the middle to the ends, of a normal variable: 1.96.
 DEVIATIONS = float(special.ndtri(1.0 - TAIL))
-"""Standard deviations from the middle to the ends, of a normal variable: 1.96."""
 
 
 def wilson(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats]:
@@ -114,13 +114,13 @@ def _with_exact_ends(
 
 REPLICATES = 1000
 
+#: Units from which there are intervals.
 MIN_UNITS = 5
-"""Units from which there are intervals."""
 
 SEED = 21
 
+#: Weights that are in memory at a time: 32 MB.
 MAX_AT_ONCE = 1 << 22
-"""Weights that are in memory at a time: 32 MB."""
 
 
 def unit_counts(units: int) -> NDArray[np.int64]:

@@ -23,14 +23,14 @@ from sweep.typing import Floats, Masks
 # --------------------------------------------------------------------------------------------------
 # The markers of boards as poses of their own: for rates and corners of each marker.
 
+#: The dimension of a board's markers where they are an axis.
 AXIS = "board_marker"
-"""The dimension of a board's markers where they are an axis."""
 
+#: Variable of boards -> its name where the markers are an axis.
 OF_MARKERS = {"marker_detection": "detection", "marker_corner_error_px": "corner_error_px"}
-"""Variable of boards -> its name where the markers are an axis."""
 
+#: Variables of the whole board that hold for each of its markers, too.
 OF_TARGETS = ("true_rvec", "true_tvec_m")
-"""Variables of the whole board that hold for each of its markers, too."""
 
 
 def per_marker(results: xr.Dataset) -> xr.Dataset:
@@ -271,21 +271,22 @@ def bearing_of(position_m: Floats) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # Poses of a block as statistics read them: which are counted, and their errors.
 
+#: Flags of detection of the poses that are in no denominator.
 NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))
-"""Flags of detection of the poses that are in no denominator."""
 
+#: Name of the mask of the poses that count at all, if not all do.
 INSIDE = "inside"
-"""Name of the mask of the poses that count at all, if not all do."""
 
+#: Name of the mask of the trials that all pooled cells have, where sampling was stopped.
 COMMON = "common"
-"""Name of the mask of the trials that all pooled cells have, where sampling was stopped."""
 
+#: Name of z of the true position, beside the names of the dataset's variables.
 DEPTH = "true_depth_m"
-"""Name of z of the true position, beside the names of the dataset's variables."""
 
+#: Names, likewise, of the bounds' parts.
 ROTATION_BOUND, DEPTH_BOUND = "rotation_bound", "depth_bound"
-"""Names, likewise, of the bounds' parts."""
 
+#: Arrays that are parts of a variable: its name, and which part.
 DERIVED: dict[str, tuple[str, Callable[[xr.DataArray], xr.DataArray]]] = {
     DEPTH: ("true_tvec_m", lambda array: array.isel(xyz=XYZ.index("z"), drop=True)),
     ROTATION_BOUND: ("bound_std", lambda array: array.sel(
@@ -293,7 +294,6 @@ DERIVED: dict[str, tuple[str, Callable[[xr.DataArray], xr.DataArray]]] = {
     DEPTH_BOUND: ("bound_std", lambda array: array.sel(
         pose_parameter="translation_z", drop=True)),
 }
-"""Arrays that are parts of a variable: its name, and which part."""
 
 
 def variables_read(names: Iterable[str]) -> list[str]:
@@ -308,15 +308,15 @@ def variables_read(names: Iterable[str]) -> list[str]:
 DETECTION_INPUTS = ("detection",)
 ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
 ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", DEPTH)
+#: Names of the arrays that a statistic of detections, of estimates, of errors reads, and one of
+#: errors along axes and about angles.
 SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec", "true_tvec_m")
-"""Names of the arrays that a statistic of detections, of estimates, of errors reads, and one of
-errors along axes and about angles."""
 
+#: Variables that a statistic of errors and their bounds reads.
 BOUND_INPUTS = (*ERROR_INPUTS, ROTATION_BOUND, DEPTH_BOUND)
-"""Variables that a statistic of errors and their bounds reads."""
 
+#: Variables that every dataset of results has.
 REQUIRED_VARIABLES = tuple(variables_read(ERROR_INPUTS))
-"""Variables that every dataset of results has."""
 
 
 def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
@@ -359,8 +359,8 @@ class Poses:
     def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
         self._arrays = arrays
         self._prefix = prefix
+        #: Squared absolute errors (..., 1) by the name of their `Quantity`, once computed.
         self.squares: dict[str, Floats] = {}
-        """Squared absolute errors (..., 1) by the name of their `Quantity`, once computed."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return an array, of flags 0 (not run) for the poses that do not count."""
@@ -523,6 +523,7 @@ class Quantity:
         return f"{self.name}_{statistic}_{self.unit}"
 
 
+#: Kinds of error in `sweep.analysis.error_statistics` unless others are asked for.
 QUANTITIES = (
     Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg,
              bound=180.0),
@@ -530,7 +531,6 @@ QUANTITIES = (
              lambda poses: poses.range_percent, signed=True),
     Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
 )
-"""Kinds of error in `sweep.analysis.error_statistics` unless others are asked for."""
 
 
 def _signed(source: str, unit: str, units: str, **words: str) -> tuple[Quantity, ...]:
@@ -549,6 +549,7 @@ def _signed(source: str, unit: str, units: str, **words: str) -> tuple[Quantity,
 
 _IN_METRES, _IN_DEGREES = ("m", "m"), ("deg", "degree")
 
+#: Errors with a sign, by groups: of these bias and standard deviation are computed.
 SIGNED: dict[str, tuple[Quantity, ...]] = {
     "camera_frame": _signed("in_camera_m", *_IN_METRES, **{
         axis: f"position error along {axis} of the camera" for axis in XYZ}),
@@ -568,7 +569,6 @@ SIGNED: dict[str, tuple[Quantity, ...]] = {
                  in_plane="rotation error about the true normal"),
     ),
 }
-"""Errors with a sign, by groups: of these bias and standard deviation are computed."""
 
 
 def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:

@@ -56,13 +56,7 @@ from sweep.analysis.poses import (
     pose_arrays,
     variables_read,
 )
-from sweep.analysis.summaries import (
-    NEES_MEAN,
-    RATIOS,
-    PoseStatistic,
-    quantiles_of,
-    registered,
-)
+from sweep.analysis.summaries import NEES_MEAN, RATIOS, PoseStatistic, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError, PipelineError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.sampling import RequirementText, read_requirement
@@ -77,18 +71,17 @@ from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
 # `covariance_trust`, and quantiles of the absolute errors along axes and about angles; they come
 # from the records there, so that a new statistic can be required, too.
 
+#: Level of the intervals of rates and quantiles, whose ends hold whatever the distribution.
 EXACT_LEVEL = 0.95
-"""Level of the intervals of rates and quantiles, whose ends hold whatever the distribution."""
 
+#: Level of the intervals of means, root mean squares and standard deviations.
+#:
+#: Their formulas are approximations: with 50 draws an end of 97.5 % is passed in 4.6 % (normal
+#: errors) to 8.3 % (Laplace) of the samples, one of 99.5 % in 1.4 to 3.4 %.
 MEAN_LEVEL = 0.99
-"""Level of the intervals of means, root mean squares and standard deviations.
 
-Their formulas are approximations: with 50 draws an end of 97.5 % is passed in 4.6 % (normal
-errors) to 8.3 % (Laplace) of the samples, one of 99.5 % in 1.4 to 3.4 %.
-"""
-
+#: Draws from which on means are decided; where draws are Sobol' points, any number.
 MIN_DRAWS = 50
-"""Draws from which on means are decided; where draws are Sobol' points, any number."""
 
 
 @dataclass(frozen=True)
@@ -230,15 +223,15 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
 # --------------------------------------------------------------------------------------------------
 # Faults of requirements: names, units, limits, contradictions, a line each.
 
+#: Units that names end with.
 UNITS = {"deg": "degrees", "rad": "radians", "m": "metres", "mm": "millimetres", "percent": "%",
          "px": "pixels", "cm": "centimetres"}
-"""Units that names end with."""
 
+#: Middle parts of the names of statistics of errors.
 STATISTICS = (*PERCENTS, "bias", "sd", "rmse")
-"""Middle parts of the names of statistics of errors."""
 
+#: Endings of names that may be left out.
 ENDINGS = ("_rate", "_mean")
-"""Endings of names that may be left out."""
 
 
 def named(name: str) -> Requirable:
@@ -349,8 +342,8 @@ def _ordered() -> frozenset[tuple[str, str]]:
     return frozenset(pairs)
 
 
+#: Names of which the first's value is never above the second's.
 ORDERED = _ordered()
-"""Names of which the first's value is never above the second's."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -369,8 +362,8 @@ ORDERED = _ordered()
 # interval's other end at the error probability over the number of conditions and requirements
 # (Bonferroni).
 
+#: Probability below which a decision is wrong: a false "met", or any false "not met".
 ERROR_PROBABILITY = 0.05
-"""Probability below which a decision is wrong: a false "met", or any false "not met"."""
 
 
 class Decision(Flag):
@@ -691,8 +684,8 @@ def _judged(
 # --------------------------------------------------------------------------------------------------
 # About how many draws decide a requirement, if the value stays what it is.
 
+#: More draws than this are none that anyone waits for.
 MAX_DRAWS = 1e9
-"""More draws than this are none that anyone waits for."""
 
 
 def draws_needed(
@@ -950,16 +943,16 @@ def described(values: Mapping[str, Any]) -> str:
 # --------------------------------------------------------------------------------------------------
 # The conditions at which requirements must hold, where none are named.
 
+#: Axes along which the marker is turned away.
 ANGLE_AXES = ("tilt_deg", "view_angle_deg")
-"""Axes along which the marker is turned away."""
 
+#: Axes along which the size in the image changes, too.
 SIZES_BESIDE = ("size_m", "hfov_deg", "focal_length_mm", "fx_px", "width_px")
-"""Axes along which the size in the image changes, too."""
 
 IDS = "marker_id"
 
+#: The parameter by which boards differ, on an axis of its own or with others.
 BOARDS = "kind"
-"""The parameter by which boards differ, on an axis of its own or with others."""
 
 
 def conditions(

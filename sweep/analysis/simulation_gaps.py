@@ -58,8 +58,8 @@ from sweep.typing import Floats, Integers, Masks
 # Arrays are (configurations, 1, units, rows, ...), by the names of `Poses`: a unit is drawn with
 # all its markers.
 
+#: Shares of the photographs' markers between which the default bins lie.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Shares of the photographs' markers between which the default bins lie."""
 
 SIDE = "side_px"
 
@@ -294,8 +294,8 @@ SOURCES = ("photographs", "simulated")
 
 PERCENTS = {"median": 50, "p90": 90}
 
+#: A photograph, or a scene of a simulation, is the draw.
 BY_PHOTOGRAPH = Design(Unit.photograph)
-"""A photograph, or a scene of a simulation, is the draw."""
 
 
 @dataclass(frozen=True)
@@ -316,6 +316,7 @@ class Compared:
 
 RATES = tuple(Compared(rate.name, rate.meaning, "1", rate) for rate in (DETECTION_RATE, FLIP_RATE))
 
+#: Compared statistics, in the order of the table.
 QUANTILES = (
     Compared("range_bias_percent", "median depth error of the true depth, solved", "percent",
              error=lambda poses: poses.range_percent[..., 0]),
@@ -324,7 +325,6 @@ QUANTILES = (
                error=quantity.norm, percent=percent, ratio=True)
       for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()),
 )
-"""Compared statistics, in the order of the table."""
 
 
 @describes

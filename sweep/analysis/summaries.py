@@ -196,8 +196,8 @@ def flip_rate(
     return _table(results, per, bins, [PoseStatistic(rate, ESTIMATE_INPUTS)])
 
 
+#: Outcomes of a pose: solved, or the step at which it was lost.
 OUTCOMES = (*outcomes(counted=True), *outcomes(counted=False))
-"""Outcomes of a pose: solved, or the step at which it was lost."""
 
 
 def ends_as(outcome: str, poses: Poses) -> Masks:
@@ -275,11 +275,11 @@ def failure_composition(
 # --------------------------------------------------------------------------------------------------
 # Which marker IDs are weak: each against the others, corrected for their number.
 
+#: Chance that any ID at all is called weak, or strong, if all are alike.
 SIGNIFICANCE = 0.05
-"""Chance that any ID at all is called weak, or strong, if all are alike."""
 
+#: Below it the gamma distribution is normal to 1e-6, and its functions lose digits.
 MIN_SKEWNESS = 1e-6
-"""Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
 
 
 @describes
@@ -483,14 +483,15 @@ def _root_mean_square(quantity: Quantity) -> Statistic[Poses]:
     return RootMeanSquare(*labels, quantity.squares, lambda poses: poses.solved)
 
 
+#: Counts of the poses.
 POSE_STATISTICS: tuple[PoseStatistic, ...] = (
     PoseStatistic(Count(*LOOKED_FOR, lambda poses: poses.looked_for), DETECTION_INPUTS),
     PoseStatistic(Count(*SOLVED, lambda poses: poses.solved), ESTIMATE_INPUTS),
     PoseStatistic(DETECTION_RATE, DETECTION_INPUTS), PoseStatistic(SOLVED_RATE, ESTIMATE_INPUTS),
     PoseStatistic(FLIP_RATE, ESTIMATE_INPUTS),
 )
-"""Counts of the poses."""
 
+#: Quantiles of absolute errors, which take a second pass over the poses.
 QUANTILES = ErrorStatistic(
     {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
      "p99": "99 % quantile (p99)"},
@@ -499,8 +500,8 @@ QUANTILES = ErrorStatistic(
         lambda poses: poses.solved, lambda poses: poses.looked_for,
         # Why an end is missing is the same for all kinds of error.
         with_reason=quantity is QUANTITIES[0]))
-"""Quantiles of absolute errors, which take a second pass over the poses."""
 
+#: Statistics of each kind of error; for `SIGNED` kinds only where it says so.
 ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
     QUANTILES,
     ErrorStatistic(
@@ -519,7 +520,6 @@ ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
             quantity.units, quantity.vector, lambda poses: poses.unflipped),
         of_signed=True),
 )
-"""Statistics of each kind of error; for `SIGNED` kinds only where it says so."""
 
 
 def quantiles_of(quantity: Quantity) -> PoseStatistic:
@@ -662,11 +662,11 @@ def _table(
 # --------------------------------------------------------------------------------------------------
 # Whether the covariances that estimates come with describe their errors.
 
+#: By how much the coverage of a trusted covariance may differ from the level.
 TOLERANCE = 0.02
-"""By how much the coverage of a trusted covariance may differ from the level."""
 
+#: Draws from which on a covariance can be trusted.
 MIN_DRAWS = 50
-"""Draws from which on a covariance can be trusted."""
 
 
 def _nees(poses: Poses) -> Floats:
@@ -677,11 +677,11 @@ def _with_nees(poses: Poses) -> Masks:
     return poses.solved & ~np.isnan(_nees(poses))
 
 
+#: The mean of ``nees``.
 NEES_MEAN = PoseStatistic(
     PositiveMean("nees_mean", "mean normalised estimation error squared, expected 6", "1",
                  lambda poses: _nees(poses)[..., None], _with_nees),
     (*ESTIMATE_INPUTS, "nees"))
-"""The mean of ``nees``."""
 
 
 @describes
@@ -881,9 +881,9 @@ def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> PoseStati
         lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound=bound), BOUND_INPUTS)
 
 
+#: Of the rotation and of the depth.
 RATIOS = (
     _of_bound(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses[ROTATION_BOUND]))),
     _of_bound(QUANTITIES[1],
               lambda poses: (100.0 * relative(poses[DEPTH_BOUND], poses[DEPTH])) ** 2),
 )
-"""Of the rotation and of the depth."""

@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # A command: a function, and what is read from its signature and its docstring.
 
+#: Names that are listed behind commas; a flag that may be repeated. None if it is not given.
 Names = Sequence[str] | None
-"""Names that are listed behind commas; a flag that may be repeated. None if it is not given."""
 
+#: A part of numpydoc: names, in place of a type flags and what stands for the value, meaning.
 PARAMETER = re.compile(r"^(\w[\w, ]*?)(?: : (.*))?\n((?:    .*\n?|\n)+)", re.MULTILINE)
-"""A part of numpydoc: names, in place of a type flags and what stands for the value, meaning."""
 
+#: A docstring's text in place of parameters that another command explains.
 ELSEWHERE = re.compile(r"As for `(\w+)`\.?")
-"""A docstring's text in place of parameters that another command explains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +112,8 @@ class Command:
         return str(inspect.signature(self.function).return_annotation) == "Findings"
 
 
+#: The commands by the name of their function.
 DECLARED: dict[str, Command] = {}
-"""The commands by the name of their function."""
 
 
 def command(
@@ -154,11 +154,11 @@ def names_of(text: str) -> list[str]:
     return [name for part in text.split(",") if (name := part.strip())]
 
 
+#: Annotation -> what argparse makes of a flag; others are text.
 KINDS: dict[str, dict[str, Any]] = {
     "int": {"type": int}, "float": {"type": float}, "bool": {"action": "store_true"},
     "Sequence[str]": {"action": "append"}, "Names": {"action": "extend", "type": names_of},
 }
-"""Annotation -> what argparse makes of a flag; others are text."""
 
 
 def argument(
@@ -194,8 +194,8 @@ class Session:
 
 SESSION = Session()
 
+#: Told after Ctrl-C where it does; a command sets ``SESSION.stopped`` to it.
 CONTINUES = "stopped; the same command continues"
-"""Told after Ctrl-C where it does; a command sets ``SESSION.stopped`` to it."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -267,14 +267,14 @@ def store_of(pipeline: str, store: str | None) -> str | None:
     return store or (pipeline if library.lifecycle.names_store(pipeline) else None)
 
 
+#: Seconds that the renderer takes to compile, which every run needs.
 COMPILATION_S = 8
-"""Seconds that the renderer takes to compile, which every run needs."""
 
+#: Seconds that `photometric_real` takes beyond that.
 PHOTOGRAPH_S = 20
-"""Seconds that `photometric_real` takes beyond that."""
 
+#: Seconds that the bound and `photometric` take beyond that.
 LIKELIHOOD_S = 10
-"""Seconds that the bound and `photometric` take beyond that."""
 
 
 def announce_compilation(pipeline: Pipeline) -> None:
@@ -295,11 +295,11 @@ def announce_compilation(pipeline: Pipeline) -> None:
 # --------------------------------------------------------------------------------------------------
 # Output: lines without control characters, and a picture.
 
+#: How the program's path ends if Python was told to run the package.
 AS_MODULE = ("sweep", "__main__.py")
-"""How the program's path ends if Python was told to run the package."""
 
+#: Lines of each kind that `sweep status` and `sweep verify` print.
 MAX_LINES = 50
-"""Lines of each kind that `sweep status` and `sweep verify` print."""
 
 def say(text: str = "") -> None:
     """Print lines without control characters, whosever names they quote."""
@@ -429,6 +429,7 @@ def summarised(
 
 MAX_LINE_LENGTH = 2000
 
+#: What to change after an error of the system.
 ADVICE = {
     errno.EMFILE: "allow more open files (ulimit -n)",
     errno.EAGAIN: "allow more processes (ulimit -u)",
@@ -436,17 +437,16 @@ ADVICE = {
     errno.ENOSPC: "free space on the disk",
     errno.EFBIG: "allow larger files (ulimit -f)",
 }
-"""What to change after an error of the system."""
 
 
+#: What writing may end with.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""What writing may end with."""
 
+#: What Python says in a RuntimeError where the system allows no more threads.
 NO_THREAD = "can't start new thread"
-"""What Python says in a RuntimeError where the system allows no more threads."""
 
+#: Errors of what was asked for (exit status 2); others occur while a command runs (1).
 REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
-"""Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
 
 
 def print_error(error: SweepError) -> int:

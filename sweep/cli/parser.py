@@ -25,9 +25,9 @@ from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
 
+#: Arguments for which names of files and folders are offered.
 FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR",
          "FILE", "FIGURE", "PNG")
-"""Arguments for which names of files and folders are offered."""
 
 
 @command("pipelines/README.md", {
@@ -54,6 +54,7 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
     return 0
 
 
+#: Every command, by group, in the order in which the help lists them.
 GROUPS = {
     "experiments": (run, plan, show, status, verify, repro),
     "answers": (report, require, size, limit, tradeoff, diagnose, error_model, calibration),
@@ -61,19 +62,18 @@ GROUPS = {
     "other programs": (export, score, plugins),
     "help": (reference, completion),
 }
-"""Every command, by group, in the order in which the help lists them."""
 
 COMMANDS = tuple(itertools.chain.from_iterable(GROUPS.values()))
 
+#: Title of the list that argparse makes of the commands.
 UNGROUPED = "all commands"
-"""Title of the list that argparse makes of the commands."""
 
+#: Beginning of argparse's message for a command that does not exist.
 INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)'")
-"""Beginning of argparse's message for a command that does not exist."""
 
+#: Pages for all commands: a first answer; questions and the command that answers each;
+#: architecture, development and the glossary.
 GUIDES = ("README.md", "pipelines/questions/README.md", "sweep/README.md")
-"""Pages for all commands: a first answer; questions and the command that answers each;
-architecture, development and the glossary."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -32,16 +32,16 @@ from sweep.typing import Floats, Grey, Integers
 # --------------------------------------------------------------------------------------------------
 # Corners that a detector found against the truth: their order and offset, and the IDs.
 
+#: Largest mean offset of a detector that conforms.
 MAX_OFFSET_PX = 0.02
-"""Largest mean offset of a detector that conforms."""
 
+#: Standard errors of the mean offset that are allowed beside it.
 STANDARD_ERRORS = 4.0
-"""Standard errors of the mean offset that are allowed beside it."""
 
 ORDERS = tuple(itertools.permutations(range(4)))
 
+#: The markers of an image: ID and corners (4, 2) px.
 Found = Sequence[tuple[int, Floats]]
-"""The markers of an image: ID and corners (4, 2) px."""
 
 
 @dataclass(frozen=True)
@@ -189,8 +189,8 @@ SIDES_PX = (60.0, 150.0)
 TILTS_DEG = (0.0, 45.0)
 MAX_BEARING_DEG = 8.0
 
+#: What lines on faults begin with.
 SOURCE = "plugins check"
-"""What lines on faults begin with."""
 
 @dataclass(frozen=True)
 class TrialScenes:
@@ -285,21 +285,21 @@ def trial_scenes(pipeline: Pipeline) -> TrialScenes:
 #
 # They run in a child process, which the plug-in may end or never leave.
 
+#: Time limit of each check.
 TIME_LIMIT_S = 120.0
-"""Time limit of each check."""
 
+#: Share of the scenes in which a marker must be found, or solved: all are large and sharp.
 FEWEST_SHARE = 0.75
-"""Share of the scenes in which a marker must be found, or solved: all are large and sharp."""
 
+#: Largest median errors of a solver that has the right frames and units.
 MAX_ROTATION_DEG, MAX_POSITION_PERCENT = 5.0, 5.0
-"""Largest median errors of a solver that has the right frames and units."""
 
 PREFERRED = "DICT_APRILTAG_36h11"
 
 OK, NOTE, FAULT = "ok", "note", "fault"
 
+#: Result of a check: a verdict, a line, and maybe numbers by name.
 Outcome = tuple[str, str] | tuple[str, str, dict[str, Any]]
-"""Result of a check: a verdict, a line, and maybe numbers by name."""
 
 
 @dataclass(frozen=True)
@@ -657,10 +657,10 @@ CHECKS: tuple[Callable[[Trial], Outcome], ...] = (
     survives_odd_input,
 )
 
+#: Kind of plug-in -> the names of its checks.
 NAMES = {
     "detector": ("returns markers", "finds markers", "keeps conventions", "repeats itself",
                  "has no memory", "survives odd images"),
     "estimator": ("returns poses", "solves scenes", "keeps frames", "repeats itself",
                   "ignores the batch", "survives odd detections"),
 }
-"""Kind of plug-in -> the names of its checks."""

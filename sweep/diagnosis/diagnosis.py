@@ -18,12 +18,7 @@ from sweep.diagnosis.inference import (
     rank,
     rivals,
 )
-from sweep.diagnosis.observations import (
-    READABLE_PX,
-    ZERO_SD_M,
-    Observations,
-    read_observations,
-)
+from sweep.diagnosis.observations import READABLE_PX, ZERO_SD_M, Observations, read_observations
 from sweep.model.calibration import Calibration
 from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file

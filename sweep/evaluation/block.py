@@ -150,8 +150,8 @@ def estimates_of(
 # --------------------------------------------------------------------------------------------------
 # Scene cells of the grid: scenes -> images -> detections -> estimates -> variables.
 
+#: Pixels of images that are kept for the estimators, if all were whole frames: 67 MB of memory.
 KEPT_PX = 1 << 26
-"""Pixels of images that are kept for the estimators, if all were whole frames: 67 MB of memory."""
 
 
 def compute_block(experiment: Experiment, block: Block) -> dict[str, NDArray[Any]]:
@@ -277,8 +277,8 @@ def _run_batch(
 # --------------------------------------------------------------------------------------------------
 # Before a run: whether any scene can have a bound.
 
+#: Scenes, spread over the grid, by which it is told whether any has a bound.
 NOTED_SCENES = 64
-"""Scenes, spread over the grid, by which it is told whether any has a bound."""
 
 NO_BOUND = {
     BoundStatus.clipped: "a grey level is within two standard deviations of the noise of 0 or 255; "
@@ -308,13 +308,13 @@ def bound_notes(pipeline: Pipeline) -> list[str]:
 # --------------------------------------------------------------------------------------------------
 # A standard scene, computed before any block: a machine that cannot do that computes nothing.
 
+#: Solvers whose compiled code is loaded, if the pipeline has them; else that of the first.
 SOLVERS = ("ippe_square", "photometric", "photometric_real")
-"""Solvers whose compiled code is loaded, if the pipeline has them; else that of the first."""
 
 TITLE = "A standard scene"
 
+#: Rotation error of the standard scene; with the supported solvers it is below 0.05.
 MAX_ERROR_RAD = 0.2
-"""Rotation error of the standard scene; with the supported solvers it is below 0.05."""
 
 
 def warm_up(pipeline: Pipeline) -> None:

@@ -18,13 +18,13 @@ from sweep.messages import plain
 # Values that faulty hardware computes without an exception cannot be told from sound ones here;
 # `sweep verify` finds those that its sample meets.
 
+#: Types of exceptions that say nothing about a scene; Numba's errors are others.
 MACHINE_FAULTS: tuple[type[Exception], ...] = (
     OSError, MemoryError, ImportError, EOFError, pickle.PickleError,
 )
-"""Types of exceptions that say nothing about a scene; Numba's errors are others."""
 
+#: Characters of an exception that a message quotes.
 MAX_FAULT_LENGTH = 300
-"""Characters of an exception that a message quotes."""
 
 
 def machine_fault(error: BaseException) -> MachineFaultError | None:

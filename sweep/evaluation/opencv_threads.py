@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import cv2
 
 _lock = threading.Lock()
+#: The process' own number of threads, once for each context that is open.
 _entered: list[int] = []
-"""The process' own number of threads, once for each context that is open."""
 
 
 @contextmanager

@@ -46,8 +46,8 @@ class Failure:
     crashed: bool = False
 
 
+#: Failures whose traceback is kept; of the others only the last line is.
 MAX_TRACEBACKS = 1000
-"""Failures whose traceback is kept; of the others only the last line is."""
 
 
 def note_failure(

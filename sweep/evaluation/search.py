@@ -83,13 +83,12 @@ def scenes_at(experiment: Experiment, indices: Sequence[NDArray[np.intp]]) -> Sc
 # --------------------------------------------------------------------------------------------------
 # Where images come from: a renderer, or a photograph.
 
+#: A function from N scenes, the rows (n,) of some, the boxes (n, 4) that their targets can touch,
+#: and their windows (n, 4) in the frame, to n images of these windows.
+#:
+#: It is :func:`sweep.model.renderers.render_all`, which draws a scene or cuts it out of a
+#: photograph, as the scene's renderer says.
 ImageSource = Callable[[Scenes, NDArray[np.intp], Integers, Integers], Sequence[Grey]]
-"""A function from N scenes, the rows (n,) of some, the boxes (n, 4) that their targets can touch,
-and their windows (n, 4) in the frame, to n images of these windows.
-
-It is :func:`sweep.model.renderers.render_all`, which draws a scene or cuts it out of a photograph,
-as the scene's renderer says.
-"""
 
 
 def images_of(
@@ -268,8 +267,8 @@ def detections_of(
     return [each.result(batch.targets) for each in passes], row_s
 
 
+#: The image of a scene that is not rendered, since no source needs it.
 _UNSEEN = np.empty((0, 0), dtype=np.uint8)
-"""The image of a scene that is not rendered, since no source needs it."""
 
 
 @dataclass(slots=True)
@@ -326,8 +325,8 @@ class _Pass:
             targets, found, flags, seconds, self.images, first, poses, self.outputs, origins)
 
 
+#: Pixels that are rendered, in one call, before they are searched: 17 MB of memory.
 GROUP_PX = 1 << 24
-"""Pixels that are rendered, in one call, before they are searched: 17 MB of memory."""
 
 
 def _groups(

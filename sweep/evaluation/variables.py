@@ -114,6 +114,7 @@ def _chessboard_errors_px(results: SearchResult) -> Floats:
     return errors
 
 
+#: Variable that follows from camera and pose -> its values (N, ...).
 GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
     "true_rvec": lambda scenes: vector_of_rotation(scenes.rotation),
     "true_tvec_m": lambda scenes: scenes.translation,
@@ -121,13 +122,13 @@ GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
         viewing_angle(scenes.rotation, scenes.translation)
     ),
 }
-"""Variable that follows from camera and pose -> its values (N, ...)."""
 
 
 def _centre_px(scenes: Scenes) -> Floats:
     return np.asarray(scenes.cameras.project(scenes.translation[:, None])[:, 0])
 
 
+#: Variable of photographs, whose poses are not drawn but found -> its values (N,).
 OF_PHOTOGRAPHS: dict[str, Callable[[Scenes], NDArray[Any]]] = {
     "side_px": lambda scenes: (
         scenes.cameras.view[:, 0] * scenes.size_m / scenes.translation[:, 2]
@@ -136,8 +137,8 @@ OF_PHOTOGRAPHS: dict[str, Callable[[Scenes], NDArray[Any]]] = {
     "image_x_px": lambda scenes: _centre_px(scenes)[:, 0],
     "image_y_px": lambda scenes: _centre_px(scenes)[:, 1],
 }
-"""Variable of photographs, whose poses are not drawn but found -> its values (N,)."""
 
+#: Variable of the scene -> its values (N, ...).
 SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
     **{
         name: lambda results, function=function: function(results.batch.scenes)  # type: ignore[misc]
@@ -157,8 +158,8 @@ SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
     "truth": lambda results: results.batch.values["truth"].values,
     "truth_std": lambda results: results.batch.values["truth_std"].values,
 }
-"""Variable of the scene -> its values (N, ...)."""
 
+#: Variable of the detection -> its values (N, ...).
 DETECTION: dict[str, Callable[[SearchResult], NDArray[Any]]] = {
     "detection": lambda results: results.flags,
     "corner_error_px": lambda results: _marker_errors_px(results)[:, 0],
@@ -166,8 +167,8 @@ DETECTION: dict[str, Callable[[SearchResult], NDArray[Any]]] = {
     "marker_corner_error_px": _marker_errors_px,
     "chessboard_corner_error_px": _chessboard_errors_px,
 }
-"""Variable of the detection -> its values (N, ...)."""
 
+#: Variable of the estimation -> its values (n, ...) for the scenes with a detection.
 ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "estimate": lambda results: results.estimates.status,
     "translation_error_m": lambda results: results.error.translation_m,
@@ -190,15 +191,14 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "flipped": _flipped,
     "point_count": lambda results: results.estimates.point_count,
 }
-"""Variable of the estimation -> its values (n, ...) for the scenes with a detection."""
 
+#: All scenes.
 ALL = slice(None)
-"""All scenes."""
 
+#: Flag variable of the estimation -> its flag for scenes without a detection.
 WITHOUT_DETECTION: dict[str, int] = {
     "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
 }
-"""Flag variable of the estimation -> its flag for scenes without a detection."""
 
 
 def check_complete(tables: Mapping[Stage, Mapping[str, Any]]) -> None:

@@ -24,11 +24,11 @@ from sweep.typing import Floats, Integers
 
 CORNERS = ("TL", "TR", "BR", "BL")
 
+#: Directions of the marker as a viewer sees it upright -> in the marker frame of OpenCV's ArUco.
 DIRECTIONS = {
     "right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "out": (0, 0, 1),
     "in": (0, 0, -1),
 }
-"""Directions of the marker as a viewer sees it upright -> in the marker frame of OpenCV's ArUco."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,7 @@ VECTOR = ("rx", "ry", "rz")
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx", "ty", "tz")
 
+#: Other names of columns.
 ALIASES = {
     "file": "image", "filename": "image", "file_name": "image", "image_name": "image",
     "marker_id": "id", "markerid": "id", "tag_id": "id",
@@ -116,13 +117,12 @@ ALIASES = {
     **{f"tvec_{axis}": f"t{axis}" for axis in "xyz"},
     **{f"{axis}_{corner}": f"{axis}{corner}" for corner in range(5) for axis in "xy"},
 }
-"""Other names of columns."""
 
+#: The header has most of the one that separates; with semicolons, commas are decimal points.
 SEPARATORS = ",;\t"
-"""The header has most of the one that separates; with semicolons, commas are decimal points."""
 
+#: Parts of an image's name that are left out: folders, and the suffix.
 STEM = r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$"
-"""Parts of an image's name that are left out: folders, and the suffix."""
 
 NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 
@@ -134,8 +134,8 @@ MAX_TOLD_COLUMNS = 12
 
 _NAME = re.compile(r"(\d{6,})-[0-9a-f]{8}")
 
+#: Line of the file -> its first fault.
 Faults = dict[int, str]
-"""Line of the file -> its first fault."""
 
 
 def _refused(source: str, faults: Faults) -> PipelineError:

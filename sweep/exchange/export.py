@@ -45,8 +45,8 @@ from sweep.typing import Integers
 # --------------------------------------------------------------------------------------------------
 # An experiment's scenes as a set of images: their numbers, names, windows, and visibility.
 
+#: Scenes that are in memory together.
 BATCH = 256
-"""Scenes that are in memory together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +116,8 @@ def image_batches(pipeline: Pipeline, *, windowed: bool = False) -> Iterator[Ima
 # Both put pixel (0, 0) at the centre of the top left pixel and have OpenCV's lens model, as the
 # simulation does.
 
+#: Coefficients -> ROS's name of the lens model; longer ones are rational polynomials, too.
 MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
-"""Coefficients -> ROS's name of the lens model; longer ones are rational polynomials, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,14 +178,14 @@ class FileCamera:
 # --------------------------------------------------------------------------------------------------
 # The truth of exported images: rows of CSV, COCO records, and the variables of a dataset.
 
+#: Columns of the corners: x0, y0 of the top left one, then clockwise on the marker.
 CORNERS = tuple(f"{axis}{corner}" for corner in range(4) for axis in "xy")
-"""Columns of the corners: x0, y0 of the top left one, then clockwise on the marker."""
 
+#: Columns of where the corners are on the target, in its frame.
 PLACES = tuple(f"{axis}{corner}_m" for corner in range(4) for axis in "XYZ")
-"""Columns of where the corners are on the target, in its frame."""
 
+#: Columns of the rotation vector in rad and of the position in m.
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
-"""Columns of the rotation vector in rad and of the position in m."""
 
 
 def write_truth(
@@ -345,12 +345,12 @@ def _of_chessboards(batch: ImageBatch, images: pd.DataFrame) -> pd.DataFrame:
     })
 
 
+#: Description inside the COCO-like file.
 COCO_INFO = {
     "description": "true corners of markers, as COCO keypoints",
     "pixel_center": 0,
     "corner_order": "top left, top right, bottom right, bottom left of the upright marker",
 }
-"""Description inside the COCO-like file."""
 
 
 def _coco(table: pd.DataFrame) -> dict[str, Any]:
@@ -411,28 +411,28 @@ def write_errors(folder: Path) -> Iterator[None]:
 # --------------------------------------------------------------------------------------------------
 # Export of an experiment: its images, their truth, and camera files, in a folder.
 
+#: The file by which a folder is known as an export; it names the experiment.
 MARK = "export.json"
-"""The file by which a folder is known as an export; it names the experiment."""
 
+#: Digests of the images that are written, as ``sha256sum -c`` reads them.
 CHECKSUMS = "images.sha256"
-"""Digests of the images that are written, as ``sha256sum -c`` reads them."""
 
+#: The README of an export: the folder's content, its conventions, and how answers come back.
 GUIDE = Path(__file__).with_name("readme.md.jinja")
-"""The README of an export: the folder's content, its conventions, and how answers come back."""
 
+#: Folder of the pipeline and of the files that it names.
 EXPERIMENT = "experiment"
-"""Folder of the pipeline and of the files that it names."""
 
 FORMAT = 1
 
+#: Larger exports have to be confirmed.
 MAX_BYTES = 10 * 10**9
-"""Larger exports have to be confirmed."""
 
+#: Larger experiments are not exported: their names are listed in memory.
 MAX_SCENES = 10**6
-"""Larger experiments are not exported: their names are listed in memory."""
 
+#: Images by which the size of all is estimated.
 SAMPLE = 8
-"""Images by which the size of all is estimated."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,21 +13,9 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from sweep.errors import (
-    ArgumentError,
-    OtherExperimentError,
-    PipelineError,
-    StoreError,
-    SweepError,
-)
+from sweep.errors import ArgumentError, OtherExperimentError, PipelineError, StoreError, SweepError
 from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
-from sweep.exchange.export import (
-    EXPERIMENT,
-    image_batch,
-    image_batches,
-    read_mark,
-    write_errors,
-)
+from sweep.exchange.export import EXPERIMENT, image_batch, image_batches, read_mark, write_errors
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
@@ -39,8 +27,8 @@ from sweep.typing import Floats, Integers
 # --------------------------------------------------------------------------------------------------
 # Faults of the conventions of answers, where the truth fits other ones better.
 
+#: Markers that are compared with the truth.
 SAMPLE = 500
-"""Markers that are compared with the truth."""
 
 MIN_MARKERS = 5
 

@@ -26,12 +26,12 @@ from sweep.store.blocks import Receipt
 # A bounded number of blocks is out at a time, so that memory does not grow with the grid. Workers
 # write the blocks; only receipts come back.
 
+#: How often a block is tried whose worker dies, or fails by a fault of its machine.
 MAX_ATTEMPTS = 10
-"""How often a block is tried whose worker dies, or fails by a fault of its machine."""
 
 
+#: How long no block may be finished before a line says so.
 SILENCE_S = 60.0
-"""How long no block may be finished before a line says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +152,11 @@ class Executor(ABC):
 # --------------------------------------------------------------------------------------------------
 # Child processes of this machine, each called by a thread.
 
+#: Work up to which a run needs one process: another takes a second to import its packages.
 SMALL_RUN_S = 3.0
-"""Work up to which a run needs one process: another takes a second to import its packages."""
 
+#: Seconds after which the other processes are started if such a run still goes on.
 SMALL_RUN_LIMIT_S = 10.0
-"""Seconds after which the other processes are started if such a run still goes on."""
 
 
 class Children(Executor):

@@ -33,26 +33,26 @@ from sweep.store.locations import is_remote
 # --------------------------------------------------------------------------------------------------
 # The cost of a scene: a seeded random batch of scenes is timed in a child process.
 
+#: Seconds of the batch of scenes that is timed before blocks are cut.
 TIMING_S = 0.2
-"""Seconds of the batch of scenes that is timed before blocks are cut."""
 
+#: Seconds after which it is abandoned: it is known by then that blocks are small.
 TIMING_LIMIT_S = 5.0
-"""Seconds after which it is abandoned: it is known by then that blocks are small."""
 
+#: Share of a block's time limit after which it is, too.
 TIMING_SHARE = 1 / 8
-"""Share of a block's time limit after which it is, too."""
 
+#: Most scenes of a batch.
 MAX_BATCH = 1536
-"""Most scenes of a batch."""
 
+#: By how much a batch may exceed the one before: a few scenes may cost far more than the others.
 GROWTH = 8
-"""By how much a batch may exceed the one before: a few scenes may cost far more than the others."""
 
+#: How long a measurement may compile; its own limit stands still meanwhile.
 COMPILATION_LIMIT_S = 900.0
-"""How long a measurement may compile; its own limit stands still meanwhile."""
 
+#: Assumed cost of a scene if the measurement crashed.
 UNMEASURED_S = 0.01
-"""Assumed cost of a scene if the measurement crashed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,37 +148,37 @@ def measured_or_assumed(child: Child, pipeline: Pipeline, block_limit_s: float) 
 # --------------------------------------------------------------------------------------------------
 # The blocks of a run: about two seconds of work each.
 
+#: Work in a block of most runs: a lost block costs its work.
 BLOCK_S = 2.0
-"""Work in a block of most runs: a lost block costs its work."""
 
 MIN_BLOCK_S = 0.1
 
+#: Least work in a block of a run in waves, if all its scenes are needed: soon few of them are.
 WAVE_BLOCK_S = 0.5
-"""Least work in a block of a run in waves, if all its scenes are needed: soon few of them are."""
 
+#: Blocks that all workers together finish in a second: a scheduler does about 180 of them, so that
+#: larger clusters get larger blocks.
 BLOCKS_PER_S = 75
-"""Blocks that all workers together finish in a second: a scheduler does about 180 of them, so that
-larger clusters get larger blocks."""
 
+#: Blocks of a run, of about 25 files each: longer runs get larger blocks.
 MAX_BLOCKS = 100_000
-"""Blocks of a run, of about 25 files each: longer runs get larger blocks."""
 
+#: Work that a block takes at most: jobs of clusters end after hours, and lose a block each. A run
+#: of 11 years of one processor has 100,000 of these; longer ones have more.
 MAX_BLOCK_S = 3600.0
-"""Work that a block takes at most: jobs of clusters end after hours, and lose a block each. A
-run of 11 years of one processor has 100,000 of these; longer ones have more."""
 
+#: Share of a block's time limit that its work is to take: scenes may cost more than was measured. A
+#: time limit that the user gives bounds the work; else the work raises the limit.
 MAX_BLOCK_SHARE = 1 / 10
-"""Share of a block's time limit that its work is to take: scenes may cost more than was measured.
-A time limit that the user gives bounds the work; else the work raises the limit."""
 
+#: With little work, blocks are cut smaller so that every worker has some until the end.
 BLOCKS_PER_WORKER = 6
-"""With little work, blocks are cut smaller so that every worker has some until the end."""
 
 MAX_BLOCK_BYTES = 256_000_000
 MAX_BLOCK_SCENES = 200_000
 
+#: By how much blocks are made larger until there are few enough.
 LARGER = 1.2
-"""By how much blocks are made larger until there are few enough."""
 
 
 def block_work_s(total_s: float, workers: int, time_limit_s: float | None = None) -> float:
@@ -281,11 +281,11 @@ def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int,
 # --------------------------------------------------------------------------------------------------
 # Time and disk of a run, which is refused if it takes longer than a day, or more than the disk has.
 
+#: Seconds from which on a run has to be confirmed.
 MAX_S = 86_400.0
-"""Seconds from which on a run has to be confirmed."""
 
+#: Committed blocks from which the cost of a scene is estimated.
 SAMPLED_RECEIPTS = 100
-"""Committed blocks from which the cost of a scene is estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,11 +395,11 @@ def scene_s_of(store: RunStore, done: AbstractSet[int]) -> float:
 # --------------------------------------------------------------------------------------------------
 # The forecast of a run: blocks, bytes, memory and time.
 
+#: Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes.
 PLAN_SCENES_S = 1.5
-"""Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes."""
 
+#: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
-"""Seconds of a run apart from its blocks: processes start and end, packages are imported."""
 
 
 

@@ -26,8 +26,8 @@ from sweep.store.lifecycle import (
     unfinished_line,
 )
 
+#: The most trials of a cell where nothing says how many.
 MAX_TRIALS = 2400
-"""The most trials of a cell where nothing says how many."""
 
 
 def search_limits(

@@ -34,15 +34,15 @@ from sweep.store.provenance import fingerprint
 #
 # The caller's client or cluster is only used; no client here becomes Dask's default.
 
+#: In place of a scheduler's address: a cluster of processes on this machine, for this run alone.
 LOCAL = "local"
-"""In place of a scheduler's address: a cluster of processes on this machine, for this run alone."""
 
+#: How long a scheduler may take to answer.
 ANSWER_S = 10.0
-"""How long a scheduler may take to answer."""
 
+#: How long a run waits for a first worker, for all workers' versions, for which they import this
+#: package, and after the last worker left.
 WORKERS_S = 60.0
-"""How long a run waits for a first worker, for all workers' versions, for which they import this
-package, and after the last worker left."""
 
 
 @runtime_checkable
@@ -256,11 +256,11 @@ def silenced_dask_loggers() -> Iterator[None]:
 # --------------------------------------------------------------------------------------------------
 # Blocks on the cluster: how many are out, which worker computes which, and when to give up.
 
+#: Blocks in flight per worker thread: enough that none waits, few enough that none pile up.
 BLOCKS_PER_THREAD = 3
-"""Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
 
+#: How often the scheduler is asked what workers it has, and how long a run waits for the answer.
 LOOK_S, LOOK_LIMIT_S = 1.0, 2.0
-"""How often the scheduler is asked what workers it has, and how long a run waits for the answer."""
 
 AWAY = "the scheduler went away"
 

@@ -14,8 +14,8 @@ from sweep.messages import notice
 # --------------------------------------------------------------------------------------------------
 # How far a run is, while it runs: the event after each block, and its display on stderr.
 
+#: Seconds between two lines of progress where stderr is not a terminal.
 LINE_INTERVAL_S = 30.0
-"""Seconds between two lines of progress where stderr is not a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class Progress:
 ProgressReport = Callable[[Progress], None]
 
 
+#: Called with the current step, and the share of it that is done.
 StageReport = Callable[[str, float], None]
-"""Called with the current step, and the share of it that is done."""
 
 
 @contextlib.contextmanager

@@ -138,11 +138,11 @@ class Source:
 # failed or crashed. Which cells an old store has finished follows from its receipts and flags;
 # the old store is only read.
 
+#: Flags of cells that are not reused, so that the new store has the reasons of all its failures.
 LOST = {
     "detection": (DetectionStatus.failed, DetectionStatus.crashed),
     "estimate": (EstimateStatus.failed, EstimateStatus.crashed),
 }
-"""Flags of cells that are not reused, so that the new store has the reasons of all its failures."""
 
 
 def match(pipeline: Pipeline, store: RunStore) -> Source:

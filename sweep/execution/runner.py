@@ -281,8 +281,8 @@ def _compute_and_close(
     return computed
 
 
+#: Failed blocks after which a run ends.
 MAX_FAILED_BLOCKS = 10
-"""Failed blocks after which a run ends."""
 
 
 def compute(

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # Totals of a store's receipts.
 
+#: Failed cells, and as many crashed ones, that are listed of a store; the flags count all.
 MAX_ROWS = 1000
-"""Failed cells, and as many crashed ones, that are listed of a store; the flags count all."""
 
 
 @dataclass(slots=True)
@@ -117,22 +117,22 @@ def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:
 # --------------------------------------------------------------------------------------------------
 # The outcome of a run in words: what failed and why, and whether anything was computed.
 
+#: Share of the cells that were tried, above which failures are told first.
 LOUD_SHARE = 0.1
-"""Share of the cells that were tried, above which failures are told first."""
 
+#: Groups of failures that are listed; the others are counted.
 MAX_GROUPS = 5
-"""Groups of failures that are listed; the others are counted."""
 
 MAX_REASON = 200
 
+#: Flags of cells on which a stage was not tried.
 NOT_TRIED = (
     "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name,
     DetectionStatus.not_needed.name,
 )
-"""Flags of cells on which a stage was not tried."""
 
+#: Parts of messages that differ from cell to cell: addresses and numbers.
 _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
-"""Parts of messages that differ from cell to cell: addresses and numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,11 +544,11 @@ def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
 # --------------------------------------------------------------------------------------------------
 # The status of a store: progress, counts of flags, rate, time left; also while it is written.
 
+#: Seconds over which the rate is measured, up to the last block that was written.
 RATE_S = 60.0
-"""Seconds over which the rate is measured, up to the last block that was written."""
 
+#: At least so many times the longest block is measured: with many workers, blocks come in waves.
 RATE_BLOCKS = 10
-"""At least so many times the longest block is measured: with many workers, blocks come in waves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,8 +18,8 @@ from sweep.experiment.sampling import StoppingRule, digest_of
 from sweep.sampling.rules import Decider, Decision, Waves, condition_axes, make_rule
 from sweep.store.blocks import Receipt, RunStore, committed, receipts
 
+#: Blocks of which nothing is needed that one task writes.
 SETTLED_AT_ONCE = 64
-"""Blocks of which nothing is needed that one task writes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class AnyOrder:
     ``done``: those that are committed before.
     """
 
+    #: There are no conditions that could be settled.
     settled_share = None
-    """There are no conditions that could be settled."""
 
     def __init__(self, numbers: Iterable[int], done: AbstractSet[int] = frozenset()) -> None:
         self._numbers = iter(numbers)
@@ -90,8 +90,8 @@ class InWaves:
         # goes on when all are.
         self._groups: dict[int, tuple[set[int], Iterator[list[Work]]]] = {}
         self._settled_shares: dict[int, float] = {}
+        #: Numbers of the blocks that were committed on the basis that they have now.
         self.current: set[int] = set()
-        """Numbers of the blocks that were committed on the basis that they have now."""
         for number, receipt in receipts(store, committed(store)):
             self._note(number, receipt)
         begun = {self._waves.group(number) for number in self._known}
@@ -166,8 +166,8 @@ class InWaves:
             wave += 1
 
 
+#: The blocks that wait to be computed.
 Waiting = AnyOrder | InWaves
-"""The blocks that wait to be computed."""
 
 
 def waiting_blocks(

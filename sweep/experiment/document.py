@@ -28,11 +28,11 @@ from sweep.plugins.declared import DeclaredPlugin
 # --------------------------------------------------------------------------------------------------
 # TOML: any text gives a document or a reason, and soon.
 
+#: The largest text that is read.
 MAX_BYTES = 250_000
-"""The largest text that is read."""
 
+#: The most parts of a dotted key: reading it takes memory that grows with their square.
 MAX_PARTS = 8
-"""The most parts of a dotted key: reading it takes memory that grows with their square."""
 
 _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(
@@ -163,11 +163,11 @@ def toml_item(value: Any) -> tomlkit.items.Item:
 # --------------------------------------------------------------------------------------------------
 # The keys of a document. All faults are gathered: a value that cannot be is left out of the grid.
 
+#: The section of what the results must fulfil (`sweep.experiment.sampling`).
 REQUIRE = "require"
-"""The section of what the results must fulfil (`sweep.experiment.sampling`)."""
 
+#: The section of what is searched (`sweep.experiment.sampling`).
 SEARCH = "search"
-"""The section of what is searched (`sweep.experiment.sampling`)."""
 
 MAX_TITLE_LENGTH = 200
 
@@ -185,6 +185,7 @@ def _effects(value: Any) -> list[str]:
     return [*value]
 
 
+#: Keys that stand above the sections.
 HEADER = {
     declared.name: declared for declared in (
         Declared("title", (str,), "", "title", reads=_title),
@@ -193,7 +194,6 @@ HEADER = {
         Declared(parameters.EFFECTS_KEY, (list,), (), "plug-ins", reads=_effects),
     )
 }
-"""Keys that stand above the sections."""
 
 
 def section_of(name: str, known: Mapping[str, Parameter] = PARAMETERS) -> str:

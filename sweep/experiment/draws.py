@@ -33,11 +33,11 @@ from sweep.typing import Floats, Integers
 # that depends on the digits before it. So each point is uniform, and replicates with scrambles of
 # their own are independent.
 
+#: Independent randomisations; the trial modulo this is the number of a trial's replicate.
 REPLICATES = 16
-"""Independent randomisations; the trial modulo this is the number of a trial's replicate."""
 
+#: Binary digits of a point; those beyond are random.
 BITS = 32
-"""Binary digits of a point; those beyond are random."""
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _ONE = np.uint64(1)
@@ -118,12 +118,12 @@ CENTRE = ("x_m", "y_m")
 SHARES = ("frame_x", "frame_y")
 SHIFTS = ("shift_u_px", "shift_v_px")
 
+#: The parameters that :func:`distance_of_side` needs.
 DISTANCE_PARAMETERS = (*VIEW_PARAMETERS, "size_m", "side_px")
-"""The parameters that :func:`distance_of_side` needs."""
 
+#: Decimals of degrees to which resolved angles enter the geometry key: they have rounding errors
+#: where angles that are given have none.
 KEY_DECIMALS = 10
-"""Decimals of degrees to which resolved angles enter the geometry key: they have rounding errors
-where angles that are given have none."""
 
 
 def distance_of_side(values: Mapping[str, Any]) -> Any:
@@ -320,6 +320,7 @@ def _bearings(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
 
 _POSITION = ("distance_m", *CENTRE, *BEARINGS, *SHIFTS, *VIEW_PARAMETERS)
 
+#: Every step, each after those that make what it reads.
 STEPS = (
     Step(("side_px",), (*VIEW_PARAMETERS, "size_m"), ("distance_m",), _from_side),
     Step(WORLD, (), (*ANGLES, *CENTRE, "distance_m"), _from_world),
@@ -328,7 +329,6 @@ STEPS = (
                   "quiet_zone_modules", "dictionary"), CENTRE, _from_frame),
     Step(("view_angle_deg",), ("azimuth_deg", "roll_deg", *_POSITION), ANGLES, _from_view_angle),
 )
-"""Every step, each after those that make what it reads."""
 
 _TO_BEARINGS = Step(CENTRE, ("distance_m", *BEARINGS), BEARINGS, _bearings)
 
@@ -411,8 +411,8 @@ def _hash(text: str) -> np.uint64:
     return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))
 
 
+#: How the draws of a cell's trials relate: not at all, or so that they fill their space evenly.
 SAMPLINGS = ("independent", "sobol")
-"""How the draws of a cell's trials relate: not at all, or so that they fill their space evenly."""
 
 
 def uniform(
@@ -443,8 +443,8 @@ def bits(
 # --------------------------------------------------------------------------------------------------
 # Draws of a calibration: the camera's numbers as an estimator believes them.
 
+#: Begins the names of numbers that a calibration gives, among a scene's values.
 CALIBRATED = "calibrated_"
-"""Begins the names of numbers that a calibration gives, among a scene's values."""
 
 NORMAL = Distribution("normal", 0.0, 1.0)
 

@@ -49,20 +49,20 @@ def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     return Column.of([part[index] for index in (indices - low).tolist()])
 
 
+#: Values of what differs from marker to marker in a photograph, as if it did not.
 ANY_MARKER = {
     name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
 }
-"""Values of what differs from marker to marker in a photograph, as if it did not."""
 
 
 def _names(declaring: type) -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(declaring))
 
 
+#: Parameters of the scene's stage that do not change its image.
 NOT_IN_IMAGE = {
     "window", "camera_file", "calibration_sd", "calibration_covariance", *_names(BoundSetting),
 }
-"""Parameters of the scene's stage that do not change its image."""
 
 
 def _made(declaring: type[T], values: Mapping[str, Any]) -> T:
@@ -285,11 +285,11 @@ class Experiment:
 # --------------------------------------------------------------------------------------------------
 # The settings that a configuration uses: an axis may hold others, which change nothing for it.
 
+#: Solver on pixels -> the settings that it has beside those of all solvers.
 PIXEL_SETTINGS = {
     "photometric": frozenset({"refined_starts", "estimate_blur"}),
     "photometric_real": frozenset({"refined_starts", "estimate_tone"}),
 }
-"""Solver on pixels -> the settings that it has beside those of all solvers."""
 
 
 def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -382,17 +382,17 @@ def _differs(believed: Any, truth: Any) -> bool:
     return bool((canonical_distortion(believed) if lens else believed) != truth)
 
 
+#: Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere.
 MAX_SAMPLE = 600
-"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
 
+#: The most corners of a grid that are looked at.
 MAX_CORNERS = 200
-"""The most corners of a grid that are looked at."""
 
+#: Distance of the principal point from the frame's centre, as a share of its side, that is told.
 OFF_CENTRE = 0.15
-"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
 
+#: Share of poses that is told.
 MIN_SHARE = 0.01
-"""Share of poses that is told."""
 
 
 def _ends(numbers: Floats) -> tuple[float, float]:

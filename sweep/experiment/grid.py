@@ -22,14 +22,14 @@ from sweep.model.calibration import CalibrationError
 from sweep.plugins.declared import DeclaredPlugin
 from sweep.typing import Floats
 
+#: The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ...
 TRIAL = "trial"
-"""The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ..."""
 
+#: The longest axis (``range`` and ``trial``; they are never written out).
 MAX_VALUES = 10**9
-"""The longest axis (``range`` and ``trial``; they are never written out)."""
 
+#: The longest axis of any other form; also the most values of all such axes together.
 MAX_LISTED = 10**6
-"""The longest axis of any other form; also the most values of all such axes together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +128,8 @@ class Axis:
         return np.array(part, dtype=self.kind)
 
 
+#: The largest distance of a normal draw of 53 bits from its mean, in standard deviations.
 MAX_DEVIATIONS = 8.3
-"""The largest distance of a normal draw of 53 bits from its mean, in standard deviations."""
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
@@ -156,13 +156,13 @@ class Distribution:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
 
+#: Forms in which the values of an axis are generated -> their numbers, in words.
 AXIS_FORMS = {
     "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
     "arange": "[start, stop, step], half-open",
     "linspace": "[first, last, count], both inclusive",
     "geom": "[first, last, count], both inclusive, above 0",
 }
-"""Forms in which the values of an axis are generated -> their numbers, in words."""
 
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
 

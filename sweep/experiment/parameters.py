@@ -34,6 +34,7 @@ class Stage(IntEnum):
     estimation = 2
 
 
+#: Section of a pipeline file -> the dataclasses that declare its parameters, and its stage.
 SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "camera": ((Camera,), Stage.scene),
     "marker": ((Marker,), Stage.scene),
@@ -43,10 +44,9 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "detector": ((DetectorChoice, DetectorSetting, BoardDetectorSetting), Stage.detection),
     "estimator": ((EstimatorSetting,), Stage.estimation),
 }
-"""Section of a pipeline file -> the dataclasses that declare its parameters, and its stage."""
 
+#: Sections whose values make up the geometry key of the random draws.
 GEOMETRY_SECTIONS = ("camera", "marker", "pose")
-"""Sections whose values make up the geometry key of the random draws."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,33 +57,35 @@ class Parameter(Declared):
     stage: Stage = Stage.scene
 
 
+#: Every parameter by its name; names are unique over all sections.
 PARAMETERS: dict[str, Parameter] = {
     name: converted(each, Parameter, section=section, stage=stage)
     for section, (declaring, stage) in SECTIONS.items() for group in declaring
     for name, each in declared_fields(group).items()
 }
-"""Every parameter by its name; names are unique over all sections."""
 
 
 # --------------------------------------------------------------------------------------------------
 # Parameters that say the same in different ways: one of the ways is given, not two.
 
+#: Parameters that place the camera and the marker in the world.
 WORLD = tuple(
     f"{whose}_{name}" for whose in ("camera", "marker")
     for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 )
-"""Parameters that place the camera and the marker in the world."""
 
+#: Parameters that place the marker in the camera's frame.
 IN_CAMERA = tuple(
     p.name for p in PARAMETERS.values()
     if p.section == "pose" and p.name not in (*WORLD, "jitter_px")
 )
-"""Parameters that place the marker in the camera's frame."""
 
 SENSOR_SIDES = ("sensor_width_mm", "sensor_height_mm")
 IN_MM = (*SENSOR_SIDES, "focal_length_mm", "pixel_size_um")
 FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg", "dfov_deg")
 
+#: The ways, each of one or more parameters, in which a quantity of the pose in the camera's frame,
+#: of the camera, or of what is believed of it is given: one of them, not two.
 CHOICES: tuple[tuple[tuple[str, ...], ...], ...] = (
     (("distance_m",), ("side_px",)),
     (("bearing_x_deg",), ("x_m",), ("frame_x",)),
@@ -94,21 +96,22 @@ CHOICES: tuple[tuple[tuple[str, ...], ...], ...] = (
     (SENSOR_SIDES, ("pixel_size_um",)),
     (("believed_focal_scale",), ("believed_fx_px", "believed_fy_px")),
 )
-"""The ways, each of one or more parameters, in which a quantity of the pose in the camera's frame,
-of the camera, or of what is believed of it is given: one of them, not two."""
 
+#: The parameter that takes poses and images from a record of photographs.
 PHOTOGRAPHS = "photographs"
-"""The parameter that takes poses and images from a record of photographs."""
 
+#: The parameters that say how far a calibration is from the truth.
 STATED = ("calibration_sd", "calibration_covariance")
-"""The parameters that say how far a calibration is from the truth."""
 
+#: The parameter that takes from such a record the poses alone.
 SIMULATED = "simulated"
-"""The parameter that takes from such a record the poses alone."""
 
+#: The parameters that cannot be an axis.
 ONE_VALUE = ("camera_file", *STATED, SIMULATED, "ids", "markers", "distractors")
-"""The parameters that cannot be an axis."""
 
+#: Parameter of one of the ways -> those of the other ways.
+#:
+#: >>> sorted(RIVALS["yaw_deg"]) ['azimuth_deg', 'tilt_deg', 'view_angle_deg']
 RIVALS: dict[str, frozenset[str]] = {
     name: frozenset(
         other for ways in CHOICES for way in ways
@@ -116,11 +119,6 @@ RIVALS: dict[str, frozenset[str]] = {
     )
     for choice in CHOICES for each in choice for name in each
 }
-"""Parameter of one of the ways -> those of the other ways.
-
->>> sorted(RIVALS["yaw_deg"])
-['azimuth_deg', 'tilt_deg', 'view_angle_deg']
-"""
 
 
 def is_zip(value: Any) -> bool:
@@ -131,14 +129,14 @@ def is_zip(value: Any) -> bool:
 # --------------------------------------------------------------------------------------------------
 # The plug-ins that a document names, and their settings as parameters beside our own.
 
+#: Kind of plug-in -> the parameter whose values name it.
 NAMED_BY = {each.plugin: each for each in PARAMETERS.values() if each.plugin}
-"""Kind of plug-in -> the parameter whose values name it."""
 
+#: The key above the sections that names effects.
 EFFECTS_KEY = "effects"
-"""The key above the sections that names effects."""
 
+#: The keys whose values name plug-ins.
 NAMING = (EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values()))
-"""The keys whose values name plug-ins."""
 
 
 def section_of_settings(kind: str) -> str:

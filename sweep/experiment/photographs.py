@@ -91,8 +91,8 @@ def board_of(document: Mapping[str, Any], source: str) -> Board:
 # --------------------------------------------------------------------------------------------------
 # The record: a file of arrays, which is read once in each process.
 
+#: End of the name of a record's file.
 SUFFIX = ".photographs.npz"
-"""End of the name of a record's file."""
 
 POSE = 6
 
@@ -167,18 +167,18 @@ def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
     return record
 
 
+#: Files of records.
 PHOTOGRAPH_RECORDS = ArrayFile("a record of photographs that `sweep photos` writes", 2, {
     "paths": ("U", ("P",)), "digests": ("U", ("P",)), "part": ("U", ()),
     "marker_id": ("i8", ("M",)), "rotation": ("f8", ("P", "M", 3, 3)),
     "translation": ("f8", ("P", "M", 3)), "std": ("f8", ("P", "M", POSE)),
     "source": ("u1", ("P", "M")), "board": ("U", ()), "size": ("i8", (2,)),
 }, _made)
-"""Files of records."""
 
 
+#: Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing
+#: farther out influences the marker's corners.
 BESIDE_MODULES = 4.0
-"""Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing
-farther out influences the marker's corners."""
 
 
 @lru_cache(maxsize=8)

@@ -45,8 +45,8 @@ from sweep.plugins.recording import is_recording
 # Two kinds of rules: of values that cannot meet on the grid, and of parameters that have no place
 # somewhere. A parameter whose own value is at fault is passed over: its fault is known already.
 
+#: Notes the faults of a document that break a rule.
 Check = Callable[[Reading], None]
-"""Notes the faults of a document that break a rule."""
 
 
 def apart(
@@ -109,11 +109,11 @@ def _is_calibrated(reading: Reading) -> bool:
 
 SEVERAL_PLANES = "for prints with z_m or tilt_deg"
 
+#: The ways to give a camera beside focal lengths in pixels, and beside a file.
 OTHER_WAYS = (*parameters.IN_MM, *parameters.FIELDS_OF_VIEW)
-"""The ways to give a camera beside focal lengths in pixels, and beside a file."""
 
+#: Parameter -> those of which one must be given beside it, or one of a rival way.
 PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
-"""Parameter -> those of which one must be given beside it, or one of a rival way."""
 
 RECORDS: tuple[Check, ...] = (
     *(absent((name,), _without(*others, *parameters.RIVALS.get(name, ())),
@@ -187,8 +187,8 @@ RECORDS: tuple[Check, ...] = (
 # in millimetres (with the sensor's sides or the size of a pixel), or a calibration's file. The
 # file's values are written into the pipeline's text: a store does not need the file any more.
 
+#: The parameters whose values a camera file has.
 FILE_VALUES = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
-"""The parameters whose values a camera file has."""
 
 
 def file_and_camera(written: str, is_file: Callable[[str], bool]) -> tuple[str, str]:
@@ -335,8 +335,8 @@ def photographs_alone(reading: Reading) -> None:
 # --------------------------------------------------------------------------------------------------
 # Targets: boards, what is beside them, what can search and solve them.
 
+#: The most boards of a grid: all are checked before anything is computed.
 MAX_BOARDS = 10_000
-"""The most boards of a grid: all are checked before anything is computed."""
 
 def boards_can_be_printed(reading: Reading) -> None:
     """Demand what each kind of board needs, and boards whose parts do not overlap."""
@@ -449,6 +449,7 @@ def something_random_to_repeat(reading: Reading) -> None:
                       "points each, best a power of two")
 
 
+#: Names in datasets and tables that no axis may take.
 RESERVED = {
     *VARIABLES, *LABELS, *HEADER, *parameters.SECTIONS, "axes", TRIAL,
     *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
@@ -457,7 +458,6 @@ RESERVED = {
     "image_y_px",
     "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",
 }
-"""Names in datasets and tables that no axis may take."""
 
 
 def names_are_free(reading: Reading) -> None:
@@ -471,11 +471,11 @@ def names_are_free(reading: Reading) -> None:
                          "one")
 
 
+#: The largest grid.
 MAX_POSES = 10**12
-"""The largest grid."""
 
+#: The most configurations: they are listed, and each has its share of every block.
 MAX_CONFIGURATIONS = 10_000
-"""The most configurations: they are listed, and each has its share of every block."""
 
 
 def size_of_the_grid(reading: Reading) -> None:
@@ -507,11 +507,11 @@ RULES: tuple[Callable[[Reading], None], ...] = (
 # --------------------------------------------------------------------------------------------------
 # Values that replace those of a pipeline document: ``--set`` changes it, ``--at`` fixes it.
 
+#: Parameter -> those that say the same in another way: choosing it drops them.
 ALTERNATIVES: dict[str, Collection[str]] = {
     **parameters.RIVALS, "camera_file": (*FILE_VALUES, *STATED, *OTHER_WAYS),
     TRIAL: (MAX_TRIALS,), f"{SEARCH}.{MAX_TRIALS}": (TRIAL,),
 }
-"""Parameter -> those that say the same in another way: choosing it drops them."""
 
 
 def parse_settings(
@@ -857,8 +857,8 @@ def _checked(
 # --------------------------------------------------------------------------------------------------
 # A cell of a grid, selected by its coordinates: ``distance_m=0.3,tilt_deg=45``.
 
+#: A part between commas; commas within a list or within quotes do not separate.
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
-"""A part between commas; commas within a list or within quotes do not separate."""
 
 _TRIAL = Declared(TRIAL, (int,), 0, "number of the draw", low=0, high=1e18)
 

@@ -21,8 +21,8 @@ from sweep.messages import nearest, shown
 # --------------------------------------------------------------------------------------------------
 # Numbers of trials at which waves end: after each, it is decided what else is needed.
 
+#: A wave has about one trial for so many of those before it, at least one unit.
 GROWTH = 4
-"""A wave has about one trial for so many of those before it, at least one unit."""
 
 
 def wave_ends(max_trials: int, unit: int) -> tuple[int, ...]:
@@ -48,8 +48,8 @@ def wave_ends(max_trials: int, unit: int) -> tuple[int, ...]:
 # on its number alone, and a search decides only which trials are computed.
 
 CHOICES = ("smallest", "largest", "cheapest")
+#: Keys that say what is searched, one in a section.
 KINDS = ("along", *CHOICES, "precision")
-"""Keys that say what is searched, one in a section."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,20 +197,20 @@ def read_requirement(text: object) -> RequirementText:
 # --------------------------------------------------------------------------------------------------
 # Keys of the sections, each with what reads its value, or raises ValueError with what is expected.
 
+#: What may be required beside quantities where a choice is made: the time of a frame.
 BUDGET = "budget_ms"
-"""What may be required beside quantities where a choice is made: the time of a frame."""
 
+#: The key with the most trials, the length of the axis ``trial``.
 MAX_TRIALS = "max_trials"
-"""The key with the most trials, the length of the axis ``trial``."""
 
+#: What is expected where nothing says how many trials there are at most.
 NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
-"""What is expected where nothing says how many trials there are at most."""
 
+#: Draws of a condition in the first wave, about: all pooled cells together.
 FIRST_DRAWS = 50
-"""Draws of a condition in the first wave, about: all pooled cells together."""
 
+#: The same of a value of the axis along which a limit is searched.
 COARSE_DRAWS = 40
-"""The same of a value of the axis along which a limit is searched."""
 
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
@@ -250,8 +250,8 @@ def _keys(**readers: Callable[[Any], Any]) -> dict[str, Declared]:
             for name, reads in readers.items()}
 
 
+#: Texts that all must hold, and the axes whose values are conditions at which they must.
 REQUIRE_KEYS = _keys(all=_texts('["detection >= 0.99"]', least=1), per=_texts('["distance_m"]'))
-"""Texts that all must hold, and the axes whose values are conditions at which they must."""
 
 SEARCH_KEYS = {
     **{name: Declared(name, (str,), None, "an axis") for name in ("along", "smallest", "largest")},

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 # xarray labels the axes of its charts by ``long_name [units]``: a sentence there would be cut
 # off. So ``long_name`` is the variable's name in words, and ``description`` says what it means.
 
+#: The unit at the end of a name, or before the end of an interval.
 UNIT = re.compile(r"_(m_s|deg_s|deg|rad|percent|px|mm|um|ms|m|s|e|grey|modules)(?=_low$|_high$|$)")
-"""The unit at the end of a name, or before the end of an interval."""
 
 def short_name(name: str, units: str = "") -> str:
     """Return a variable's name in words, without its unit if it has one.
@@ -75,15 +75,15 @@ def with_descriptions(dataset: xr.Dataset) -> xr.Dataset:
 # --------------------------------------------------------------------------------------------------
 # Coordinates of the dataset beside its axes: what is fixed, and what is drawn for each scene.
 
+#: Sections whose fixed parameters are coordinates also where the file does not give them.
 ALWAYS_GIVEN = ("marker", "pose")
-"""Sections whose fixed parameters are coordinates also where the file does not give them."""
 
+#: Size of a camera's numbers in pixels by which rounding of a calibration's is measured.
 CALIBRATION_SCALE_PX = 1e4
-"""Size of a camera's numbers in pixels by which rounding of a calibration's is measured."""
 
 
+#: Attribute of the coordinates of fixed parameters; tables of analyses leave them out.
 FIXED = "fixed"
-"""Attribute of the coordinates of fixed parameters; tables of analyses leave them out."""
 
 
 def fixed_values(pipeline: Grid) -> dict[str, tuple[float | bool | str, dict[str, str]]]:
@@ -116,11 +116,11 @@ CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
 
 POSE_PARAMETERS = tuple(f"{part}_{axis}" for part in ("rotation", "translation") for axis in XYZ)
 
+#: Coordinates of the dimensions that are no axes; of boards' they are numbers, from 0 on.
 LABELS: dict[str, tuple[str, ...]] = {
     "corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ, "pose_parameter": POSE_PARAMETERS,
     "marker": (), "chessboard_corner": (),
 }
-"""Coordinates of the dimensions that are no axes; of boards' they are numbers, from 0 on."""
 
 
 def cf_attributes(
@@ -177,29 +177,29 @@ class Tolerance:
     limit: float = 0.0
 
 
+#: Detections of a scene for which not even the truth may be known.
 LOST = (
     DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed,
     DetectionStatus.not_in_photograph,
 )
-"""Detections of a scene for which not even the truth may be known."""
 
+#: Detections of a scene in which a corner may be behind the camera: the marker has no image.
 UNSEEN = (*LOST, DetectionStatus.not_visible)
-"""Detections of a scene in which a corner may be behind the camera: the marker has no image."""
 
+#: Of the true pose (relative to its length) and of the marker's area.
 TRUTH_RTOL = 1e-12
-"""Of the true pose (relative to its length) and of the marker's area."""
 
+#: Of the accuracy bound's numbers: they pass through the inverse of a 6 x 6 matrix.
 BOUND_RTOL = 1e-6
-"""Of the accuracy bound's numbers: they pass through the inverse of a 6 x 6 matrix."""
 
+#: Of corners and of the reprojection error.
 CORNER_ATOL_PX = 1e-2
-"""Of corners and of the reprojection error."""
 
+#: Also, in degrees, of the angles that follow from the rotation: they change by no more.
 ROTATION_ATOL_RAD = 1e-4
-"""Also, in degrees, of the angles that follow from the rotation: they change by no more."""
 
+#: Relative to the marker's distance.
 TRANSLATION_RTOL = 1e-4
-"""Relative to the marker's distance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,6 +323,7 @@ _POSE, _MAYBE_POSE = FlagRule("estimate", "always"), FlagRule("estimate", "only"
 _EQUAL = Tolerance("equal")
 _ANGLE = Tolerance("absolute", math.degrees(ROTATION_ATOL_RAD))
 
+#: Every variable, in the order in which the stages make them.
 SCHEMA: tuple[Variable, ...] = (
     Variable("true_rvec", _S, "f8", "true rotation vector, marker to camera", "radian", ("xyz",),
              present_when=_TRUTH, tolerance=Tolerance("length", TRUTH_RTOL)),
@@ -387,8 +388,8 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
              flags=flags.Flipped),
 )
-"""Every variable, in the order in which the stages make them."""
 
+#: The variables that stores of boards have besides; those of :data:`NOT_OF_BOARDS` they lack.
 BOARD_SCHEMA: tuple[Variable, ...] = (
     Variable("board_marker_id", _S, "f4", "ID of each marker of the board, in the board's order",
              inner=("marker",)),
@@ -404,12 +405,11 @@ BOARD_SCHEMA: tuple[Variable, ...] = (
     Variable("point_count", _E, "f4", "points that the pose was estimated from",
              present_when=_POSE),
 )
-"""The variables that stores of boards have besides; those of :data:`NOT_OF_BOARDS` they lack."""
 
 NOT_OF_BOARDS = frozenset({"corner_error_px"})
 
+#: Every variable by its name, those of boards included.
 VARIABLES = {each.name: each for each in (*SCHEMA, *BOARD_SCHEMA)}
-"""Every variable by its name, those of boards included."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -427,6 +427,7 @@ def _drawn(name: str, meaning: str, unit: str, scale: float = 0.0, drawn_as: str
                     tolerance=tolerance, drawn_as=drawn_as or name)
 
 
+#: The variables that stores of photographs have besides.
 PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
     _drawn("side_px", "side of the black square if it were parallel to the image plane", "px"),
     _drawn("distance_m", "depth of the marker's centre along the optical axis", "m"),
@@ -440,7 +441,6 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
              "radian, m", ("pose_parameter",),
              tolerance=Tolerance("relative", 1e-6)),
 )
-"""The variables that stores of photographs have besides."""
 
 
 def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:

@@ -40,12 +40,12 @@ from sweep.typing import Floats, Integers, Masks
 # --------------------------------------------------------------------------------------------------
 # Means over photographs, each of which is one draw, and their intervals.
 
+#: Photographs from one line of progress to the next.
 SAID = 5
-"""Photographs from one line of progress to the next."""
 
+#: Photographs from which intervals are given: with three, Student's are 2.5 standard deviations of
+#: a photograph wide on each side, and their spread is known to a factor of 6.
 MIN_PHOTOGRAPHS = 4
-"""Photographs from which intervals are given: with three, Student's are 2.5 standard deviations of
-a photograph wide on each side, and their spread is known to a factor of 6."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +142,8 @@ class CameraFit:
         ]
 
 
+#: Is told, in a line, how far a fit is.
 Say = Callable[[str], None]
-"""Is told, in a line, how far a fit is."""
 
 
 def fit_camera(
@@ -215,8 +215,8 @@ class EdgeField:
         )
 
 
+#: Correlation lengths that are compared, in modules.
 EDGE_LENGTHS = np.geomspace(0.1, 3.0, 60)
-"""Correlation lengths that are compared, in modules."""
 
 
 def _edge_means() -> tuple[Floats, Floats]:
@@ -269,15 +269,15 @@ def edge_field(shifts: Sequence[EdgeShifts], module_px: float) -> EdgeField:
 # The intervals are the jackknife's by photograph, of logarithms (Efron and Stein, "The jackknife
 # estimate of variance", Annals of Statistics 9, 1981).
 
+#: Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
+#: longer ones: their size cannot be said.
 LENGTHS = np.geomspace(0.01, 0.4, 24)
-"""Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
-longer ones: their size cannot be said."""
 
+#: Cells along each side of a marker in which the field is taken as constant.
 CELLS = 6
-"""Cells along each side of a marker in which the field is taken as constant."""
 
+#: Markers of a photograph from which their shifts are seen beside the pose's.
 MIN_SHIFTED_MARKERS = 3
-"""Markers of a photograph from which their shifts are seen beside the pose's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -446,8 +446,8 @@ def _matched(squares: Floats, fields: Floats) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # The terms of a scene: the estimate of each, and whether it is kept.
 
+#: Significant digits of the values that are written.
 DIGITS = 4
-"""Significant digits of the values that are written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -529,13 +529,13 @@ def judged(
 # --------------------------------------------------------------------------------------------------
 # A camera's scene from photographs of known markers: every term with its interval.
 
+#: Markers of a photograph that are fitted: more of them narrow the intervals little, since
+#: photographs differ by more than the estimates of one.
 MARKERS = 12
-"""Markers of a photograph that are fitted: more of them narrow the intervals little, since
-photographs differ by more than the estimates of one."""
 
 
+#: Effects that are absent unless needed -> their parameter of a photograph's fit.
 FITTED = {"sharpening": AMOUNT, "bloom": BLOOM}
-"""Effects that are absent unless needed -> their parameter of a photograph's fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

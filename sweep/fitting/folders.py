@@ -43,21 +43,22 @@ from sweep.typing import Floats, Integers
 # show each effect, so one is left out only where the gap between the errors of photographs and
 # simulation is clearly narrower without it, and without all such effects together.
 
+#: Held-out photographs from which errors have intervals.
 MIN_HELD_OUT = 5
-"""Held-out photographs from which errors have intervals."""
 
+#: Markers of a photograph whose errors are compared.
 MAX_MARKERS = 12
-"""Markers of a photograph whose errors are compared."""
 
+#: Simulations of each photograph. With one, the simulation's own random errors decide whether an
+#: effect narrows the gap. Effects that move no error (light, the noise's correlation) changed it by
+#: ± 0.02 half-widths of the intervals (standard deviation) with eight.
 REPEATS = 4
-"""Simulations of each photograph. With one, the simulation's own random errors decide whether an
-effect narrows the gap. Effects that move no error (light, the noise's correlation) changed it by
-± 0.02 half-widths of the intervals (standard deviation) with eight."""
 
+#: Half-widths of the intervals by which the mean gap is narrower without an effect that is left
+#: out: a standard deviation of the photographs' own random errors. Of rendered photographs, gaps
+#: were narrower by 0.11 and 0.15 without a sharpening and a bloom with which they had been
+#: rendered.
 CLEARLY = 0.5
-"""Half-widths of the intervals by which the mean gap is narrower without an effect that is left
-out: a standard deviation of the photographs' own random errors. Of rendered photographs, gaps were
-narrower by 0.11 and 0.15 without a sharpening and a bloom with which they had been rendered."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,9 +170,9 @@ def held_out(
 
 CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
 
+#: Share of the photographs' bearings that the poses of the pipeline keep to, lest their markers be
+#: cut by the frame.
 MAX_BEARING = 0.8
-"""Share of the photographs' bearings that the poses of the pipeline keep to, lest their markers be
-cut by the frame."""
 
 TRIALS = 200
 
@@ -258,14 +259,14 @@ def numbers_text(term: Term) -> str:
 
 PathName = str | os.PathLike[str]
 
+#: Settings of the markers in the photographs; others set the comparison.
 OF_MARKERS = ("dictionary", "size_m")
-"""Settings of the markers in the photographs; others set the comparison."""
 
+#: Detector settings that the check compares unless others are given.
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
-"""Detector settings that the check compares unless others are given."""
 
+#: Effects that are kept where the errors of photographs that were not fitted say so.
 SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
-"""Effects that are kept where the errors of photographs that were not fitted say so."""
 
 NOT_NEEDED = "errors are clearly nearer to those of photographs that were not fitted without it"
 

@@ -26,25 +26,25 @@ from sweep.typing import Floats, Masks
 # spread, amount and bloom are the photograph's. All are one vector: the shifts of the corners from
 # their true places, right and down in turn, then b and c, then the photograph's.
 
+#: Parameters of a marker: the shifts of its four corners, then b and c; with the photograph's.
 CORNERS, OWN, ALL = 8, 10, 13
-"""Parameters of a marker: the shifts of its four corners, then b and c; with the photograph's."""
 
+#: Parameters of a photograph: variance of the point spread in px², amount of sharpening, bloom.
 VARIANCE, AMOUNT, BLOOM = range(3)
-"""Parameters of a photograph: variance of the point spread in px², amount of sharpening, bloom."""
 
+#: Radius of the sharpening: what ``sharpening_px`` is unless it is given.
 RADIUS_PX = 1.0
-"""Radius of the sharpening: what ``sharpening_px`` is unless it is given."""
 
+#: Markers whose corners end farther than this from the truth are left out: they are covered, or
+#: their true pose is wrong.
 MAX_SHIFT_PX = 2.0
-"""Markers whose corners end farther than this from the truth are left out: they are covered, or
-their true pose is wrong."""
 
 LOW = np.array([*[-2 * MAX_SHIFT_PX] * CORNERS, -np.inf, -np.inf, 0.02, -0.95, -0.95])
+#: Range of the parameters.
 HIGH = np.array([*[2 * MAX_SHIFT_PX] * CORNERS, np.inf, np.inf, 100.0, 10.0, 0.95])
-"""Range of the parameters."""
 
+#: The photograph's parameters at which a fit starts.
 START = np.array([0.5, 0.0, 0.0])
-"""The photograph's parameters at which a fit starts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,15 +180,15 @@ def products(columns: Floats) -> Floats:
 # The fit of one photograph: each marker by itself, then the photograph's parameters by Gauss-Newton
 # steps with all markers' own ones eliminated.
 
+#: Most steps of a marker's fit, and steps of the photograph's parameters.
 MAX_STEPS, ROUNDS = 30, 2
-"""Most steps of a marker's fit, and steps of the photograph's parameters."""
 
+#: Markers whose residuals are so many times the median marker's of the photograph are left out;
+#: something lies on them.
 OUTLIER = 2.5
-"""Markers whose residuals are so many times the median marker's of the photograph are left out;
-something lies on them."""
 
+#: Difference of white and black in grey levels below which there is no marker in the pixels.
 MIN_CONTRAST = 5.0
-"""Difference of white and black in grey levels below which there is no marker in the pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,11 +291,11 @@ def _good(states: Sequence[MarkerState]) -> list[MarkerState]:
 # A fit takes a part of the noise into its parameters: of a pixel the share that its derivatives
 # explain, the diagonal of QQᵀ with their orthonormal columns Q. It is computed and added.
 
+#: Slope of the share of white, and its distance from 0 or 1, below which a pixel is flat.
 FLAT_PER_PX, FLAT_SHARE = 5e-3, 0.03
-"""Slope of the share of white, and its distance from 0 or 1, below which a pixel is flat."""
 
+#: Flat pixels of a photograph, of one colour, from which its noise is estimated.
 MIN_PIXELS = 100
-"""Flat pixels of a photograph, of one colour, from which its noise is estimated."""
 
 
 def photograph_noise(states: Sequence[MarkerState]) -> Floats:
@@ -325,11 +325,11 @@ def photograph_noise(states: Sequence[MarkerState]) -> Floats:
 # Edges of both polarities that are shifted alike are a field of shifts; edges that all move
 # towards white are the marker's own bloom, which is taken off.
 
+#: Half widths across and along the edge of the pixels that say where a module's edge is.
 REACH_MODULES, ALONG_MODULES = 0.5, 0.4
-"""Half widths across and along the edge of the pixels that say where a module's edge is."""
 
+#: Share of the whole step from black to white from which pixels count as an edge.
 STEP_SHARE = 0.6
-"""Share of the whole step from black to white from which pixels count as an edge."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,16 +76,16 @@ def photograph_scenes(pipeline: Pipeline) -> PhotographScenes:
 # --------------------------------------------------------------------------------------------------
 # The image of printed edges in pixels, and its slopes.
 
+#: Values of outside, black and white in the image of the share of white.
 WHITE_SHARE = np.array([0.0, 0.0, 1.0])
-"""Values of outside, black and white in the image of the share of white."""
 
+#: The projection of edges that are given in pixels.
 IN_PIXELS = Projection(
     np.eye(3), Optics(np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(24), distorted=False)
 )
-"""The projection of edges that are given in pixels."""
 
+#: Least length of the pieces in which edges are integrated.
 PANEL_PX = 0.4
-"""Least length of the pieces in which edges are integrated."""
 
 
 class Drawn(NamedTuple):
@@ -117,19 +117,19 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
 # --------------------------------------------------------------------------------------------------
 # Pixels that are fitted: of some markers, well spread over each frame.
 
+#: Pixels around the fitted ones within which print is in the model: what blur and sharpening carry
+#: inwards.
 MODELLED_PX = 10.0
-"""Pixels around the fitted ones within which print is in the model: what blur and sharpening
-carry inwards."""
 
+#: Pixels that get more than this share from outside the print through that point spread are left
+#: out: nothing is known of what lies there.
 OUTSIDE_BLUR_PX, OUTSIDE_SHARE = 2.0, 1e-3
-"""Pixels that get more than this share from outside the print through that point spread are left
-out: nothing is known of what lies there."""
 
+#: Level from which white is taken to be cut off; compression moves it a little.
 SATURATED = 254.0
-"""Level from which white is taken to be cut off; compression moves it a little."""
 
+#: Side of a marker below which its pixels say too little.
 MIN_SIDE_PX = 12.0
-"""Side of a marker below which its pixels say too little."""
 
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -106,8 +106,8 @@ def computable(store: RunStore) -> Pipeline:
 # of those of a pipeline of extremes, lie outside them, because a last bit can decide between two
 # minima.
 
+#: Variable -> values of one scene, of its inner dimensions last.
 Values = Mapping[str, NDArray[Any]]
-"""Variable -> values of one scene, of its inner dimensions last."""
 
 
 def compare(

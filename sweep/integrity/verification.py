@@ -21,13 +21,7 @@ from sweep.execution.waves import InWaves
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, selection_text
-from sweep.integrity.reproduction import (
-    StoredValues,
-    compare,
-    computable,
-    is_same,
-    stored_values,
-)
+from sweep.integrity.reproduction import StoredValues, compare, computable, is_same, stored_values
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -111,8 +105,8 @@ class IntegrityReport:
 # --------------------------------------------------------------------------------------------------
 # Blocks: every chunk fits the checksum at its end, and the receipt lists the same.
 
+#: Blocks that are read and checked at a time, and that are submitted at a time.
 THREADS, WINDOW = 4, 256
-"""Blocks that are read and checked at a time, and that are submitted at a time."""
 
 
 def check_blocks(
@@ -170,21 +164,21 @@ def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport
 # --------------------------------------------------------------------------------------------------
 # Scenes of sound blocks that are recomputed and compared.
 
+#: Largest share of the scenes recomputed on another processor that may differ.
 MAX_OUTSIDE = 0.1
-"""Largest share of the scenes recomputed on another processor that may differ."""
 
+#: That many scenes may differ however few were recomputed on another processor.
 MIN_OUTSIDE = 2
-"""That many scenes may differ however few were recomputed on another processor."""
 
+#: Scenes that are recomputed, in turns, where a recomputed one differs. They are searched and
+#: solved in calls of several scenes, where the first time each scene has calls of its own.
 REPEATED = 128
-"""Scenes that are recomputed, in turns, where a recomputed one differs. They are searched and
-solved in calls of several scenes, where the first time each scene has calls of its own."""
 
+#: Flags of scenes that are not recomputed: they ended their process.
 CRASHED = {"detection": DetectionStatus.crashed, "estimate": EstimateStatus.crashed}
-"""Flags of scenes that are not recomputed: they ended their process."""
 
+#: Number of a block, and of a scene within it.
 Scene = tuple[int, int]
-"""Number of a block, and of a scene within it."""
 
 
 def check_scenes(
@@ -340,8 +334,8 @@ def _at(store: RunStore, scene: Scene) -> str:
 # --------------------------------------------------------------------------------------------------
 # Verification of a store: its files, its blocks, and a sample.
 
+#: Scenes that are recomputed by default.
 SAMPLE = 20
-"""Scenes that are recomputed by default."""
 
 
 def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:

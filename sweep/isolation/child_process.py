@@ -26,17 +26,17 @@ from sweep.evaluation.machine_faults import machine_fault
 # --------------------------------------------------------------------------------------------------
 # Child processes: how many, on one thread each, and how they ended.
 
+#: Variables of a child process. Parallelism is over blocks: a process computes on one thread.
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENCV_FOR_THREADS_NUM": "1",
 }
-"""Variables of a child process. Parallelism is over blocks: a process computes on one thread."""
 
+#: Signals that the system or its users send, too little memory or space among their reasons: what a
+#: scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status.
 OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
-"""Signals that the system or its users send, too little memory or space among their reasons: what
-a scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status."""
 
 ADVICE = "use fewer workers, or give them more memory"
 
@@ -75,11 +75,11 @@ def explained(death: object) -> str:
 # The two are connected by a pair of sockets. Only what these two processes of one program send each
 # other is unpickled.
 
+#: How long after its limit a child that did not end itself is killed.
 GRACE_S = 30.0
-"""How long after its limit a child that did not end itself is killed."""
 
+#: How often a child looks whether its caller still lives.
 PARENT_S = 1.0
-"""How often a child looks whether its caller still lives."""
 
 
 class ChildError(Exception):
@@ -252,8 +252,8 @@ def _end_after(parent: int) -> None:
 # --------------------------------------------------------------------------------------------------
 # Ctrl-C that stops a run between two steps, never in the middle of one.
 
+#: How often Ctrl-C is checked while a result is awaited.
 POLL_S = 0.2
-"""How often Ctrl-C is checked while a result is awaited."""
 
 
 class Interrupts:

@@ -39,27 +39,27 @@ from sweep.typing import Masks
 # - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
 #   is compiled or loaded.
 
+#: Shares of a block's time limit: for the block, for a piece of it, for a part of a scene.
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
-"""Shares of a block's time limit: for the block, for a piece of it, for a part of a scene."""
 
+#: Additional time of the first call in a child: a share of the limit, at most so many seconds.
 LOADING, LOADING_S = 1 / 16, 15.0
-"""Additional time of the first call in a child: a share of the limit, at most so many seconds."""
 
+#: How many fresh processes a part of a scene must end, one after another, to be flagged; one that
+#: never returns counts for two.
 DEATHS = 3
-"""How many fresh processes a part of a scene must end, one after another, to be flagged; one that
-never returns counts for two."""
 
+#: Least time limit of a part of a scene.
 MIN_S = 1.0
-"""Least time limit of a part of a scene."""
 
+#: How long a child may take to start and to unpickle the pipeline.
 HOLD_S = 300.0
-"""How long a child may take to start and to unpickle the pipeline."""
 
+#: Into how many pieces a group of scenes is cut that crashed a process.
 PIECES = 64
-"""Into how many pieces a group of scenes is cut that crashed a process."""
 
+#: In the child: the pipeline whose cells are computed.
 _held: list[Pipeline] = []
-"""In the child: the pipeline whose cells are computed."""
 
 
 def _hold(pipeline: Pipeline) -> None:
@@ -80,8 +80,8 @@ class _IsolatedCells:
         self._limit_s = limit_s
         self._child: Child | None = None
         self._share = PART
+        #: Deaths that did not come again when the same part of a scene was repeated.
         self.chances: list[str] = []
-        """Deaths that did not come again when the same part of a scene was repeated."""
 
     def run(self, share: float, *arguments: Any) -> CellsResult:
         """Call ``run_cells`` with a share of the time limit.
@@ -318,11 +318,11 @@ def check_repeatable(
 # --------------------------------------------------------------------------------------------------
 # Plug-ins are used once before a run: one that cannot work refuses it, and costs no pose.
 
+#: Seconds that a plug-in may take to be made, and to search one blank frame.
 LIMIT_S = 60.0
-"""Seconds that a plug-in may take to be made, and to search one blank frame."""
 
+#: Settings of a plug-in that are tried.
 MAX_SETTINGS = 16
-"""Settings of a plug-in that are tried."""
 
 
 def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) -> None:

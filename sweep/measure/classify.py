@@ -128,17 +128,17 @@ class Quads(NamedTuple):
     ids: Integers
 
 
+#: Flags of a square in the order in which they tell most about its target.
 _NEAREST = (
     DetectionStatus.detected, DetectionStatus.wrong_id, DetectionStatus.rejected,
     DetectionStatus.no_candidate, DetectionStatus.not_visible, DetectionStatus.not_modelled,
 )
-"""Flags of a square in the order in which they tell most about its target."""
 
+#: The corners' order after each quarter turn, (4, 4).
 _TURNS = np.array([np.roll(np.arange(4), -turn) for turn in range(4)])
-"""The corners' order after each quarter turn, (4, 4)."""
 
+#: Pairs of a square and a quadrilateral that are compared at a time: they fit a cache.
 _MOST_PAIRS = 1 << 12
-"""Pairs of a square and a quadrilateral that are compared at a time: they fit a cache."""
 
 
 def classify(

@@ -150,26 +150,25 @@ class DetectorSetting:
     )
 
 
+#: Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide.
 ALIGNMENT_PX = 4
-"""Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide."""
 
 MIN_WINDOW_PX = 8
 
 
+#: Added to the margin if there is noise: its candidates around the marker affect one another.
+#:
+#: Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
+#: without it, 3 with 16 px, none from 32. Coarse noise (correlated, or through JPEG) needs twice as
+#: much: of 300 searches with noise of 8 to 32, a correlation of 0.7 and quality 1, two flags
+#: differed with 16 px, one with 32, none with 64.
 NOISE_MARGIN_PX = 32
-"""Added to the margin if there is noise: its candidates around the marker affect one another.
-
-Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
-without it, 3 with 16 px, none from 32. Coarse noise (correlated, or through JPEG) needs twice as
-much: of 300 searches with noise of 8 to 32, a correlation of 0.7 and quality 1, two flags differed
-with 16 px, one with 32, none with 64.
-"""
 
 
+#: The adaptive threshold's constant below which uneven light (at gain 1) is searched on whole
+#: frames: on a slope the replicated border of a window makes candidates of the background. With
+#: gradients to 2 of frames from 96 px wide no flag differed at 7, of 400 up to 17 at 1.5.
 UNEVEN_LIGHT_CONSTANT = 7.0
-"""The adaptive threshold's constant below which uneven light (at gain 1) is searched on whole
-frames: on a slope the replicated border of a window makes candidates of the background. With
-gradients to 2 of frames from 96 px wide no flag differed at 7, of 400 up to 17 at 1.5."""
 
 
 def windows(
@@ -195,12 +194,12 @@ def windows(
     return np.concatenate([start, stop - over], axis=1)
 
 
+#: Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) or as in OpenCV 4 (n, 1), None if n
+#: is 0; and corners of the rejected candidates.
 DetectorOutput = tuple[
     Sequence[NDArray[np.floating[Any]]], NDArray[np.integer[Any]] | None,
     Sequence[NDArray[np.floating[Any]]],
 ]
-"""Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) or as in OpenCV 4 (n, 1), None if n
-is 0; and corners of the rejected candidates."""
 
 
 SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
@@ -346,8 +345,8 @@ def opencv_board(board: Board) -> cv2.aruco.Board:
 # --------------------------------------------------------------------------------------------------
 # A plug-in's detector: its conventions are turned into ours, and what it returns is checked.
 
+#: Markers, or candidates, that are believed of an image with one marker.
 MAX_MARKERS = 1000
-"""Markers, or candidates, that are believed of an image with one marker."""
 
 
 class PluggedDetector:
@@ -423,8 +422,8 @@ class PluggedDetector:
 # --------------------------------------------------------------------------------------------------
 # The detectors: OpenCV's and those of plug-ins, each made from its setting.
 
+#: The detector that is no plug-in, ``cv2.aruco.ArucoDetector``.
 OPENCV = "opencv"
-"""The detector that is no plug-in, ``cv2.aruco.ArucoDetector``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,12 +438,12 @@ class DetectorChoice:
     )
 
 
+#: A setting of any detector.
 AnyDetectorSetting = DetectorSetting | PluginSetting
-"""A setting of any detector."""
 
+#: A search of an image (h, w): a window of a frame whose larger side is the last argument, for
+#: markers of a dictionary.
 FindFunction = Callable[[NDArray[np.uint8], str, int], DetectorOutput]
-"""A search of an image (h, w): a window of a frame whose larger side is the last argument, for
-markers of a dictionary."""
 
 
 @lru_cache(maxsize=256)

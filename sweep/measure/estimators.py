@@ -23,8 +23,8 @@ from sweep.plugins.loading import call, made, real_numbers
 # --------------------------------------------------------------------------------------------------
 # A plug-in's solver: what it returns is checked as our own solvers' poses are.
 
+#: How far a rotation matrix times its transpose may be from the unit matrix.
 ROTATION_ATOL = 1e-6
-"""How far a rotation matrix times its transpose may be from the unit matrix."""
 
 
 class PluggedEstimator:
@@ -136,6 +136,7 @@ class RecordedPose:
 # --------------------------------------------------------------------------------------------------
 # The solvers: one record each, the estimator's settings, and from a setting to its estimator.
 
+#: Name in pipeline files -> the solver; choices, messages and reference follow from it.
 SOLVERS: dict[str, Solver] = {
     **OPENCV_SOLVERS,
     "photometric": Solver(
@@ -156,7 +157,6 @@ SOLVERS: dict[str, Solver] = {
         lambda setting: RecordedPose(setting.reprojection_limit), recorded=True, of_boards=True,
     ),
 }
-"""Name in pipeline files -> the solver; choices, messages and reference follow from it."""
 
 _PLAIN = ", ".join(
     name for name, each in SOLVERS.items()

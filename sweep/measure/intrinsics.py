@@ -13,9 +13,10 @@ from sweep.model import calibration
 from sweep.typing import Floats
 
 COEFFICIENTS = calibration.COEFFICIENTS[:5]
+#: The numbers of a camera that are estimated, in the order of arrays.
 INTRINSICS = (*calibration.VIEW, *COEFFICIENTS)
-"""The numbers of a camera that are estimated, in the order of arrays."""
 
+#: Lens coefficients that are estimated, of :data:`COEFFICIENTS` the first -> OpenCV's flags.
 FREE_COEFFICIENTS: dict[int, int] = {
     0: cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3,
     1: cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3,
@@ -23,16 +24,15 @@ FREE_COEFFICIENTS: dict[int, int] = {
     4: cv2.CALIB_FIX_K3,
     5: 0,
 }
-"""Lens coefficients that are estimated, of :data:`COEFFICIENTS` the first -> OpenCV's flags."""
 
+#: Points in a view that is used.
 MIN_POINTS = 6
-"""Points in a view that is used."""
 
+#: Views with which a calibration is tried.
 MIN_VIEWS = 3
-"""Views with which a calibration is tried."""
 
+#: Ratio of the extents of a view's points below which they lie on a line.
 _FLAT = 1e-3
-"""Ratio of the extents of a view's points below which they lie on a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

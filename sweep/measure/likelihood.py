@@ -36,35 +36,35 @@ STATE_LENGTH = 18
 ROTATION, POSITION = slice(0, 9), slice(9, 12)
 DEPTH, SPREAD = 11, 12
 GREY_LEVELS = slice(13, 16)
+#: A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
+#: standard deviation of the point spread in pixels, the levels of outside, black and white; and of
+#: photographs, as shares of the contrast, the level outside and the tone curve, for which slopes
+#: are computed (:mod:`sweep.measure.photograph`).
 OUTSIDE, BLACK, WHITE, OUTSIDE_SHARE, TONE = 13, 14, 15, 16, 17
-"""A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
-standard deviation of the point spread in pixels, the levels of outside, black and white; and of
-photographs, as shares of the contrast, the level outside and the tone curve, for which slopes are
-computed (:mod:`sweep.measure.photograph`)."""
 
+#: Smallest point spread that is estimated; a smaller one becomes 0 and stays so.
 MIN_SPREAD_PX = 0.1
-"""Smallest point spread that is estimated; a smaller one becomes 0 and stays so."""
 
 MAX_TURN = 0.3
+#: Largest step: in radians, and as a share of the distance.
 MAX_SHIFT = 0.1
-"""Largest step: in radians, and as a share of the distance."""
 
+#: Squared standard deviations of the last undamped step. Near a second minimum that has just
+#: vanished steps get ever shorter: there the larger one suffices.
 SETTLED, NEARLY_SETTLED = 1e-4, 1e-2
-"""Squared standard deviations of the last undamped step. Near a second minimum that has just
-vanished steps get ever shorter: there the larger one suffices."""
 
+#: Noise in grey levels below which the rounding error is not uniform and independent.
 MIN_NOISE = 0.5
-"""Noise in grey levels below which the rounding error is not uniform and independent."""
 
+#: Variance in squared grey levels added by rounding to whole levels.
 QUANTISATION_VARIANCE = 1 / 12
-"""Variance in squared grey levels added by rounding to whole levels."""
 
+#: Width of the background around the marker from which its level is estimated.
 BACKGROUND_MARGIN_PX = 4
-"""Width of the background around the marker from which its level is estimated."""
 
+#: Abandon a start after more than this many consecutive steps that predict a chi-square above
+#: ``worth``.
 PATIENCE = 2
-"""Abandon a start after more than this many consecutive steps that predict a chi-square above
-``worth``."""
 
 
 class Sheets(NamedTuple):
@@ -85,8 +85,8 @@ class Sheets(NamedTuple):
     radius_m: float
 
 
+#: The sheets of a target in one plane, which is that of its pose.
 FLAT = Sheets(np.zeros(1, dtype=np.int64), np.empty((0, 3, 3)), 0.0)
-"""The sheets of a target in one plane, which is that of its pose."""
 
 
 class MarkerView(NamedTuple):
@@ -376,8 +376,8 @@ class Pixels(NamedTuple):
     marker: MarkerView
 
 
+#: What is seen -> the function that does what :func:`squared_residuals` does by its model.
 MODELS: dict[type, Callable[..., float]] = {}
-"""What is seen -> the function that does what :func:`squared_residuals` does by its model."""
 
 
 def squared_residuals(
@@ -574,12 +574,12 @@ def turn_between(state: Floats, other: Floats) -> float:
 
 COARSE_STEPS, FINE_STEPS = 15, 30
 
+#: Fits whose rotations differ by less than this are the same.
 SAME_TURN_RAD = 1e-3
-"""Fits whose rotations differ by less than this are the same."""
 
+#: Deviation of the residuals' variance, in its standard deviations, above which the model does not
+#: explain the pixels.
 EXCESS = 5.0
-"""Deviation of the residuals' variance, in its standard deviations, above which the model does not
-explain the pixels."""
 
 
 class Search(NamedTuple):
@@ -756,8 +756,8 @@ def _squares_in_sight(
 
 MODELS[InSight] = _squares_in_sight
 
+#: The same steps without compilation: what is seen is determined in Python.
 _descend_in_sight = getattr(descend, "py_func", descend)
-"""The same steps without compilation: what is seen is determined in Python."""
 
 
 def locate_in_sight(
@@ -798,14 +798,14 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
 # --------------------------------------------------------------------------------------------------
 # The Cramér-Rao bound of the exact image's pixels: the least error of any unbiased estimate.
 
+#: Standard deviations of the noise by which every grey level must stay off the scale's ends.
 CLIPPING_DEVIATIONS = 2.0
-"""Standard deviations of the noise by which every grey level must stay off the scale's ends."""
 
+#: Most steps of the search for the mirrored minimum.
 MIRROR_STEPS = 60
-"""Most steps of the search for the mirrored minimum."""
 
+#: Largest distance of a mirrored minimum that is searched for, in standard deviations.
 MAX_MIRROR_DISTANCE = 100.0
-"""Largest distance of a mirrored minimum that is searched for, in standard deviations."""
 
 @dataclass(frozen=True, slots=True)
 class BoundSetting:

@@ -32,23 +32,23 @@ from sweep.typing import Floats, Grey, Integers
 # over the marker's side; that changes the direction of a step, not the pose at which the fit
 # ends.
 
+#: Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond.
 REACH = 3.5
-"""Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond."""
 
+#: Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
+#: jump.
 PANEL = 2.0
-"""Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
-jump."""
 
+#: Most panels of one straight segment.
 MAX_PANELS = 4096
-"""Most panels of one straight segment."""
 
 _STEPS = 64
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
 _DENSITY = np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
 _BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+#: The normal distribution, its integral, and the integral of that, in steps of 1/64 standard
+#: deviations.
 _BELOW_SUM = _AT * _BELOW + _DENSITY
-"""The normal distribution, its integral, and the integral of that, in steps of 1/64 standard
-deviations."""
 
 
 @compiled_inline
@@ -241,26 +241,26 @@ def add_plane(
 # parameter in the place of e, all but the pose and the point spread is linear. The state of a fit
 # is that of :mod:`sweep.measure.likelihood`.
 
+#: Parameters that are moved, the pose's and the point spread's variance, and the linear ones.
 MOVED, LINEAR = POSE + 1, 4
-"""Parameters that are moved, the pose's and the point spread's variance, and the linear ones."""
 
+#: All parameters.
 SIZE = MOVED + LINEAR
-"""All parameters."""
 
+#: Largest tone, as a share of the contrast, for which slopes are computed.
 MAX_TONE = 5.0
-"""Largest tone, as a share of the contrast, for which slopes are computed."""
 
+#: Largest level outside, from black, as a share of the contrast.
 MAX_OUTSIDE = 2.0
-"""Largest level outside, from black, as a share of the contrast."""
 
+#: Pixels of the area outside, by squares of its shares, below which its level stays as it is.
 MIN_OUTSIDE_PX = 1.0
-"""Pixels of the area outside, by squares of its shares, below which its level stays as it is."""
 
+#: Smallest point spread that is estimated.
 MIN_SPREAD_PX = 0.2
-"""Smallest point spread that is estimated."""
 
+#: Pixels between those at which the lens is inverted; between them it is interpolated.
 LENS_STEP_PX = 8
-"""Pixels between those at which the lens is inverted; between them it is interpolated."""
 
 
 class PhotographView(NamedTuple):
@@ -421,8 +421,8 @@ def write_columns(
         column[11] = levels[j]
 
 
+#: Pixels whose columns are multiplied at once, and the side of the tiles of their products.
 GROUP, TILE = 128, 4
-"""Pixels whose columns are multiplied at once, and the side of the tiles of their products."""
 
 
 @compiled
@@ -526,15 +526,15 @@ likelihood.MODELS[PhotographView] = _squares_of_photograph
 # --------------------------------------------------------------------------------------------------
 # The box of a photograph that is fitted: its pixels, and the same of half the resolution.
 
+#: Pixels around the fitted ones in the box.
 PADDING_PX = 2
-"""Pixels around the fitted ones in the box."""
 
+#: Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
+#: of 2 x 2 pixels, whose fit is a start.
 PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
-"""Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
-of 2 x 2 pixels, whose fit is a start."""
 
+#: Pixels around the fitted ones within which print is in the model: what blur carries inwards.
 MODELLED_PX = 5.0
-"""Pixels around the fitted ones within which print is in the model: what blur carries inwards."""
 
 
 def photograph_view(
@@ -698,35 +698,35 @@ def binned_photograph(view: PhotographView) -> PhotographView:
 # covariance matrix estimator and a direct test for heteroskedasticity", Econometrica 48, 1980,
 # for the form.
 
+#: Nodes of the field of shifts along each side of the marker.
 SHIFT_NODES = 4
-"""Nodes of the field of shifts along each side of the marker."""
 
+#: Distance at which the correlation of shifts is 1/e, in halves of the marker's extent. With 1 the
+#: squared errors of poses on photographs of boards are about those expected; if shifts were
+#: independent, they would be two to three times that.
 CORRELATED = 1.0
-"""Distance at which the correlation of shifts is 1/e, in halves of the marker's extent. With 1 the
-squared errors of poses on photographs of boards are about those expected; if shifts were
-independent, they would be two to three times that."""
 
 _NODES = np.array([divmod(k, SHIFT_NODES) for k in range(SHIFT_NODES**2)])
+#: (n, n) correlations of the components of the nodes' shifts: x and y of each node.
 _CORRELATIONS = np.kron(np.array([
     [math.exp(-2.0 / (SHIFT_NODES - 1) * math.hypot(*apart) / CORRELATED) for apart in _NODES - at]
     for at in _NODES
 ]), np.eye(2)).astype(np.float64)
-"""(n, n) correlations of the components of the nodes' shifts: x and y of each node."""
 
+#: Standard deviation of shifts before the residuals are seen; keeps what they do not tell small.
 LARGEST_SHIFT_PX = 1.0
-"""Standard deviation of shifts before the residuals are seen; keeps what they do not tell small."""
 
+#: Standard deviations by which shifts must exceed what noise brings about.
 SIGNIFICANT = 2.0
-"""Standard deviations by which shifts must exceed what noise brings about."""
 
+#: Largest correlation of neighbouring pixels that is assumed.
 MAX_CORRELATION = 0.9
-"""Largest correlation of neighbouring pixels that is assumed."""
 
+#: Components of nodes that move a pixel's level: two of each of the four nodes around it.
 HELD = 8
-"""Components of nodes that move a pixel's level: two of each of the four nodes around it."""
 
+#: Numbers kept of each pixel: the pose's six changes by its level, and its residual.
 WIDE, RESIDUAL = 2 * TILE, POSE
-"""Numbers kept of each pixel: the pose's six changes by its level, and its residual."""
 
 
 @compiled
@@ -963,9 +963,9 @@ def _write_residuals(
 # --------------------------------------------------------------------------------------------------
 # The pose in a photograph: the best minimum of several starts, and its covariance.
 
+#: Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
+#: Fits of all pixels chose the mirror at an excess of at most 44.
 REAL = likelihood.Search(4.0, 16.0, 50.0)
-"""Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
-Fits of all pixels chose the mirror at an excess of at most 44."""
 
 
 @compiled

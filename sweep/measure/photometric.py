@@ -140,17 +140,17 @@ def window_of(one: Detections, poses: list[Pose]) -> list[int]:
 # --------------------------------------------------------------------------------------------------
 # The estimators.
 
+#: Smallest start of an estimated point spread: 0 is a minimum of its own.
 LIKELY_SPREAD_PX = 0.5
-"""Smallest start of an estimated point spread: 0 is a minimum of its own."""
 
+#: Point spread at which fits of photographs start.
 FIRST_SPREAD_PX = 0.7
-"""Point spread at which fits of photographs start."""
 
+#: Difference of white and black in grey levels below which there is no marker in the pixels.
 MIN_CONTRAST = 1.0
-"""Difference of white and black in grey levels below which there is no marker in the pixels."""
 
+#: Standard deviation of the shifts of the marker's parts above which a pose is not explained.
 MAX_MISFIT_PX = 0.5
-"""Standard deviation of the shifts of the marker's parts above which a pose is not explained."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,6 +74,7 @@ def _of_opencv(method: int, meaning: str, *, guarded: bool = True, **properties:
     )
 
 
+#: The solvers of OpenCV.
 OPENCV_SOLVERS = {
     "ippe": _of_opencv(
         cv2.SOLVEPNP_IPPE, "both planar solutions from the homography", planar_only=True,
@@ -99,7 +100,6 @@ OPENCV_SOLVERS = {
         "points", guarded=False, of_boards=True,
     ),
 }
-"""The solvers of OpenCV."""
 
 _TWO_SOLUTIONS = {each.method for each in OPENCV_SOLVERS.values() if each.two_solutions}
 
@@ -162,38 +162,38 @@ def _plain(
 # steps, converged or not: of 990 poses to 40° off the axis 36 to 45 % came out wrong by more than
 # 0.01° (tests/measure/test_guards.py), so corners are undistorted before.
 
+#: Corners BL, BR, TR, TL (IPPE_SQUARE's order) in the marker's frame turned z in.
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""Corners BL, BR, TR, TL (IPPE_SQUARE's order) in the marker's frame turned z in."""
 
 _Z_OUT = np.array([1.0, -1.0, -1.0])
 
+#: Solutions with a reprojection error below this share of the side are accepted; wrong solutions
+#: lie far above it. Others are compared with ITERATIVE's.
 CREDIBLE_SHARE = 0.05
-"""Solutions with a reprojection error below this share of the side are accepted; wrong solutions
-lie far above it. Others are compared with ITERATIVE's."""
 
+#: The largest ratio of a solution's reprojection error to that of ITERATIVE.
 CREDIBLE_RATIO = 2.0
-"""The largest ratio of a solution's reprojection error to that of ITERATIVE."""
 
+#: Sides below this share of the focal length are compared with IPPE: the perspective across the
+#: marker, which tells the two planar solutions apart, is below this share of the side, and what all
+#: solvers but IPPE leave of it is rounding.
 _FAR_SHARE = 1 / 800
-"""Sides below this share of the focal length are compared with IPPE: the perspective across the
-marker, which tells the two planar solutions apart, is below this share of the side, and what all
-solvers but IPPE leave of it is rounding."""
 
+#: The largest ratio of a far solution's reprojection error to that of IPPE. Without perspective an
+#: exact solution of three corners has twice the least error of four: c/2 and c/4 if the opposite
+#: sides differ by a vector of length c.
 _FAR_RATIO = 4.0
-"""The largest ratio of a far solution's reprojection error to that of IPPE. Without perspective an
-exact solution of three corners has twice the least error of four: c/2 and c/4 if the opposite
-sides differ by a vector of length c."""
 
+#: Methods that go astray for a few poses of real corners -> the largest ratio of their reprojection
+#: error to that of IPPE. ITERATIVE ends in another minimum than the least (1-4 % of markers of 12
+#: to 80 px, at up to 24 times the least error), and is started again from both of IPPE's solutions.
+#: P3P and AP3P fit three corners exactly and miss the fourth (by up to 22 times the least error),
+#: and IPPE's solution is taken.
 ASTRAY_RATIO = {cv2.SOLVEPNP_ITERATIVE: 1.1, cv2.SOLVEPNP_P3P: 4.0, cv2.SOLVEPNP_AP3P: 4.0}
-"""Methods that go astray for a few poses of real corners -> the largest ratio of their
-reprojection error to that of IPPE. ITERATIVE ends in another minimum than the least (1-4 % of
-markers of 12 to 80 px, at up to 24 times the least error), and is started again from both of
-IPPE's solutions. P3P and AP3P fit three corners exactly and miss the fourth (by up to 22 times
-the least error), and IPPE's solution is taken."""
 
+#: Reprojection errors below this share of the side are not astray, but the rounding of corners that
+#: nearly fit.
 ASTRAY_SHARE = 1e-3
-"""Reprojection errors below this share of the side are not astray, but the rounding of corners
-that nearly fit."""
 
 
 def _guarded(
@@ -326,8 +326,8 @@ def _solve_turned(
 # --------------------------------------------------------------------------------------------------
 # Poses of one target from any number of points: OpenCV's solvers, called plainly or guarded.
 
+#: Rotation (3, 3) and translation (3,) in metres.
 Pose = tuple[Floats, Floats]
-"""Rotation (3, 3) and translation (3,) in metres."""
 
 
 def lens_of(cameras: Cameras) -> Floats | None:
@@ -395,9 +395,9 @@ def _called(
     ]
 
 
+#: Least extent of points across their line, of unit size along it: points of a line leave the turn
+#: about it open, and SQPnP and EPnP return any.
 COLLINEAR = 1e-6
-"""Least extent of points across their line, of unit size along it: points of a line leave the turn
-about it open, and SQPnP and EPnP return any."""
 
 _Z_IN = np.diag([1.0, -1.0, -1.0])
 
@@ -469,8 +469,8 @@ class GuardedPoints(NamedTuple):
 # --------------------------------------------------------------------------------------------------
 # The estimator of poses from corners.
 
+#: The fewest points that a pose is estimated from.
 MIN_POINTS = 4
-"""The fewest points that a pose is estimated from."""
 
 
 class _Solution(NamedTuple):

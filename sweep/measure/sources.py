@@ -141,13 +141,12 @@ class RecordedSearch:
         )
 
 
+#: Where the detections of N scenes with one setting come from.
+#:
+#: One that needs images gets them in windows; else its pixels are those of the frame. Its ``poses``
+#: are those (N, 3, 3), (N, 3) in metres that come with what was found: NaN where none does, None in
+#: the place of both if there never are any.
 DetectionSource = ImageSearch | RecordedSearch
-"""Where the detections of N scenes with one setting come from.
-
-One that needs images gets them in windows; else its pixels are those of the frame. Its ``poses``
-are those (N, 3, 3), (N, 3) in metres that come with what was found: NaN where none does, None in
-the place of both if there never are any.
-"""
 
 
 def detection_source(

@@ -76,8 +76,8 @@ def clear_modules(marker: BoardMarker) -> float:
     return max(float(distance(low).min(initial=np.inf)) - half, 0.0)
 
 
+#: Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose.
 RING_MODULES = 1.5
-"""Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
 
 
 def ring_modules(marker: Board, on_board: BoardMarker | None) -> float:

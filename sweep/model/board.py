@@ -220,8 +220,8 @@ def rectangles_print(boxes_m: Floats, outside: int, inside: int) -> Print:
 # --------------------------------------------------------------------------------------------------
 # Whether squares in one plane overlap.
 
+#: Share of a side by which squares may overlap and still count as touching: rounding.
 TOUCHING = 1e-9
-"""Share of a side by which squares may overlap and still count as touching: rounding."""
 
 
 def first_overlap(sheets: Floats) -> tuple[int, int] | None:
@@ -420,8 +420,8 @@ def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> Mar
 # are those inside, and those outside projected onto its line, which enclose the same area. Of
 # several sheets in front, by inclusion and exclusion.
 
+#: Sine of an angle, of rays from the camera, below which sheets only touch in the image.
 _NEGLIGIBLE = 1e-12
-"""Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
 
 
 class _Face(NamedTuple):

@@ -23,8 +23,8 @@ from sweep.typing import Floats, Integers
 # --------------------------------------------------------------------------------------------------
 # What declarations of all kinds of boards share: fields, and faults of their values.
 
+#: The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer.
 MAX_MARKERS = 4000
-"""The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
 
 _DICTIONARY = declared_fields(marker.Marker)["dictionary"]
 
@@ -242,14 +242,14 @@ class Markers:
 
 _MARKER = declared_fields(BoardMarker)
 
+#: Keys of a table [[board.markers]].
 _LISTED = _MARKER | {"size_m": dataclasses.replace(_MARKER["size_m"], default=None)}
-"""Keys of a table [[board.markers]]."""
 
+#: Keys of a table [[board.distractors]]: none of their IDs and sizes is needed.
 _BESIDE = _LISTED | {
     "marker_id": dataclasses.replace(_MARKER["marker_id"], default=None),
     "dictionary": dataclasses.replace(_DICTIONARY, default=None),
 }
-"""Keys of a table [[board.distractors]]: none of their IDs and sizes is needed."""
 
 
 def with_distractors(
@@ -533,29 +533,29 @@ def _printed_side(dictionary: str, marker_m: float) -> tuple[float, str]:
 
 Kind = Charuco | Grid | AprilGrid | Markers
 
+#: The kinds of boards by the names that files have for them.
 KINDS: dict[str, type[Kind]] = {
     "charuco": Charuco, "grid": Grid, "aprilgrid": AprilGrid, "markers": Markers,
 }
-"""The kinds of boards by the names that files have for them."""
 
 
 # --------------------------------------------------------------------------------------------------
 # A board as a pipeline declares it: how the markers of [marker] are arranged.
 
+#: The kind of a marker without a board.
 SINGLE = "none"
-"""The kind of a marker without a board."""
 
+#: Parameters of [marker] that a board takes.
 FROM_MARKER = ("dictionary", "marker_id", "size_m", "quiet_zone_modules")
-"""Parameters of [marker] that a board takes."""
 
+#: Key of a board's file -> the parameter of a pipeline that says the same.
 PIPELINE_NAMES = {
     "marker_m": "size_m", "tagSize": "size_m", "first_id": "marker_id",
     "margin_m": "quiet_zone_modules",
 }
-"""Key of a board's file -> the parameter of a pipeline that says the same."""
 
+#: What makes a ChArUco diamond of a charuco.
 DIAMOND = {"squares_x": 3, "squares_y": 3, "legacy_pattern": False}
-"""What makes a ChArUco diamond of a charuco."""
 
 _DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
 
@@ -566,16 +566,16 @@ _OWN = {
     }
     for kind in ("grid", "aprilgrid", "charuco", "markers")
 }
+#: Kind -> the keys of its file that [board] has, too.
 _OWN["diamond"] = {name: each for name, each in _OWN["charuco"].items() if name not in DIAMOND}
-"""Kind -> the keys of its file that [board] has, too."""
 
+#: Kind -> the parameters that it must have.
 NEEDED = {
     SINGLE: (), **{
         kind: tuple(name for name, each in keys.items() if each.default is dataclasses.MISSING)
         for kind, keys in _OWN.items()
     },
 }
-"""Kind -> the parameters that it must have."""
 
 
 @dataclass(frozen=True)
@@ -599,6 +599,7 @@ class _Arrangement:
     )
 
 
+#: The board's parameters, beside those of [marker]: dictionary, first ID, size, quiet zone.
 BoardValues: type = dataclasses.make_dataclass(
     "BoardValues",
     [
@@ -611,10 +612,9 @@ BoardValues: type = dataclasses.make_dataclass(
     ],
     bases=(_Arrangement,), frozen=True,
 )
-"""The board's parameters, beside those of [marker]: dictionary, first ID, size, quiet zone."""
 
+#: The parameters that :func:`arranged_board` takes, in its order.
 ARRANGING = (*FROM_MARKER, *(field.name for field in dataclasses.fields(BoardValues)))
-"""The parameters that :func:`arranged_board` takes, in its order."""
 
 
 def arranged(values: Sequence[Any]) -> Kind:

@@ -35,16 +35,17 @@ SD = ("stddeviationsintrinsics", "stddevintrinsics", "stddevsintrinsics")
 COVARIANCE = ("covarianceintrinsics", "intrinsicscovariance")
 
 MODEL_NAMES = ("distortionmodel", "lensmodel", "distortiontype")
+#: Lens model -> the numbers of coefficients that it may have.
 MODEL_COUNTS = {
     "plumbbob": (0, 4, 5), "radtan": (0, 4), "radialtangential": (0, 4), "none": (0,),
     "rationalpolynomial": (0, 4, 5, 8, 12, 14), "brownconrady": (0, 4, 5), "": COUNTS,
     "lensmodelpinhole": (0,), "lensmodelopencv": COUNTS, "lensmodelopencv4": (4,),
     "lensmodelopencv5": (5,), "lensmodelopencv8": (8,), "lensmodelopencv12": (12,),
 }
-"""Lens model -> the numbers of coefficients that it may have."""
 
 _FRAME_AS_SENT = "give the calibration of the frame as it is sent"
 
+#: Names, the values that entries of these names may have, and why others are refused.
 ALLOWED: tuple[tuple[tuple[str, ...], Iterable[str], str], ...] = (
     (("xi",), (), "camera model omnidirectional (xi): not supported, only pinhole cameras are"),
     (("cameramodel",), ("pinhole", ""),
@@ -57,7 +58,6 @@ ALLOWED: tuple[tuple[tuple[str, ...], Iterable[str], str], ...] = (
     (("binningx", "binningy"), ("0", "1"),
      "{name} = {value}: the matrix is that of the frame without binning; " + _FRAME_AS_SENT),
 )
-"""Names, the values that entries of these names may have, and why others are refused."""
 
 KINDS = (
     "a file of OpenCV's FileStorage (camera_matrix, distortion_coefficients, image_width, "
@@ -316,8 +316,8 @@ def _covariance(entry: _Entry, count: int) -> tuple[float, ...]:
 # Scalars of YAML and XML stay text, as written: what is a number is decided by who expects one.
 # Tags make no objects.
 
+#: The largest file that is read; a calibration with all its image points is a tenth of that.
 MAX_BYTES = 4_000_000
-"""The largest file that is read; a calibration with all its image points is a tenth of that."""
 
 _COMMENT = re.compile(r"^[ \t]*//[^\n]*$", re.MULTILINE)
 
@@ -386,13 +386,13 @@ def _element(element: ET.Element) -> Any:
 
 VIEW = ("fx_px", "fy_px", "cx_px", "cy_px")
 
+#: Lens coefficients in OpenCV's order.
 COEFFICIENTS = (
     "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
 )
-"""Lens coefficients in OpenCV's order."""
 
+#: Largest asymmetry, and largest rest of the factorisation, of a covariance that is accepted.
 RTOL = 1e-6
-"""Largest asymmetry, and largest rest of the factorisation, of a covariance that is accepted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from sweep.typing import Floats, Masks
 # --------------------------------------------------------------------------------------------------
 # The camera: pinhole intrinsics, a lens, and the projection of points in space.
 
+#: Numbers that a calibration estimates: fx, fy, cx, cy and the lens coefficients.
 BELIEF_COUNTS = tuple(4 + count for count in lens.COUNTS)
-"""Numbers that a calibration estimates: fx, fy, cx, cy and the lens coefficients."""
 
+#: Width and height of the sensor where the pipeline gives neither.
 DEFAULT_SENSOR_MM = (4.8, 3.6)
-"""Width and height of the sensor where the pipeline gives neither."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +90,14 @@ class Camera:
     )
 
 
+#: The arguments of :func:`intrinsics`, in order.
 VIEW_PARAMETERS = (
     "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
     "fy_px", "cx_px", "cy_px", "hfov_deg", "vfov_deg", "pixel_size_um", "dfov_deg",
 )
-"""The arguments of :func:`intrinsics`, in order."""
 
+#: Focal lengths that differ by less, relatively, are those of square pixels.
 SQUARE_RTOL = 1e-12
-"""Focal lengths that differ by less, relatively, are those of square pixels."""
 
 
 def intrinsics(
@@ -309,24 +309,24 @@ def map_columns(function: Callable[..., Any], columns: Sequence[Column]) -> Colu
 # of them if the marker is turned against the line of sight. Then the place is a fixed point: x at
 # its share between the limits at (x, y), and y at its.
 
+#: Steps of the fixed point: each gains a digit or more, unless the lens folds in the frame.
 MAX_STEPS = 200
-"""Steps of the fixed point: each gains a digit or more, unless the lens folds in the frame."""
 
+#: Step, relative to the depth, at which the fixed point is reached.
 CONVERGED = 1e-12
-"""Step, relative to the depth, at which the fixed point is reached."""
 
+#: Bisections between a place that is in the frame and one that is not.
 HALVINGS = 50
-"""Bisections between a place that is in the frame and one that is not."""
 
+#: Pixels by which a point may be beyond the frame's edge: rounding, where it lies upon it.
 SLACK_PX = 1e-6
-"""Pixels by which a point may be beyond the frame's edge: rounding, where it lies upon it."""
 
+#: Points of a side that is bent by a lens; between them it bulges by less than 1/64 of the side's
+#: bulge, which :data:`BULGE_PX` covers up to 3 px.
 PER_SIDE = 8
-"""Points of a side that is bent by a lens; between them it bulges by less than 1/64 of the side's
-bulge, which :data:`BULGE_PX` covers up to 3 px."""
 
+#: Pixels that are kept free at the frame's edges under a lens.
 BULGE_PX = 0.05
-"""Pixels that are kept free at the frame's edges under a lens."""
 
 
 @dataclass(frozen=True, slots=True)

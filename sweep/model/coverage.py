@@ -18,22 +18,22 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # The Gaussian point spread: its integrals, and the quadrature along an edge seen through it.
 
+#: Standard deviations at which the point spread is cut off; 6e-7 of it lies beyond.
 REACH = 5.0
-"""Standard deviations at which the point spread is cut off; 6e-7 of it lies beyond."""
 
+#: Shortest piece of an edge that is integrated on its own.
 MIN_PANEL_PX = 0.015
-"""Shortest piece of an edge that is integrated on its own."""
 
 NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
+#: Three Gauss-Legendre nodes on [0, 1], and their weights.
 WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
-"""Three Gauss-Legendre nodes on [0, 1], and their weights."""
 
 _STEPS = 256
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
 _BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+#: The normal distribution's integral, and the integral of that, in steps of 1/256 standard
+#: deviations: interpolated linearly they are accurate to 8e-7.
 _BELOW_SUM = _AT * _BELOW + np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
-"""The normal distribution's integral, and the integral of that, in steps of 1/256 standard
-deviations: interpolated linearly they are accurate to 8e-7."""
 
 
 @compiled
@@ -76,8 +76,8 @@ def spread_below_sum(t: float, sigma: float) -> float:
 # Pixel i covers [i - 0.5, i + 0.5]; the functions below shift coordinates by 0.5, so that it
 # covers [i, i + 1].
 
+#: Levels this close below a half round up, so that the last bits of a sum never decide.
 ROUNDING_SNAP = 1e-9
-"""Levels this close below a half round up, so that the last bits of a sum never decide."""
 
 
 class MarkerEdges(NamedTuple):
@@ -405,11 +405,11 @@ def sum_levels(cover: Floats, outside: float, levels: Floats) -> None:
 #
 # The box begins at pixel (0, 0): the principal point is given relative to the box.
 
+#: Parameters of a pose; the point spread, if its derivative is requested, is one more.
 POSE = 6
-"""Parameters of a pose; the point spread, if its derivative is requested, is one more."""
 
+#: Unknown grey levels: outside, black, white.
 LEVELS = 3
-"""Unknown grey levels: outside, black, white."""
 
 
 class Work(NamedTuple):

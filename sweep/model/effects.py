@@ -272,6 +272,7 @@ def _tone(name: str, default: float, meaning: str, low: float, high: float) -> E
     }, worsens=("uneven light",), apply=_toned)
 
 
+#: Every effect, in physical order.
 EFFECTS: tuple[Effect, ...] = (
     Effect("printed size", "edges", {
         "marker_scale": drawn(
@@ -465,11 +466,11 @@ EFFECTS: tuple[Effect, ...] = (
         ),
     }, worsens=("noise", "uneven light"), block_px=sensor.BLOCK_PX),
 )
-"""Every effect, in physical order."""
 
 
 _DECLARED = {name: each for effect in EFFECTS for name, each in effect.parameters.items()}
 
+#: The parameters of all effects as a dataclass, as those of camera, marker and pose are.
 Effects: type = dataclasses.make_dataclass(
     "Effects",
     [
@@ -478,27 +479,26 @@ Effects: type = dataclasses.make_dataclass(
     ],
     frozen=True,
 )
-"""The parameters of all effects as a dataclass, as those of camera, marker and pose are."""
 
+#: Every parameter of the effects at its default: no effect is active.
 NEUTRAL: dict[str, Any] = {name: each.default for name, each in _DECLARED.items()}
-"""Every parameter of the effects at its default: no effect is active."""
 
+#: Parameters that are text or lists: scenes hold the numbers of their values.
 CODED = tuple(name for name, default in NEUTRAL.items() if is_coded(default))
-"""Parameters that are text or lists: scenes hold the numbers of their values."""
 
+#: Parameters that are numbers.
 PLAIN = tuple(name for name in NEUTRAL if name not in CODED)
-"""Parameters that are numbers."""
 
+#: Switches of the effects that only the ``exact`` renderer has.
 GEOMETRIC = tuple(effect.switch for effect in EFFECTS if effect.step == "edges")
-"""Switches of the effects that only the ``exact`` renderer has."""
 
+#: Switches of the effects that draw random numbers.
 RANDOM = tuple(effect.switch for effect in EFFECTS if effect.random)
-"""Switches of the effects that draw random numbers."""
 
+#: Parameter -> parameters of which one must be given beside it.
 NEEDS: dict[str, tuple[str, ...]] = {
     name: others for effect in EFFECTS for name, others in effect.needs.items()
 }
-"""Parameter -> parameters of which one must be given beside it."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -545,8 +545,8 @@ class MarkerView:
         return np.asarray(self.camera_matrix @ self.plane)
 
 
+#: A renderer: levels and shares (h, w) each.
 Render = Callable[[MarkerView], tuple[Floats, Floats]]
-"""A renderer: levels and shares (h, w) each."""
 
 
 @dataclass(frozen=True, slots=True)

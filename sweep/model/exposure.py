@@ -53,9 +53,9 @@ def moved_plane(plane: Floats, motion: Motion, time_s: float) -> Floats:
     return after
 
 
+#: States of a moving marker: in front of the camera; wholly behind it; or without a meaningful
+#: image, since it crosses the camera's plane, shows its back, or lies where the lens folds.
 VISIBLE, BEHIND, MEANINGLESS = 0, 1, 2
-"""States of a moving marker: in front of the camera; wholly behind it; or without a meaningful
-image, since it crosses the camera's plane, shows its back, or lies where the lens folds."""
 
 
 @compiled
@@ -117,8 +117,8 @@ def track(
     return extents, states
 
 
+#: Least number of instants at which a moving target's extent is computed.
 MIN_INSTANTS = 65
-"""Least number of instants at which a moving target's extent is computed."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -128,10 +128,10 @@ MIN_INSTANTS = 65
 # (Rahimi and Recht, "Random features for large-scale kernel machines", 2007): a smooth function
 # of the pixel, whatever part of the frame is computed.
 
+#: Waves of each coordinate's shift. Given their directions, the field is exactly Gaussian; their
+#: directions are drawn, so that the covariance of one frame deviates from the formula by 1/8 of its
+#: height.
 WAVES = 32
-"""Waves of each coordinate's shift. Given their directions, the field is exactly Gaussian; their
-directions are drawn, so that the covariance of one frame deviates from the formula by 1/8 of its
-height."""
 
 def shift_waves(std_px: float, length_px: float, key: np.uint64) -> Floats:
     """Return the waves (2, M, 4) of a field of shifts (:class:`sweep.model.polygon.Sheet`).
@@ -154,9 +154,9 @@ def shift_waves(std_px: float, length_px: float, key: np.uint64) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # The sheets of scenes: where they are, how they are bent, and how their image is shifted.
 
+#: Points of a side at which a curved outline is sampled for its extent: between them it bulges by
+#: less than 1/1000 of the side's bulge, well inside the 2 px that are added around it.
 CHORDS_PER_SIDE = 32
-"""Points of a side at which a curved outline is sampled for its extent: between them it bulges by
-less than 1/1000 of the side's bulge, well inside the 2 px that are added around it."""
 
 
 class SeenSheet(NamedTuple):
@@ -298,8 +298,8 @@ def defocus_px(
 # --------------------------------------------------------------------------------------------------
 # The extent of the markers in the image, their areas, and whether they are visible.
 
+#: Resolution of the bitmap that the ``warp`` renderer maps (the paper's).
 WARP_PX_PER_MODULE = 10
-"""Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
 
 
 def _outlines(scenes: Scenes, rows: NDArray[np.intp], per_side: int) -> Floats:
@@ -412,11 +412,11 @@ def _warp_extent(scenes: Scenes, row: int) -> tuple[Floats, Floats]:
     return np.full(2, -0.5), scenes.frame[row] - 0.5
 
 
+#: Most instants at which a moving target's extent is computed; a step is added on all sides.
 MAX_INSTANTS = 8193
-"""Most instants at which a moving target's extent is computed; a step is added on all sides."""
 
+#: Turn between two instants above which the marker may point anywhere between them.
 _COARSE_TURN = math.pi / 8
-"""Turn between two instants above which the marker may point anywhere between them."""
 
 
 def _exposed_extent(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -485,8 +485,8 @@ def areas_px(scenes: Scenes) -> Floats:
     return np.abs(area)
 
 
+#: Sine of the angle to the line of sight below which a marker is seen edge on.
 EDGE_ON = 1e-12
-"""Sine of the angle to the line of sight below which a marker is seen edge on."""
 
 
 def hidden(scenes: Scenes) -> NDArray[np.bool_]:
@@ -639,10 +639,10 @@ class Layer(NamedTuple):
     end_s: float
 
 
+#: Path of a target in several planes between the instants at which is computed which sheets hide
+#: which: an edge of a shadow lies where it does in the middle of the time, so that half of this
+#: times the share by which one sheet moves against the other is its largest error.
 OCCLUSION_PX = 0.5
-"""Path of a target in several planes between the instants at which is computed which sheets hide
-which: an edge of a shadow lies where it does in the middle of the time, so that half of this times
-the share by which one sheet moves against the other is its largest error."""
 
 MAX_SHADOWS = 512
 
@@ -682,22 +682,22 @@ def _layers(scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool) ->
 # --------------------------------------------------------------------------------------------------
 # The exact image, unquantised.
 
+#: Path of a corner between groups of three instants: the error at kinks of the mean over the
+#: exposure is then at most 0.12 grey levels.
 SHARP_PANEL_PX = 3 / 16
-"""Path of a corner between groups of three instants: the error at kinks of the mean over the
-exposure is then at most 0.12 grey levels."""
 
 MAX_PANELS = 4093
+#: Most panels of an exposure, and of each row's; primes, so that they resonate with no turn.
 MAX_ROW_PANELS = 509
-"""Most panels of an exposure, and of each row's; primes, so that they resonate with no turn."""
 
+#: Smallest point spread that is computed if defocus varies over the image (a quarter of it if it
+#: does not); between 0 and this the image is interpolated, with an error of at most 0.8 (0.2) grey
+#: levels in single pixels.
 SHARPEST_PX = 0.05
-"""Smallest point spread that is computed if defocus varies over the image (a quarter of it if it
-does not); between 0 and this the image is interpolated, with an error of at most 0.8 (0.2) grey
-levels in single pixels."""
 
+#: Ratio of neighbouring point spreads if defocus varies; the error of cubic interpolation in their
+#: logarithm is then at most 0.1 grey levels.
 SPREAD_RATIO = 1.4
-"""Ratio of neighbouring point spreads if defocus varies; the error of cubic interpolation in their
-logarithm is then at most 0.1 grey levels."""
 
 
 def marker_exposure(

@@ -19,20 +19,20 @@ from sweep.messages import nearest_file
 # --------------------------------------------------------------------------------------------------
 # Image files named by a pipeline: their size is read and checked before they are decoded.
 
+#: Size of the largest image that is read, and of the largest frame that is rendered whole.
 MAX_PIXELS = 500_000_000
-"""Size of the largest image that is read, and of the largest frame that is rendered whole."""
 
+#: Size of the largest image file: four channels of 16 bits.
 MAX_IMAGE_BYTES = 8 * MAX_PIXELS
-"""Size of the largest image file: four channels of 16 bits."""
 
+#: Ends of the names of image files, in lower case.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm")
-"""Ends of the names of image files, in lower case."""
 
+#: First bytes of a JPEG file.
 JPEG = b"\xff\xd8\xff"
-"""First bytes of a JPEG file."""
 
+#: First bytes of the files with these ends.
 SIGNATURES = (JPEG, b"\x89PNG", b"BM", *(b"P%d" % kind for kind in range(1, 7)))
-"""First bytes of the files with these ends."""
 
 
 def read_regular(path: str | Path, most: int) -> bytes:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled, compiled_inline
 
+#: Numbers of coefficients that OpenCV's models have.
 COUNTS = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV's models have."""
 
+#: Length of a packed lens: 14 coefficients, the 3x3 sensor tilt (row major), the fold radius.
 PACKED = 24
-"""Length of a packed lens: 14 coefficients, the 3x3 sensor tilt (row major), the fold radius."""
 
 
 def _tilt_matrix(tau_x: float, tau_y: float) -> NDArray[np.float64]:

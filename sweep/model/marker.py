@@ -49,6 +49,7 @@ class Family:
     digest: str = ""
 
 
+#: By AprilTag's own names.
 TAG_FAMILIES = {
     "tagCircle21h7": Family(5, 2, 38),
     "tagCircle49h12": Family(5, 3, 65_535),
@@ -56,10 +57,9 @@ TAG_FAMILIES = {
     "tagStandard41h12": Family(5, 2, 2_115),
     "tagStandard52h13": Family(6, 2, 48_714),
 }
-"""By AprilTag's own names."""
 
+#: Python packages whose AprilTag library has all families.
 PACKAGES = ("pyapriltags", "pupil_apriltags")
-"""Python packages whose AprilTag library has all families."""
 
 
 class _Family(ctypes.Structure):
@@ -120,9 +120,10 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
 # neighbouring dots joined and smoothed; here the dots are apart. The detector reads dots at their
 # centres, and takes corners from the square and from the circle.
 
+#: A module is an eighth of the side: as wide as the white margin of published markers.
 STAG_MODULES = 8
-"""A module is an eighth of the side: as wide as the white margin of published markers."""
 
+#: By the Hamming distance between their codes.
 STAG_LIBRARIES = {
     "STAG_HD11": Family(STAG_MODULES, 0, 22_309, "8b094d9a0e7f9595"),
     "STAG_HD13": Family(STAG_MODULES, 0, 2_884, "d452276ebcb1fbad"),
@@ -132,13 +133,14 @@ STAG_LIBRARIES = {
     "STAG_HD21": Family(STAG_MODULES, 0, 12, "7ac380b8f8dfac5b"),
     "STAG_HD23": Family(STAG_MODULES, 0, 6, "b4881e97f27dddbf"),
 }
-"""By the Hamming distance between their codes."""
 
 CIRCLE_RADIUS = 0.4 * STAG_MODULES
 DOTS_RADIUS = 0.35 * STAG_MODULES
+#: In modules: the white circle, the circle that encloses the dots, and a dot.
 DOT_RADIUS = 0.062482177287080 * 2 * DOTS_RADIUS
-"""In modules: the white circle, the circle that encloses the dots, and a dot."""
 
+#: Of a quadrant's 12 dots: distance from the centre in diameters of their circle, and angle from x
+#: towards y, which points up. The other quadrants follow counter-clockwise.
 DOT_POSITIONS = (
     (0.088363142525988, math.pi / 4),
     (0.206935928182607, 0.459275804122858), (0.206935928182607, math.pi / 2 - 0.459275804122858),
@@ -150,14 +152,12 @@ DOT_POSITIONS = (
     (0.437226762361658, math.pi / 2 - 0.433363129825345),
     (0.437421957035861, math.pi / 2 - 0.145724938287167),
 )
-"""Of a quadrant's 12 dots: distance from the centre in diameters of their circle, and angle from x
-towards y, which points up. The other quadrants follow counter-clockwise."""
 
 CODE_BITS = 48
 
+#: Sides of the polygons of equal area that stand for the circles: they deviate from them by less
+#: than 1/20,000 of the marker's side.
 CIRCLE_SIDES, DOT_SIDES = 256, 64
-"""Sides of the polygons of equal area that stand for the circles: they deviate from them by less
-than 1/20,000 of the marker's side."""
 
 
 def library_file() -> Path | None:
@@ -224,11 +224,11 @@ def dot_centres() -> Floats:
 
 check_opencv()  # the dictionaries below are those of the OpenCV that is loaded
 
+#: Of markers that OpenCV lacks: AprilTag's and STag's.
 FAMILIES = {**TAG_FAMILIES, **STAG_LIBRARIES}
-"""Of markers that OpenCV lacks: AprilTag's and STag's."""
 
+#: Codes of the areas beside an edge.
 OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
-"""Codes of the areas beside an edge."""
 
 
 def opencv_dictionary_names() -> tuple[str, ...]:

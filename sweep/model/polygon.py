@@ -56,8 +56,8 @@ def half_plane(polygon: Floats, inside: Floats) -> Floats:
 # Module coordinates (column right, row down, origin at the black square's top left corner) are
 # taken to the camera frame by a plane, and from there to pixels by the camera's optics.
 
+#: Largest distance of a chord from the curved edge that it replaces; 0.03 grey levels at most.
 CHORD_TOLERANCE_PX = 1e-4
-"""Largest distance of a chord from the curved edge that it replaces; 0.03 grey levels at most."""
 
 
 class Optics(NamedTuple):
@@ -143,20 +143,20 @@ def clip(a: float, b: float, lower: float, upper: float) -> tuple[float, float]:
 # A bent sheet keeps its tangent plane at one point, the centre: the pose is that plane's. A
 # cylinder bends without stretching; a saddle stands h = -k (a² - b²) / 2 over the tangent plane.
 
+#: Largest turn of a bent sheet along a piece of an edge that is divided into chords on its own.
 PIECE_RAD = 0.25
-"""Largest turn of a bent sheet along a piece of an edge that is divided into chords on its own."""
 
+#: Longest such piece in correlation lengths of the shift.
 PIECE_LENGTHS = 0.5
-"""Longest such piece in correlation lengths of the shift."""
 
 MAX_PIECES = 256
 
+#: Least number of cells along a marker's side whose images are checked for folds.
 FOLD_CELLS = 8
-"""Least number of cells along a marker's side whose images are checked for folds."""
 
+#: Largest turn of a bent sheet from cell to cell; a fold between them covers 1/2,000 of the radius
+#: of curvature at most.
 FOLD_RAD = 0.05
-"""Largest turn of a bent sheet from cell to cell; a fold between them covers 1/2,000 of the
-radius of curvature at most."""
 
 MAX_FOLD_CELLS = 256
 

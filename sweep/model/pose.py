@@ -222,11 +222,11 @@ def mirrored(rotation: Floats, translation: Floats) -> Floats:
 #
 # Camera frame: x right, y down, z forward. Angles in radians, (N,) each.
 
+#: Rx(180°): the marker frame (y up, z out) of an upright marker that faces the camera.
 ABOUT_X_180 = np.diag([1.0, -1.0, -1.0])
-"""Rx(180°): the marker frame (y up, z out) of an upright marker that faces the camera."""
 
+#: Sine or cosine of half a tilt below which the tilt's axis, or the roll, has no meaning.
 DEGENERATE = 1e-15
-"""Sine or cosine of half a tilt below which the tilt's axis, or the roll, has no meaning."""
 
 
 def axis_rotation(axis: int, angle: Floats) -> Floats:
@@ -296,14 +296,13 @@ def _wrapped(angle: Floats) -> Floats:
 # World frame: x forward, y left, z up (ROS REP 103). At angles of zero the camera looks along the
 # world's x with z up, and the marker faces along x, upright.
 
+#: Takes a camera's body frame (x forward, y left, z up) to its image's (x right, y down).
 OPTICAL_OF_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Takes a camera's body frame (x forward, y left, z up) to its image's (x right, y down)."""
 
+#: Takes the marker frame (x right, y up, z out) to its body's: x out of its face, z up.
+#:
+#: Whoever looks at the marker sees the body's left, y, on the right.
 BODY_OF_MARKER = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Takes the marker frame (x right, y up, z out) to its body's: x out of its face, z up.
-
-Whoever looks at the marker sees the body's left, y, on the right.
-"""
 
 
 def _coordinate(whose: str, axis: str) -> Any:

@@ -95,8 +95,8 @@ def _cut(image: Grey, computed: Box, window: Box) -> Grey:
 # --------------------------------------------------------------------------------------------------
 # The renderers: ``exact``, ``warp`` and ``supersample-N`` behind one signature.
 
+#: Renderer of scenes whose background is a photograph that shows the marker already.
 PHOTOGRAPH = "photograph"
-"""Renderer of scenes whose background is a photograph that shows the marker already."""
 
 
 @lru_cache(maxsize=16)
@@ -297,11 +297,11 @@ def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
     )
 
 
+#: The most pixels of a board's bitmap, which take 0.5 GB while it is drawn.
 MAX_BITMAP_PX = 25_000_000
-"""The most pixels of a board's bitmap, which take 0.5 GB while it is drawn."""
 
+#: The longest side of what ``cv2.warpPerspective`` takes, whose coordinates are 16-bit integers.
 MAX_BITMAP_SIDE = 32_766
-"""The longest side of what ``cv2.warpPerspective`` takes, whose coordinates are 16-bit integers."""
 
 
 def bitmap_shape(target: Board) -> tuple[int, int]:
@@ -492,8 +492,8 @@ def supersample(
 # --------------------------------------------------------------------------------------------------
 # Which pixels show what stands beside a target.
 
+#: Share of a pixel that counts: less is rounding.
 _SHARE = 1e-9
-"""Share of a pixel that counts: less is rounding."""
 
 
 def beside_pixels(scenes: Scenes, row: int, box: Box) -> Masks:

@@ -28,8 +28,8 @@ from sweep.typing import Floats
 
 SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
 
+#: The names in words.
 RENDERERS = "exact, warp, supersample-N or supersample-N-jittered with N from 1 to 999"
-"""The names in words."""
 
 
 def is_renderer(name: str) -> bool:
@@ -49,8 +49,8 @@ def renderer_name(value: Any) -> str:
 # Scenes: cameras, markers, poses and effects put together.
 
 Key = TypeVar("Key")
+#: Left, top, right, bottom in pixels of the frame; half-open.
 Box = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels of the frame; half-open."""
 
 @dataclass(frozen=True, slots=True)
 class Scene:

@@ -113,8 +113,8 @@ def digitise(levels: Floats, bits: int, image: NDArray[np.uint8]) -> None:
             image[i, j] = np.uint8(counts)
 
 
+#: The draw of a pixel that plain grey noise is made from, correlated or not.
 GREY_NOISE_DRAW = 2
-"""The draw of a pixel that plain grey noise is made from, correlated or not."""
 
 
 @compiled
@@ -131,8 +131,8 @@ def standard_normals(key: np.uint64, draw: int, left: int, top: int, normals: Fl
 # --------------------------------------------------------------------------------------------------
 # Noise that is correlated from pixel to pixel.
 
+#: Standard deviations at which the kernel's Gaussian is cut off.
 REACH = 5.0
-"""Standard deviations at which the kernel's Gaussian is cut off."""
 
 
 @lru_cache(maxsize=256)
@@ -194,18 +194,18 @@ def normal_field(
 # --------------------------------------------------------------------------------------------------
 # A grey scene seen through a colour filter array, and made grey again by OpenCV.
 
+#: Filters of the frame's first two pixels, then those of the two below them.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""Filters of the frame's first two pixels, then those of the two below them."""
 
+#: Demosaicing by name -> the ending of OpenCV's conversion code.
 METHODS = {"bilinear": "", "edge_aware": "_EA"}
-"""Demosaicing by name -> the ending of OpenCV's conversion code."""
 
+#: Pixels around a pixel that its result depends on: neighbours, and at the frame's border the
+#: neighbours of the pixel that OpenCV copies there.
 REACH_PX = 2
-"""Pixels around a pixel that its result depends on: neighbours, and at the frame's border the
-neighbours of the pixel that OpenCV copies there."""
 
+#: The raw image has 16 bits: 65535 at level 255.
 STEPS_PER_LEVEL = 257.0
-"""The raw image has 16 bits: 65535 at level 255."""
 
 
 def demosaiced(
@@ -239,11 +239,11 @@ def demosaiced(
 # --------------------------------------------------------------------------------------------------
 # JPEG: an image through the encoder and the decoder that OpenCV has.
 
+#: Sides of the blocks that a grey image is compressed in, each on its own.
 BLOCK_PX = 8
-"""Sides of the blocks that a grey image is compressed in, each on its own."""
 
+#: Largest side of an image that is compressed at once, in whole blocks: JPEG ends at 65535.
 TILE_PX = 1 << 14
-"""Largest side of an image that is compressed at once, in whole blocks: JPEG ends at 65535."""
 
 
 def compressed(image: Grey, quality: int) -> Grey:
@@ -269,8 +269,8 @@ def compressed(image: Grey, quality: int) -> Grey:
 
 MAX_LEVEL = 255.0
 
+#: The share of the scale, from its end, over which toe and knee act: they never overlap.
 BEND = 0.5
-"""The share of the scale, from its end, over which toe and knee act: they never overlap."""
 
 
 def bloomed(levels: Floats, black: float, white: float, bloom: float) -> Floats:

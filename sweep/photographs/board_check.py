@@ -23,13 +23,7 @@ from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary_names
 from sweep.model.polygon import side_lengths
 from sweep.model.pose import rotation_of_vector
-from sweep.photographs.folder import (
-    FoundCorners,
-    KnownCamera,
-    Photograph,
-    detect_markers,
-    named,
-)
+from sweep.photographs.folder import FoundCorners, KnownCamera, Photograph, detect_markers, named
 from sweep.photographs.pose_fit import Lens
 from sweep.photographs.truth import fitted_board
 from sweep.typing import Floats, Integers, Masks
@@ -37,30 +31,30 @@ from sweep.typing import Floats, Integers, Masks
 # --------------------------------------------------------------------------------------------------
 # Whether photographs show the board that was described; if not, which one fits better.
 
+#: Share of the detected markers that lie where the board has them.
 MIN_FITTING = 0.8
-"""Share of the detected markers that lie where the board has them."""
 
+#: Share of fitting markers from which no other board is tried.
 DOUBTFUL = 0.98
-"""Share of fitting markers from which no other board is tried."""
 
+#: By how much more of the markers another board must fit.
 CLEARLY = 0.02
-"""By how much more of the markers another board must fit."""
 
+#: Distance of a corner to its place by the board's homography, as a share of the marker's side.
 FITTING_SHARE = 0.2
-"""Distance of a corner to its place by the board's homography, as a share of the marker's side."""
 
+#: Relative difference of the markers' measured side to the board's that is refused; blur makes
+#: detected markers up to 5 % smaller.
 MAX_SIZE_ERROR = 0.08
-"""Relative difference of the markers' measured side to the board's that is refused; blur makes
-detected markers up to 5 % smaller."""
 
+#: Share of the markers of a single photograph that must lie there, and how many tell.
 MIN_OWN, MIN_JUDGED = 0.6, 4
-"""Share of the markers of a single photograph that must lie there, and how many tell."""
 
+#: Photographs in which other dictionaries, and halves side by side, are searched for.
 MAX_TRIED = 3
-"""Photographs in which other dictionaries, and halves side by side, are searched for."""
 
+#: IDs (k,) and corners (k, 4, 2) px of each photograph.
 Seen = Sequence[tuple[Integers, Floats]]
-"""IDs (k,) and corners (k, 4, 2) px of each photograph."""
 
 
 def check_board(
@@ -169,11 +163,11 @@ def _on_board(board: Board, ids: Integers) -> tuple[Masks, Floats]:
     return known, board.corners_m[[index[each] for each in ids[known].tolist()], :, :2]
 
 
+#: Kind of a board -> keys of how many squares or markers it has across and down.
 COUNTS = {
     "charuco": ("squares_x", "squares_y"), "grid": ("columns", "rows"),
     "aprilgrid": ("tagCols", "tagRows"),
 }
-"""Kind of a board -> keys of how many squares or markers it has across and down."""
 
 
 def _others(path: Path) -> Iterator[tuple[str, Board]]:
@@ -255,17 +249,17 @@ def _no_marker(
 # --------------------------------------------------------------------------------------------------
 # Whether a camera's file is of the photographs' resolution, where it does not say.
 
+#: RMS of a board's corners, in the median photograph, from which other resolutions are tried.
 DOUBTFUL_PX = 0.5
-"""RMS of a board's corners, in the median photograph, from which other resolutions are tried."""
 
+#: Share of that RMS below which another resolution fits.
 CLEARLY_BETTER = 0.5
-"""Share of that RMS below which another resolution fits."""
 
+#: Photographs with the most corners in which they are tried.
 MAX_TRIED_VIEWS = 5
-"""Photographs with the most corners in which they are tried."""
 
+#: Resolutions of photographs over the resolution of a calibration.
 SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "2", "3", "4")))
-"""Resolutions of photographs over the resolution of a calibration."""
 
 
 def check_resolution(
@@ -324,15 +318,15 @@ def _median_rms(lens: Lens, found: Sequence[FoundCorners]) -> float:
 # --------------------------------------------------------------------------------------------------
 # The camera from the photographs themselves.
 
+#: Photographs with a board from which a camera is calibrated.
 MIN_PHOTOGRAPHS = 4
-"""Photographs with a board from which a camera is calibrated."""
 
+#: Corners of a board in a photograph that is used.
 MIN_CORNERS = 12
-"""Corners of a board in a photograph that is used."""
 
+#: RMS of the corners beside the calibrated camera that is refused, in images of 800 px or less; in
+#: larger ones it grows with the width.
 MAX_RMS_PX = 2.0
-"""RMS of the corners beside the calibrated camera that is refused, in images of 800 px or less; in
-larger ones it grows with the width."""
 
 
 def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCamera:

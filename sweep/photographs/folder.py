@@ -30,8 +30,8 @@ from sweep.typing import Floats, Integers
 # --------------------------------------------------------------------------------------------------
 # The photographs of a folder: which files they are, and lines on them for the user.
 
+#: The most files that a line names.
 MAX_NAMED = 3
-"""The most files that a line names."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,17 +182,17 @@ def _conversions(content: bytes) -> list[str]:
 # homography says where they are about, and ``cv2.cornerSubPix`` measures them. Of other boards
 # they are the markers' corners, as OpenCV refines them.
 
+#: Markers whose corners give the homography around a corner of the chessboard.
 NEIGHBOURS = 4
-"""Markers whose corners give the homography around a corner of the chessboard."""
 
+#: Half window of the search, as a share of the distance to the nearest corner of a marker.
 WINDOW_SHARE = 0.8
-"""Half window of the search, as a share of the distance to the nearest corner of a marker."""
 
+#: Half windows, in pixels.
 MIN_WINDOW, MAX_WINDOW = 2, 11
-"""Half windows, in pixels."""
 
+#: The detector that finds the corners of boards: whatever is under test, truth is the same.
 REFERENCE = DetectorSetting(cornerRefinementMethod="subpix")
-"""The detector that finds the corners of boards: whatever is under test, truth is the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

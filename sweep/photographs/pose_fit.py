@@ -18,16 +18,16 @@ from sweep.typing import Floats, Integers, Masks
 
 MAX_STEPS = 20
 
+#: Step, in rad and in shares of the distance, below which the iteration ends.
 CONVERGED = 1e-9
-"""Step, in rad and in shares of the distance, below which the iteration ends."""
 
+#: Residuals beyond this many robust standard deviations are left out.
 OUTLIER = 4.0
-"""Residuals beyond this many robust standard deviations are left out."""
 
 MIN_OUTLIER_PX = 0.5
 
+#: Standard deviation over the median absolute value, of a normal variable of mean 0.
 MAD_TO_STD = 1.4826
-"""Standard deviation over the median absolute value, of a normal variable of mean 0."""
 
 
 class Lens(NamedTuple):

@@ -50,8 +50,8 @@ from sweep.typing import Floats
 
 PathName = str | os.PathLike[str]
 
+#: In the place of a camera's file: calibrated from the photographs.
 CALIBRATE = "calibrate"
-"""In the place of a camera's file: calibrated from the photographs."""
 
 
 def prepare(

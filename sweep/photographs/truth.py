@@ -35,8 +35,8 @@ from sweep.typing import Floats, Integers
 # Corners by OpenCV's subpix refinement, poses by IPPE: the better of the two planar solutions in
 # one image, or in two images the one that fits both of them better.
 
+#: Markers seen by both cameras from which the spread of their poses is estimated.
 MIN_PAIRS = 12
-"""Markers seen by both cameras from which the spread of their poses is estimated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,8 +187,8 @@ def is_within(
 # --------------------------------------------------------------------------------------------------
 # Cameras of photographs from files: one camera, or two with the pose of one to the other.
 
+#: Largest deviation of RᵀR from the identity; files have few digits.
 ORTHOGONAL = 1e-3
-"""Largest deviation of RᵀR from the identity; files have few digits."""
 
 
 def camera_of_file(written: str, size: tuple[int, int] | None = None) -> Calibration:
@@ -307,11 +307,11 @@ def _numbers(written: str, tree: Any, name: str, count: int) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # Truth by a file of poses, which is checked against the markers that are detected.
 
+#: Distance of a detected corner to the one of the file's pose, as a share of the marker's side.
 NEAR_SHARE = 0.5
-"""Distance of a detected corner to the one of the file's pose, as a share of the marker's side."""
 
+#: Ratio of distances from which positions are taken for those in another unit.
 OTHER_UNIT = 1.5
-"""Ratio of distances from which positions are taken for those in another unit."""
 
 
 def poses_of_file(
@@ -412,14 +412,14 @@ def _fault(
 # lead to the same change of the pose: what truth and estimates share is no error of either
 # against the other. A bent board is not in it.
 
+#: Corners of a board, without the marker's own, from which its pose is taken for known.
 MIN_CORNERS = 6
-"""Corners of a board, without the marker's own, from which its pose is taken for known."""
 
+#: Corners in each of two halves whose poses are compared.
 MIN_HALF = 5
-"""Corners in each of two halves whose poses are compared."""
 
+#: Takes points of a board to a frame with z away from the viewer, where IPPE is stable.
 Z_IN = np.diag([1.0, -1.0, -1.0])
-"""Takes points of a board to a frame with z away from the viewer, where IPPE is stable."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,8 +18,8 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.messages import notice, plain
 from sweep.model.image_file import read_regular
 
+#: Name of the twins of photographs of a name.
 NAME = "{}-twins"
-"""Name of the twins of photographs of a name."""
 
 
 def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1) -> Pipeline:

@@ -227,11 +227,11 @@ class RendererPlugin(Plugin):
             raise TypeError("render: expected a function of a view")
 
 
+#: Kind of plug-in -> the field that a class or function may stand for, in place of a record.
 FACTORY = {"detector": "make", "estimator": "make", "renderer": "render"}
-"""Kind of plug-in -> the field that a class or function may stand for, in place of a record."""
 
+#: Kind of plug-in -> its record.
 RECORDS: dict[str, type[Plugin]] = {
     record.kind: record
     for record in (DetectorPlugin, EstimatorPlugin, EffectPlugin, RendererPlugin)
 }
-"""Kind of plug-in -> its record."""

@@ -22,8 +22,8 @@ from sweep.plugins.recording import RecordedDetector
 # --------------------------------------------------------------------------------------------------
 # A plug-in as pipelines and stores know it: all that can be said of it without importing it.
 
+#: Types that a setting may have.
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
-"""Types that a setting may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,8 +183,8 @@ def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
     return tuple(DeclaredPlugin.from_json(record) for record in metadata.get(RECORDED, ()))
 
 
+#: Key of the plug-ins in a store's metadata.
 RECORDED = "plugins"
-"""Key of the plug-ins in a store's metadata."""
 
 
 def _listed(versions: tuple[tuple[str, str], ...]) -> str:
@@ -216,11 +216,11 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
     )
 
 
+#: Fields of records that are known without importing them.
 TRAITS: dict[str, type] = {
     "threads": int, "needs_images": bool, "of_boards": bool, "random": bool, "widens": str,
     "step": str,
 }
-"""Fields of records that are known without importing them."""
 
 
 def _settings(record: Plugin) -> Iterator[Setting]:

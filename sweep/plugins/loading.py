@@ -59,8 +59,8 @@ def printing_to_stderr() -> Iterator[None]:
 # A file is executed from the bytes whose digest is taken. It is a module of its own: one that
 # imports others beside it is refused, so that the digest says all of it.
 
+#: Its adapters' results change with the version of the numbers, which is recorded in any case.
 OWN_DISTRIBUTION = "fiducial-sweep"
-"""Its adapters' results change with the version of the numbers, which is recorded in any case."""
 
 MAX_SOURCE_BYTES = 1 << 20
 

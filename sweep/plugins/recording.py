@@ -22,11 +22,11 @@ from sweep.typing import Floats
 
 SUFFIX = ".npz"
 
+#: The ID of a candidate that was not decoded.
 REJECTED = -1
-"""The ID of a candidate that was not decoded."""
 
+#: The ID of a pose that is of the target as a whole, not of one of its markers.
 OF_TARGET = -2
-"""The ID of a pose that is of the target as a whole, not of one of its markers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,12 +79,12 @@ def _made(arrays: Mapping[str, NDArray[Any]]) -> Recording:
     return Recording(**{name: arrays[name] for name in RECORDINGS.arrays})
 
 
+#: Files of recordings.
 RECORDINGS = ArrayFile("detections that `sweep score` recorded", 1, {
     "exported": ("u8", ("E",)), "image": ("u8", ("M",)), "marker_id": ("i8", ("M",)),
     "corners": ("f8", ("M", 4, 2)), "rotation": ("f8", ("M", 3, 3)),
     "translation": ("f8", ("M", 3)),
 }, _made)
-"""Files of recordings."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

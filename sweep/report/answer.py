@@ -146,8 +146,8 @@ def answer(data: ReportData) -> Answer:
 # --------------------------------------------------------------------------------------------------
 # Requirements on a report's store: the decision, how far it holds, with which configuration.
 
+#: Decisions, the best first.
 ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
-"""Decisions, the best first."""
 
 
 class Required(NamedTuple):

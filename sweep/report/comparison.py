@@ -14,18 +14,14 @@ from sweep.analysis import compare
 from sweep.analysis.comparisons import paired_table
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import QUANTITIES
-from sweep.report.report_data import (
-    CONFIGURATION,
-    Configurations,
-    ReportData,
-    configurations,
-)
+from sweep.report.report_data import CONFIGURATION, Configurations, ReportData, configurations
 from sweep.report.table import Column, Table, Value, number
 from sweep.tradeoff.pareto import WRONG, conditions_of
 
+#: Poses flipped in one of two configurations alone from which an RMSE with flips is compared.
 MIN_FLIPPED = 10
-"""Poses flipped in one of two configurations alone from which an RMSE with flips is compared."""
 
+#: Numbers of each configuration, and of the named one in the report's cards.
 CARDS = (
     Column("detected, %", "detection_rate", 100), Column("solved, %", "solved_rate", 100),
     Column("rotation median, deg", "rotation_median_deg"),
@@ -33,10 +29,9 @@ CARDS = (
     Column("range RMSE, %", "range_rmse_percent"), Column("range bias, %", "range_bias_percent"),
     Column("flips, %", "flip_rate", 100),
 )
-"""Numbers of each configuration, and of the named one in the report's cards."""
 
+#: Share -> what it is of.
 COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_rate": "solved"}
-"""Share -> what it is of."""
 
 
 # Of two equal configurations differences are 0, where large is good, and ratios 1.
@@ -48,9 +43,9 @@ UNFLIPPED = Column(
 RANGE = Column("range RMSE ratio", "range_rmse_ratio", 1.0, 1.0)
 PAIRED = (DETECTION, SOLVED, ROTATION, RANGE)
 
+#: Level of the intervals that decide: two equal configurations are told apart by any of the four
+#: quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are shown.
 DECIDING_LEVEL = 1.0 - (1.0 - LEVEL) / len(PAIRED)
-"""Level of the intervals that decide: two equal configurations are told apart by any of the four
-quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are shown."""
 
 VERDICTS = {1: "better", 0: "not decided", -1: "worse"}
 

@@ -11,13 +11,7 @@ import xarray as xr
 from sweep.analysis.dataset import each_cell
 from sweep.analysis.estimator import Bins
 from sweep.analysis.poses import QUANTITIES, Poses
-from sweep.analysis.simulation_gaps import (
-    QUANTILES,
-    RATES,
-    SOURCES,
-    Compared,
-    paired_units,
-)
+from sweep.analysis.simulation_gaps import QUANTILES, RATES, SOURCES, Compared, paired_units
 from sweep.report.figure import Figure
 from sweep.report.table import (
     Column,
@@ -35,13 +29,13 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # Photographs beside their simulation.
 
+#: Names of the statistics in a table.
 WORDS = {
     "detection_rate": "detected, %", "flip_rate": "flipped, % of solved",
     "range_bias_percent": "range bias, %", "rotation_median_deg": "rotation error, median, \u00b0",
     "rotation_p90_deg": "rotation error, 90 %, \u00b0",
     "range_median_percent": "range error, median, %", "range_p90_percent": "range error, 90 %, %",
 }
-"""Names of the statistics in a table."""
 
 
 def gap_table(gap: xr.Dataset) -> Table:
@@ -80,11 +74,11 @@ def _scale(each: Compared) -> float:
     return 100.0 if each in RATES else 1.0
 
 
+#: Configurations that are drawn, two panels each.
 MAX_CONFIGURATIONS = 6
-"""Configurations that are drawn, two panels each."""
 
+#: Percent of the solved poses at which the errors' distributions are drawn.
 PERCENT = np.arange(2.0, 99.0, 2.0)
-"""Percent of the solved poses at which the errors' distributions are drawn."""
 
 SHARE = Column("share of solved poses, %", "share", 100)
 

@@ -44,8 +44,8 @@ WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "
 
 UNITS = {"": "", "1": "", "percent": " %", "degree": "\u00b0"}
 
+#: Conditions that JSON lists.
 MAX_ROWS = 500
-"""Conditions that JSON lists."""
 
 
 def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.Dataset:

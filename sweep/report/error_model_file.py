@@ -29,15 +29,16 @@ from sweep.version import __version__
 
 SCHEMA = "sweep-error-model/3"
 
+#: Variables of the models that the file has of each quantity.
 OF_QUANTITIES = (
     *(f"{name}{end}" for name in ("sigma", "bias", "exponent") for end in INTERVAL), "knots",
     "coverage", "camera_coverage")
-"""Variables of the models that the file has of each quantity."""
 
 FRAME = (
     "sight frame: the camera's frame (x right, y down, z forward), turned by the shortest way so "
     "that z is the line of sight to the marker's centre"
 )
+#: How the numbers of the file are used.
 FORMULA = {
     "u": "(ln(distance_m), ln(side_px), viewing_angle_deg, bearing_deg)",
     "region": "u was seen if low <= sum of weights * u <= high for every direction, and if seen is "
@@ -52,16 +53,15 @@ FORMULA = {
                   "and k = 1 / (1 + c): Q = [[1 - k a^2, -k a b, a], [-k a b, 1 - k b^2, b], "
                   "[-a, -b, c]]",
 }
-"""How the numbers of the file are used."""
 
+#: Of the usual rule for one tag: sigma = 0.02 d² metres.
 RULE_M = 0.02
-"""Of the usual rule for one tag: sigma = 0.02 d² metres."""
 
+#: Warnings of every model.
 ALWAYS = (
     "sigma is of poses that are not flipped: where flips are not rejected, flip_rate counts too",
     "azimuth, roll and direction of the bearing are pooled; other cameras, markers, light differ",
 )
-"""Warnings of every model."""
 
 
 def check_error_model_file(path: str) -> None:
@@ -251,8 +251,8 @@ CAPTION = (
     "frame: z along the line of sight"
 )
 MAX_DISTANCES, MAX_SIDES = 4, 3
+#: The table has the knots nearest to these.
 ANGLES_DEG = (0.0, 30.0, 60.0)
-"""The table has the knots nearest to these."""
 
 
 def error_model_tables(data: ReportData) -> tuple[Table, ...]:

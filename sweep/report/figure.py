@@ -29,16 +29,17 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # The colours, shapes and matplotlib settings of all figures.
 
+#: The palette of Okabe and Ito, distinguishable by the colour-blind; without its yellow, which is
+#: too faint for a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-"""The palette of Okabe and Ito, distinguishable by the colour-blind; without its yellow, which is
-too faint for a line."""
 
 SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+#: Text; secondary text and lines; grid lines; shaded areas; background.
 INK, FAINT, RULE, STRIP, PAPER = "#282828", "#7a7a7a", "#e6e6e6", "#f3f3f3", "#ffffff"
-"""Text; secondary text and lines; grid lines; shaded areas; background."""
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
+#: Settings of matplotlib in which every panel is drawn.
 MATPLOTLIB_STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "sweep",
@@ -54,35 +55,34 @@ MATPLOTLIB_STYLE: Any = {
     "legend.frameon": False, "legend.fontsize": 8.5, "legend.labelcolor": INK,
     "font.size": 8.5, "lines.linewidth": 1.5, "figure.constrained_layout.use": True,
 }
-"""Settings of matplotlib in which every panel is drawn."""
 
+#: Inches of a panel, and of a line of its legend.
 WIDTH, HEIGHT, LINE_HEIGHT = 4.4, 3.2, 0.15
-"""Inches of a panel, and of a line of its legend."""
 
 COLUMNS = 2
 DOTS_PER_INCH = 150
 
+#: Lines of a panel, panels of a column, and rows of dots.
 MAX_LINES, MAX_PANELS, MAX_DOTS = 7, 4, 40
-"""Lines of a panel, panels of a column, and rows of dots."""
 
+#: Points by which neighbouring lines are shifted, so that their intervals do not overlap.
 DODGE = 2.2
-"""Points by which neighbouring lines are shifted, so that their intervals do not overlap."""
 
+#: Characters of a legend's line across a panel, and of the name of a row.
 LEGEND_CHARS, ROW_CHARS = 62, 30
-"""Characters of a legend's line across a panel, and of the name of a row."""
 
+#: Up to this many values of an axis have ticks of their own.
 MAX_OWN_TICKS = 7
-"""Up to this many values of an axis have ticks of their own."""
 
+#: Up to this many points that are not on the front have their names beside them.
 MAX_NAMED = 8
-"""Up to this many points that are not on the front have their names beside them."""
 
+#: Size of the names beside points; a letter is about 0.6 of it wide.
 NAME_PT = 8
-"""Size of the names beside points; a letter is about 0.6 of it wide."""
 
+#: A line that marks a reference, such as a bound.
 REFERENCE: dict[str, Any] = {
     "color": INK, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 1.5}
-"""A line that marks a reference, such as a bound."""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -165,8 +165,8 @@ class Figure:
         return lines
 
 
+#: Of rows of dots: their number.
 PLACE = "place"
-"""Of rows of dots: their number."""
 
 
 class Line(NamedTuple):
@@ -393,12 +393,12 @@ def panels_file(panels: Sequence[Panel], suffix: str) -> bytes:
 # --------------------------------------------------------------------------------------------------
 # Scales of charts: whether logarithmic, between which ends, with which ticks.
 
+#: Values that span a larger ratio are drawn on a logarithmic scale.
 LOGARITHMIC_FROM = 6
-"""Values that span a larger ratio are drawn on a logarithmic scale."""
 
+#: Values below this part of the largest are drawn at the lower edge of a logarithmic axis: errors
+#: of rounding would compress all others.
 FLOOR_RATIO = 1e-6
-"""Values below this part of the largest are drawn at the lower edge of a logarithmic axis: errors
-of rounding would compress all others."""
 
 
 def spans(values: Floats, ratio: float) -> bool:

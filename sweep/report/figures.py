@@ -67,16 +67,16 @@ ERRORS = (
     Column("rotation RMSE without flips, deg", "rotation_rmse_unflipped_deg"),
     RANGE_MEDIAN, RANGE_P95, Column("range RMSE without flips, %", "range_rmse_unflipped_percent"),
     RANGE_BIAS, FLIPS)
+#: Kinds of errors, as `sweep.analysis.error_statistics` takes them.
 SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
-"""Kinds of errors, as `sweep.analysis.error_statistics` takes them."""
 
+#: Bias and standard deviation along the camera's axes and about the angles.
 SIGNED_COLUMNS = (SOLVED_COUNT, RANGE_BIAS, *(
     Column(f"{name} {words}, {unit}", f"{name}_{statistic}_{stored}", scale,
            0.0 if words == "bias" else None)
     for names, unit, stored, scale in (("xyz", "mm", "m", 1000.0),
                                        (("yaw", "pitch", "roll"), "deg", "deg", 1.0))
     for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))))
-"""Bias and standard deviation along the camera's axes and about the angles."""
 
 SIGNED_CURVES = tuple(
     column for column in SIGNED_COLUMNS
@@ -88,11 +88,11 @@ INFINITE_ERRORS = (
     "In median and p95 a pose that is not solved counts as an infinite error (drawn at the edge); "
     "an interval that reaches the edge ends beyond all draws.")
 
+#: Groups of a numeric axis.
 MAX_BINS = 40
-"""Groups of a numeric axis."""
 
+#: Angles that are lines of one configuration, and panels of several.
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
-"""Angles that are lines of one configuration, and panels of several."""
 
 
 def sentences(*parts: str) -> str:
@@ -206,8 +206,8 @@ def _bias(data: ReportData) -> Figure | None:
         SIGNED_COLUMNS, SIGNED_CURVES, counted="solved")
 
 
+#: From this many values on, an axis of numbers has a figure along it beside its configurations.
 MIN_DRAWN = 3
-"""From this many values on, an axis of numbers has a figure along it beside its configurations."""
 
 
 def _configurations(data: ReportData) -> Figure | None:
@@ -264,8 +264,8 @@ def _outcomes(data: ReportData) -> Figure:
 
 ACROSS, DOWN = "frame_u_percent", "frame_v_percent"
 FRAME_COLUMNS, FRAME_ROWS = 8, 4
+#: From this range of places on, in percent of the frame's width, there is a figure.
 MIN_RANGE_PERCENT = 10.0
-"""From this range of places on, in percent of the frame's width, there is a figure."""
 
 TRUE = "true_tvec_m"
 
@@ -299,8 +299,8 @@ def _frame(data: ReportData) -> Figure | None:
         RATES, [DETECTED], by=data.label(DOWN))
 
 
+#: Marker IDs that have a row of their own in the figure.
 WEAKEST = 24
-"""Marker IDs that have a row of their own in the figure."""
 
 
 def _ranking(data: ReportData) -> Figure | None:
@@ -365,14 +365,14 @@ def _bound(data: ReportData) -> Figure | None:
 
 # Thresholds on the ambiguity: what they keep of the poses, and of the flips.
 
+#: The threshold that many programs use.
 USUAL = 0.2
-"""The threshold that many programs use."""
 
+#: Viewing angle up to which a pose hardly differs from its mirror.
 FRONTAL_DEG = 5.0
-"""Viewing angle up to which a pose hardly differs from its mirror."""
 
+#: The most sizes, or angles, that are told apart.
 CONDITIONS = 8
-"""The most sizes, or angles, that are told apart."""
 
 KEPT = (Column("poses kept, % of the solved", "kept_rate", 100),
         Column("flips kept, % of the flips", "flips_kept_rate", 100))
@@ -435,10 +435,10 @@ def threshold_tables(data: ReportData) -> list[Table]:
 # --------------------------------------------------------------------------------------------------
 # The figures of a store, in the order in which they stand.
 
+#: Makers of figures, None for a store that a figure does not fit; add one here.
 FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
     _by_size, _bias, _configurations, _trade, _ambiguity, _outcomes, _frame, _ranking, _bound,
 )
-"""Makers of figures, None for a store that a figure does not fit; add one here."""
 
 
 def figures_of(data: ReportData) -> list[Figure]:
@@ -454,12 +454,12 @@ def figures_of(data: ReportData) -> list[Figure]:
 # --------------------------------------------------------------------------------------------------
 # Tables of errors, of boards' markers, and of the precision that was reached.
 
+#: The most rows of a table of all detector settings.
 MAX_TABLE_ROWS = 40
-"""The most rows of a table of all detector settings."""
 
+#: Quantity in the names of errors -> its name in words, and its unit in those names.
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
               "position": ("position", "m")}
-"""Quantity in the names of errors -> its name in words, and its unit in those names."""
 
 
 def board_tables(data: ReportData) -> list[Table]:

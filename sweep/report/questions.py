@@ -257,10 +257,10 @@ def compare(
 # --------------------------------------------------------------------------------------------------
 # The report of a store.
 
+#: Suffixes of files that neither HTML nor Markdown would be taken for.
 NO_REPORTS = {
     ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
 }
-"""Suffixes of files that neither HTML nor Markdown would be taken for."""
 
 
 def write_report(

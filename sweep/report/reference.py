@@ -90,9 +90,9 @@ def _section(section: str) -> Table:
                        (each for each in PARAMETERS.values() if each.section == section))
 
 
+#: Flag variable -> its flags.
 FLAGS: dict[str, type[Flag]] = {
     each.name: each.flags for each in VARIABLES.values() if each.flags is not None}
-"""Flag variable -> its flags."""
 
 
 def _presence(variable: Variable) -> str:
@@ -112,6 +112,7 @@ def _presence(variable: Variable) -> str:
 
 YES = {True: "yes", False: "no"}
 
+#: Subject -> the function that makes its table.
 TABLES: dict[str, Callable[[], Table]] = {
     **{section: partial(_section, section) for section in SECTIONS},
     "effects": lambda: _table("effects, in physical order", ({
@@ -136,4 +137,3 @@ TABLES: dict[str, Callable[[], Table]] = {
             *((f"*_{name}_*", f"error: {heading}") for heading, name in error_headings().items())
         ))),
 }
-"""Subject -> the function that makes its table."""

@@ -16,11 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
 from sweep.analysis.dataset import SIZE_AXES, is_grid_axis, of_photographs
-from sweep.analysis.requirements import (
-    SIZES_BESIDE,
-    conditions,
-    parse_requirements,
-)
+from sweep.analysis.requirements import SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError
 from sweep.execution.status import Totals, outcome_of_store
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
@@ -38,19 +34,19 @@ from sweep.typing import Floats
 
 BOTH = (Stage.detection, Stage.estimation)
 AREA = "marker_area_px"
+#: Axes along which the marker is turned away.
 ANGLES = ("tilt_deg", "view_angle_deg")
-"""Axes along which the marker is turned away."""
 
 IDS = "marker_id"
+#: Dimension of tables that have a row for each configuration.
 CONFIGURATION = "configuration"
-"""Dimension of tables that have a row for each configuration."""
 
+#: Bins of the area, and of a drawn parameter.
 DRAWN_BINS = 10
-"""Bins of the area, and of a drawn parameter."""
 
 
+#: Axis, area or drawn parameter -> edges of the bins that are groups; None: each value is one.
 Groups = Mapping[str, tuple[float, ...] | None]
-"""Axis, area or drawn parameter -> edges of the bins that are groups; None: each value is one."""
 
 
 def bins_of(values: Floats, most: int) -> tuple[float, ...]:
@@ -63,12 +59,12 @@ def bins_of(values: Floats, most: int) -> tuple[float, ...]:
 # --------------------------------------------------------------------------------------------------
 # The data of a report: a store's results, the roles of its axes, and analyses computed once.
 
+#: Results up to this size are read at once: many figures need the same values, and many small
+#: chunks are slow to read.
 MAX_READ_BYTES = 600_000_000
-"""Results up to this size are read at once: many figures need the same values, and many small
-chunks are slow to read."""
 
+#: Areas vary if the largest exceeds the smallest by this factor.
 AREA_RATIO = 2.0
-"""Areas vary if the largest exceeds the smallest by this factor."""
 
 Analysis = Callable[..., xr.Dataset]
 T = TypeVar("T")
@@ -304,8 +300,8 @@ def read_report_data(
 # A configuration is a combination of detector and estimator settings, and of targets. They are
 # compared, never pooled; of a store with very many some are chosen.
 
+#: Configurations that a table or a figure of all of them compares.
 MAX_CONFIGURATIONS = 30
-"""Configurations that a table or a figure of all of them compares."""
 
 
 @dataclass(frozen=True, eq=False)

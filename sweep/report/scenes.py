@@ -37,34 +37,34 @@ TRUTH, DETECTED, OTHER, REJECTED, CHESSBOARD = "#009e73", "#d55e00", "#cc79a7", 
 FRAME = "#e69f00"
 AXES = {"estimated x": "#e60000", "y": "#00aa00", "z": "#0050e6"}
 
+#: Labels and their colours.
 LEGEND = {
     "true outline": TRUTH, "detected corners (dot: the first)": DETECTED,
     "other detection": OTHER, "rejected candidate": REJECTED, **AXES,
     "corners of a chessboard": CHESSBOARD,
 }
-"""Labels and their colours."""
 
+#: Pixels that the larger side of a picture has at most, unless the image has more.
 MAX_SIDE = 900
-"""Pixels that the larger side of a picture has at most, unless the image has more."""
 
+#: Width of a picture, in whose proportion lines and letters are drawn, and dots an inch.
 MAX_INCHES, MIN_DPI = 10, 100
-"""Width of a picture, in whose proportion lines and letters are drawn, and dots an inch."""
 
 MAX_ENLARGEMENT = 24
 
+#: Of the marker's side, shown around it.
 MARGIN = 0.35
-"""Of the marker's side, shown around it."""
 
 MIN_CUT_PX = 4
 
+#: Share of a picture's larger side below which a marker is shown enlarged in a corner, too.
 SMALL = 0.08
-"""Share of a picture's larger side below which a marker is shown enlarged in a corner, too."""
 
+#: Share of a picture's sides that this takes.
 INSET = 0.36
-"""Share of a picture's sides that this takes."""
 
+#: Characters of a caption's line, and entries of its legend side by side.
 CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
-"""Characters of a caption's line, and entries of its legend side by side."""
 
 
 def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
@@ -215,8 +215,8 @@ def value_table(
     return Table.of("Values of the cell", ["variable", "value", "unit", "stored"], rows, words=True)
 
 
+#: Numbers of a variable that are written out; of more, as of boards' corners, a summary is.
 MAX_NUMBERS = 12
-"""Numbers of a variable that are written out; of more, as of boards' corners, a summary is."""
 
 
 def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
@@ -236,8 +236,8 @@ def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
 # --------------------------------------------------------------------------------------------------
 # Example scenes of a store: the best, the median, the worst, a flip, and one of each failure.
 
+#: The rotation error of a flip that is shown exceeds this: others are hardly visible.
 MIN_FLIP_DEG = 5.0
-"""The rotation error of a flip that is shown exceeds this: others are hardly visible."""
 
 Index = dict[str, int]
 

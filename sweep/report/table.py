@@ -15,17 +15,17 @@ import xarray as xr
 
 from sweep.messages import columns, plain, to_json
 
+#: Rows of a table that a page shows.
 MAX_ROWS = 300
-"""Rows of a table that a page shows."""
 
+#: Characters of a line of plain text, and between columns.
 MAX_WIDTH, GAP = 140, "  "
-"""Characters of a line of plain text, and between columns."""
 
+#: Characters of a cell that stand in one line.
 MAX_LINE_CHARS = 28
-"""Characters of a cell that stand in one line."""
 
+#: Characters of a number that needs no rounding to be short.
 MAX_SHORT = 5
-"""Characters of a number that needs no rounding to be short."""
 
 # --------------------------------------------------------------------------------------------------
 # Numbers, coordinates and units as text.
@@ -86,15 +86,15 @@ def plural(count: int, noun: str, plural_noun: str = "") -> str:
     return f"{count:,} {noun if count == 1 else plural_noun or f'{noun}s'}"
 
 
+#: Coordinates whose names are no words.
 WORDS = {
     "marker_area_px": "area of the marker", "side_px": "side of the marker",
     "frame_u_percent": "from the left, %", "frame_v_percent": "from the top, %",
 }
-"""Coordinates whose names are no words."""
 
 ENDINGS = ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s")
+#: Unit of an attribute -> as headings have it.
 UNITS = {"px2": "px\u00b2", "degree": "deg", "percent": "%", "1": ""}
-"""Unit of an attribute -> as headings have it."""
 
 
 def axis_label(results: xr.Dataset, name: str) -> str:
@@ -335,8 +335,8 @@ class Table:
             for row in self.frame.to_numpy().tolist()]}
 
 
+#: Exit status where draws are too few to tell.
 UNDECIDED = 3
-"""Exit status where draws are too few to tell."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

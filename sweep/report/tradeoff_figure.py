@@ -11,20 +11,14 @@ import xarray as xr
 from sweep.analysis.dataset import each_cell
 from sweep.report.figure import Figure
 from sweep.report.table import Column, Table
-from sweep.tradeoff.pareto import (
-    CRITERIA,
-    UNITS,
-    conditions_of,
-    configuration_label,
-    mark_front,
-)
+from sweep.tradeoff.pareto import CRITERIA, UNITS, conditions_of, configuration_label, mark_front
 
+#: Statistics in the names of the variables of rotation and range.
 STATISTICS = ("bias", "rmse", "rmse_unflipped", "median", "p95", "p99")
-"""Statistics in the names of the variables of rotation and range."""
 
 CRITERION = "rotation_p95_deg"
+#: Used if the first is infinite or NaN for every configuration of some condition.
 OTHER_CRITERION = "rotation_median_deg"
-"""Used if the first is infinite or NaN for every configuration of some condition."""
 
 MS, MS_VARIABLE = "ms a frame", "cost_ms"
 
@@ -148,11 +142,11 @@ def headlines(trade: xr.Dataset, criterion: str) -> list[str]:
 
 IMAGES = (Column("ms an image", "render_ms"), Column("x exact", "render_ratio"),
           Column("grey RMS", "grey_rms"), Column("grey max", "grey_max"))
+#: Columns of the images, and of a configuration.
 CHANGES = (
     Column("detection differs, %", "detection_disagreement", 100),
     Column("corner RMS px", "corner_shift_rms_px"), Column("range bias %", "range_bias_percent"),
     Column("rotation RMS deg", "rotation_shift_deg"))
-"""Columns of the images, and of a configuration."""
 
 
 def renderer_table(renderers: xr.Dataset) -> Table:

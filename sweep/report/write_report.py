@@ -23,18 +23,9 @@ from sweep.messages import label, quoted
 from sweep.report.answer import Answer, answer
 from sweep.report.figure import Figure, Panel, panels_file
 from sweep.report.figures import figures_of
-from sweep.report.output_file import (
-    check_output_file,
-    write_errors_explained,
-    write_output_file,
-)
+from sweep.report.output_file import check_output_file, write_errors_explained, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.scenes import (
-    LEGEND,
-    Scene,
-    pipeline_file,
-    scenes_of,
-)
+from sweep.report.scenes import LEGEND, Scene, pipeline_file, scenes_of
 from sweep.report.table import Table, coordinates, markdown_text
 from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store

@@ -263,8 +263,8 @@ class Decider:
     pipeline: Pipeline
     rule: Stopping
     waves: Waves
+    #: The bases of each group's last decision, and its mask: other blocks of a wave ask, too.
     _decided: dict[Block, tuple[tuple[int, ...], Masks]] = field(default_factory=dict)
-    """The bases of each group's last decision, and its mask: other blocks of a wave ask, too."""
 
     @staticmethod
     def of(store: RunStore, rule: StoppingRule) -> Decider:

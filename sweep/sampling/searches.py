@@ -94,8 +94,8 @@ def group_dataset(results: GroupResults) -> xr.Dataset:
 # What is decided needs no more, and what lies beyond the first value that is decided to fail says
 # nothing of the limit.
 
+#: Values beyond the last that is met, as it seems, that are decided.
 BEYOND = 2
-"""Values beyond the last that is met, as it seems, that are decided."""
 
 
 def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Masks:

@@ -297,11 +297,11 @@ class Receipt:
             raise ValueError(f"no receipt: {error}") from None
 
 
+#: Failed cells, and as many crashed ones, that a receipt keeps; the flags count all of them.
 MAX_PER_BLOCK = 100
-"""Failed cells, and as many crashed ones, that a receipt keeps; the flags count all of them."""
 
+#: Characters that are kept of a traceback: its end.
 MAX_CHARACTERS = 4000
-"""Characters that are kept of a traceback: its end."""
 
 
 def recorded(
@@ -341,14 +341,14 @@ def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
 # A block's values are written first and its receipt last, so that a block is either complete or
 # absent.
 
+#: Folder of a mark for each block that was begun and is not committed.
 BEGUN = f"{files.RECEIPTS}/begun"
-"""Folder of a mark for each block that was begun and is not committed."""
 
+#: The flag variables that say where numbers exist.
 GOVERNING = {each.present_when.flag for each in VARIABLES.values() if each.present_when}
-"""The flag variables that say where numbers exist."""
 
+#: Receipts that are read and held at a time.
 RECEIPTS_AT_ONCE = 1000
-"""Receipts that are read and held at a time."""
 
 
 def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice, ...]:

@@ -164,11 +164,11 @@ def write_whole(path: Path, content: bytes) -> None:
 # --------------------------------------------------------------------------------------------------
 # Chunks of a store, as Zarr writes them: compressed, with a checksum at the end.
 
+#: Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed.
 RECEIPTS = "commits/receipt"
-"""Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
 
+#: Level of the compression of every chunk.
 ZSTD_LEVEL = 3
-"""Level of the compression of every chunk."""
 
 
 def codecs() -> list[Any]:

@@ -56,8 +56,8 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # The layout of a store: its arrays, their metadata, and the values of its coordinates.
 
+#: Version of the layout of stores; another one is refused.
 FORMAT = 8
-"""Version of the layout of stores; another one is refused."""
 
 COORDINATE_CHUNK = 1 << 20
 
@@ -237,11 +237,11 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
 # Files of no block. The run's metadata list them with the CRC-32 of their contents: metadata of
 # the arrays and coordinates from the creation on, tables once a store is finished.
 
+#: Groups that a finished store has.
 TABLES = ("cost", "failures")
-"""Groups that a finished store has."""
 
+#: Groups within groups that no receipt could restore.
 MEASURED = ("cost/tradeoff", "cost/renderers")
-"""Groups within groups that no receipt could restore."""
 
 CHANGED = "changed: does not fit its checksum"
 
@@ -279,11 +279,11 @@ def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
 # A local store is created and deleted beside its path and renamed, so that a kill leaves no
 # partial store; a remote one exists once its URL points to it.
 
+#: Errors that reading a foreign or damaged document may raise.
 UNREADABLE = (
     AttributeError, KeyError, TypeError, ValueError, RecursionError, OSError,
     zarr.errors.BaseZarrError,
 )
-"""Errors that reading a foreign or damaged document may raise."""
 
 NEW_RUN = "run its pipeline into a new store: `sweep run PIPELINE --store NEW`"
 
@@ -425,9 +425,9 @@ def _beside(path: Path, ending: str) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
 
 
+#: Attributes of the root: the CRC-32 of the pipeline's text and of the run's metadata, without
+#: which a store is lost, and that of the whole document, which can be written again.
 CHECKSUM, SEAL = "checksum", "seal"
-"""Attributes of the root: the CRC-32 of the pipeline's text and of the run's metadata, without
-which a store is lost, and that of the whole document, which can be written again."""
 
 
 def root_attributes(
@@ -501,8 +501,8 @@ def remove_store(url: str) -> None:
 # --------------------------------------------------------------------------------------------------
 # The readers' view of a store: its committed blocks.
 
+#: Poses of a Dask chunk: a task for each block would take longer than reading the block.
 POSES_TOGETHER = 1 << 20
-"""Poses of a Dask chunk: a task for each block would take longer than reading the block."""
 
 
 def _together(store: RunStore) -> dict[str, int]:

@@ -40,8 +40,8 @@ def check_zarr() -> None:
 # opened, wherever that is moved; a remote store's data lie under the run's id, to which the
 # store's URL points.
 
+#: Attribute at a remote store's URL: the id of the run whose data are the store's.
 POINTER = "sweep_run"
-"""Attribute at a remote store's URL: the id of the run whose data are the store's."""
 
 
 def is_remote(url: str) -> bool:

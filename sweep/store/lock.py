@@ -28,14 +28,14 @@ from sweep.errors import StoreError
 from sweep.store.files import RECEIPTS, delete_files, list_folder, read_files, write_files
 from sweep.store.locations import translate_errors
 
+#: Folder of the keys of a store on an object store.
 LOCKS = f"{RECEIPTS}/locks"
-"""Folder of the keys of a store on an object store."""
 
+#: How long a lock is waited for: `status` holds one for an instant.
 WAIT_S = 2.0
-"""How long a lock is waited for: `status` holds one for an instant."""
 
+#: Seconds after which a key's process is taken for dead.
 SILENCE_S = 120.0
-"""Seconds after which a key's process is taken for dead."""
 
 
 @contextlib.contextmanager
@@ -109,8 +109,8 @@ def _folder_locked(storage: Store, wait_s: float, *, alone: bool) -> Iterator[No
         os.close(descriptor)
 
 
+#: How keys of processes begin that hold a store alone.
 CHANGE = f"{LOCKS}/change-"
-"""How keys of processes begin that hold a store alone."""
 
 
 @contextlib.contextmanager

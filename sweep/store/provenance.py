@@ -19,8 +19,8 @@ from sweep.experiment.sampling import not_continued
 from sweep.installation import check_installation
 from sweep.version import __version__
 
+#: Raised whenever the numbers change; a test with golden digests fails if it is not.
 NUMBERS_VERSION = 5
-"""Raised whenever the numbers change; a test with golden digests fails if it is not."""
 
 
 def versions() -> dict[str, str]:

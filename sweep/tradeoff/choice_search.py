@@ -31,8 +31,8 @@ from sweep.tradeoff.pareto import pareto_front
 # --------------------------------------------------------------------------------------------------
 # What each alternative of a choice costs: the time of a frame at its answer, measured in turns.
 
+#: Conditions of each answer that are measured; of more, so many from all over the grid.
 MAX_CONDITIONS = 24
-"""Conditions of each answer that are measured; of more, so many from all over the grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +134,8 @@ def _conditions(pipeline: Pipeline, rule: StoppingRule) -> list[dict[str, int]]:
 # --------------------------------------------------------------------------------------------------
 # A requirement in, a decision out: the search for the choice of a pipeline's section [search].
 
+#: Time limit of the measurement of costs, in seconds.
 SECONDS = 20.0
-"""Time limit of the measurement of costs, in seconds."""
 
 
 @dataclass(frozen=True)

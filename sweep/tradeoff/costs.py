@@ -43,16 +43,16 @@ from sweep.typing import Floats, Grey
 # that differ by a little more than the rounds of one process show: :data:`PROCESS_SHARE` is added
 # to the intervals on both sides.
 
+#: Difference of ratios between processes: standard deviations of 0.3 to 1.5 % were measured.
 PROCESS_SHARE = 0.025
-"""Difference of ratios between processes: standard deviations of 0.3 to 1.5 % were measured."""
 
 MIN_ROUNDS, MAX_ROUNDS = 12, 2000
 
+#: Rounds where the time limit does not allow more: the fewest with a 95 % interval of a median.
 LEAST_ROUNDS = 6
-"""Rounds where the time limit does not allow more: the fewest with a 95 % interval of a median."""
 
+#: Width of a ratio's 95 % interval, as a share of it, that is narrow enough.
 NARROW = 0.03
-"""Width of a ratio's 95 % interval, as a share of it, that is narrow enough."""
 
 
 def time_in_turns(
@@ -136,11 +136,11 @@ def any_process_interval(ratio: Floats) -> tuple[Floats, Floats, Floats]:
 
 Indices = NDArray[np.intp]
 
+#: Scenes of each condition: fewer if whole frames are searched.
 MIN_SCENES, MAX_SCENES = 12, 48
-"""Scenes of each condition: fewer if whole frames are searched."""
 
+#: Pixels of images that are kept, over all conditions: 134 MB.
 MAX_PX = 1 << 27
-"""Pixels of images that are kept, over all conditions: 134 MB."""
 
 
 def whole_frames_of(pipeline: Pipeline) -> list[bool]:
@@ -201,11 +201,11 @@ def sample_scenes(
 # a time, as a user does. Estimators solve :data:`BATCH` detections in one call, so that the
 # overhead of a call is that of a run.
 
+#: Detections that an estimator gets in one call.
 BATCH = 16
-"""Detections that an estimator gets in one call."""
 
+#: Scenes of each condition that are timed first, to see how many the time limit allows.
 TRIAL_SCENES = 2
-"""Scenes of each condition that are timed first, to see how many the time limit allows."""
 
 
 @dataclass(frozen=True, slots=True)

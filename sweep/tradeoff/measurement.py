@@ -44,14 +44,14 @@ from sweep.tradeoff.costs import (
 from sweep.tradeoff.pareto import WRONG, WRONG_BELIEF, configuration_label
 from sweep.typing import Floats
 
+#: Values and the low and high ends of their intervals, arrays of one shape.
 Interval = tuple[Floats, Floats, Floats]
-"""Values and the low and high ends of their intervals, arrays of one shape."""
 
+#: Share of the time limit that is left for the costs, however long the accuracy takes.
 MIN_SHARE = 0.3
-"""Share of the time limit that is left for the costs, however long the accuracy takes."""
 
+#: The renderer with which others are compared if the grid has several.
 REFERENCE = "exact"
-"""The renderer with which others are compared if the grid has several."""
 
 
 def measure_trade(

@@ -19,16 +19,16 @@ from sweep.errors import ArgumentError
 
 Booleans = NDArray[np.bool_]
 
+#: Coordinate of a trade: whether a configuration believes what is known not to be true.
 WRONG_BELIEF = "wrong_belief"
-"""Coordinate of a trade: whether a configuration believes what is known not to be true."""
 
 UNITS = {"rotation": "deg", "range": "percent"}
+#: Variables of a `trade` that can rank configurations; all are errors, smaller is better.
 CRITERIA = tuple(
     f"{quantity}_{statistic}_{unit}"
     for quantity, unit in UNITS.items()
     for statistic in ("rmse", "rmse_unflipped", "median", "p95", "p99")
 )
-"""Variables of a `trade` that can rank configurations; all are errors, smaller is better."""
 
 
 def pareto_front(cost: ArrayLike, error: ArrayLike) -> Booleans:
@@ -109,11 +109,11 @@ def conditions_of(trade: xr.Dataset) -> Iterator[tuple[str, dict[str, Any], xr.D
 # --------------------------------------------------------------------------------------------------
 # Configurations as text.
 
+#: Behind the label of a configuration whose estimator believes what is not true.
 WRONG = " (wrong)"
-"""Behind the label of a configuration whose estimator believes what is not true."""
 
+#: Label of the only configuration of a pipeline without axes of settings.
 NO_SETTINGS = "as set"
-"""Label of the only configuration of a pipeline without axes of settings."""
 
 
 def configuration_label(settings: Mapping[str, Any]) -> str:

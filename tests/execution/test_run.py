@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from scipy.spatial.transform import Rotation
 
 import sweep
 from support.commands import started
 from support.stores import GRID, by_hand, same
-from sweep.analysis import compare, detection_rate
-from sweep.errors import ArgumentError, DatasetError, MachineFaultError, StoreError
+from sweep.errors import ArgumentError, MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
@@ -98,6 +96,9 @@ def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
     assert "seed: the store has 5, this run 6" in text
     assert "axes.tilt_deg: the store has 0.0, 50.0, this run 0.0, 51.0" in text
     assert "white: the store has 255.0, this run 200.0" in text
+    with pytest.raises(StoreError, match="seed: the store has 5, this run 6"):
+        execute(other, tmp_path / "other.zarr", reuse=[url])
+    assert not (tmp_path / "other.zarr").exists()
     assert execute(other, url, overwrite=True).poses == 48
     assert open_store(url).pipeline.seed == 6
 
@@ -145,23 +146,6 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(
     assert same(back, undisturbed)
 
 
-def test_parameters_that_go_together_are_coordinates_and_pairs_are_not_mixed(tmp_path):
-    url = str(tmp_path / "zipped.zarr")
-    document = {"pose": {"jitter_px": 0.5, "distance_m": 0.4}, "axes": {
-        "lens": {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}}, "trial": 3}}
-    store = by_hand(url, Pipeline.from_dict(document))
-    results = sweep.open(url)
-    assert results["lens"].values.tolist() == ["600, 600", "800, 805"]
-    assert results["fy_px"].dims == ("lens",)
-    # Lenses are other scenes with draws of their own.
-    assert detection_rate(results).draws.item() == 2 * 3
-    with pytest.raises(DatasetError, match="not the same scenes"):
-        compare(results.isel(lens=0), results.isel(lens=1))
-    document["axes"]["lens"]["zip"]["fy_px"].reverse()
-    with pytest.raises(StoreError, match="lens: no values of fx_px, fy_px go together in both"):
-        match(Pipeline.from_dict(document), store)
-
-
 def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
     part = str(tmp_path / "part.zarr")
     by_hand(part, pipeline, (1, 4, 2, 3), [0])
@@ -169,15 +153,6 @@ def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_p
     summary = execute(pipeline, new, reuse=[part])
     assert summary.computed_scenes == 24
     assert same(new, undisturbed)
-
-
-def test_store_that_cannot_be_reused_is_told(undisturbed, tmp_path):
-    other = Pipeline.from_text(TEXT, ["seed=9", "tilt_deg=[80]"], name="other")
-    with pytest.raises(StoreError) as told:
-        execute(other, tmp_path / "other.zarr", reuse=[undisturbed])
-    assert "seed: the store has 5, this run 9" in str(told.value)
-    assert "tilt_deg: the store has 0.0, 50.0, this run 80.0" in str(told.value)
-    assert not (tmp_path / "other.zarr").exists()
 
 
 def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
@@ -263,31 +238,16 @@ def test_task_of_a_replaced_store_writes_nothing(pipeline, tmp_path):
     assert committed(new) == set()
 
 
-def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
-    old, new = str(tmp_path / "old.zarr"), str(tmp_path / "new.zarr")
-    document = {"pose": {"distance_m": 0.2}, "axes": {"solver": ["p3p"]}}
-    by_hand(old, Pipeline.from_dict(document), ())
-    document["axes"]["solver"].append("ippe")
-    store = create_store(new, Pipeline.from_dict(document), ())
-    receipt = compute_block(new, store.run_id, next(iter(store.blocks)), (old,))
-    assert receipt.computed["estimates"] == 1
-
-
-def test_background_axis_of_levels_and_images(tmp_path):
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 640), 90, np.uint8))
+def test_an_image_that_was_changed_during_the_run_is_a_fault_of_the_machine(tmp_path):
+    image = tmp_path / "grey.png"
+    cv2.imwrite(str(image), np.full((480, 640), 90, np.uint8))
     pipeline = Pipeline.from_text(
-        '[pose]\ndistance_m = 0.05\n[axes]\nbackground = [90, "grey.png"]', folder=tmp_path
-    )
-    url = str(tmp_path / "mixed.zarr")
-    by_hand(url, pipeline, (2,))
-    with sweep.open(url) as results:
-        assert results.background.to_numpy().tolist() == ["90.0", "grey.png"]
-        level, image = results.isel(background=0), results.isel(background=1)
-        np.testing.assert_array_equal(level.corner_error_px, image.corner_error_px)
-    cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 640), 91, np.uint8))
-    other = create_store(str(tmp_path / "again.zarr"), pipeline, (2,))
+        '[pose]\ndistance_m = 0.05\n[axes]\nbackground = [90, "grey.png"]', folder=tmp_path)
+    store = create_store(str(tmp_path / "mixed.zarr"), pipeline, (2,))
+    assert sweep.open(store.url).background.to_numpy().tolist() == ["90.0", "grey.png"]
+    cv2.imwrite(str(image), np.full((480, 640), 91, np.uint8))
     with pytest.raises(MachineFaultError, match=r"grey\.png is not in .* as it was when the run"):
-        compute_block(other.url, other.run_id, next(iter(other.blocks)))
+        compute_block(store.url, store.run_id, store.blocks[0])
 
 
 WITH_DRAWS = """
@@ -310,37 +270,9 @@ DRAWN = {
 }
 
 
-@pytest.fixture(scope="module")
-def url(tmp_path_factory):
-    url = str(tmp_path_factory.mktemp("drawn") / "drawn.zarr")
+def test_every_parameter_is_a_coordinate_whether_fixed_an_axis_or_drawn(tmp_path):
+    url = str(tmp_path / "drawn.zarr")
     by_hand(url, Pipeline.from_text(WITH_DRAWS))
-    return url
-
-
-def test_the_true_pose_follows_from_the_coordinates(url):
-    r = sweep.open(url).load()
-    zeros = xr.zeros_like(r.tilt_deg)
-    tilt, azimuth, roll = (np.radians(x + zeros).values.ravel() for x in (
-        r.tilt_deg, r.azimuth_deg, r.roll_deg))
-    axis = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1)
-    expected = (
-        Rotation.from_rotvec(axis * tilt[:, None]) * Rotation.from_euler("z", roll[:, None])
-        * Rotation.from_euler("x", 180, degrees=True)
-    )
-    rvec = r.true_rvec.transpose(..., "xyz").values.reshape(-1, 3)
-    assert (expected * Rotation.from_rotvec(rvec).inv()).magnitude().max() < 1e-14
-    z = 500 * 0.05 / r.side_px
-    np.testing.assert_allclose(r.distance_m, z, rtol=1e-15)
-    x = z * np.tan(np.radians(r.bearing_x_deg)) + r.jitter_u_px * z / 500
-    y = r.jitter_v_px * z / 500
-    np.testing.assert_allclose(
-        r.true_tvec_m.transpose("xyz", ...), np.stack([x, y, z]), rtol=0, atol=1e-14
-    )
-    assert (abs(r.jitter_u_px) <= 0.5).all()
-    assert r.jitter_u_px.std() > 0.2
-
-
-def test_every_parameter_is_a_coordinate_whether_fixed_an_axis_or_drawn(url):
     for opened in (sweep.open(url), xr.open_zarr(url, consolidated=False)):
         assert set(opened.coords) >= DRAWN
         for name in DRAWN:

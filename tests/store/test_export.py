@@ -87,7 +87,7 @@ def test_every_flag_is_told_in_words_and_all_else_stays(results):
         told.drop_vars(flagged).compute(), results.drop_vars(flagged).compute())
 
 
-def test_labels_are_lazy_and_those_of_any_part_and_of_stacked_results(results):
+def test_labels_are_lazy_and_those_of_any_part_and_what_is_no_flag_is_unknown(results):
     told = sweep.decode_flags(results)
     assert told.detection.chunks is not None
     part = sweep.decode_flags(results.detection.isel(side_px=1, trial=[0]))
@@ -97,13 +97,6 @@ def test_labels_are_lazy_and_those_of_any_part_and_of_stacked_results(results):
     again = sweep.decode_flags(masked).transpose(*told.detection.dims)
     assert (again.isel(side_px=0) == "not_run").all()
     assert (again.isel(side_px=1) == told.detection.isel(side_px=1)).all()
-    stacked = results.stack(pose=["dictionary", "trial"])
-    told = sweep.decode_flags(stacked)
-    assert told.indexes["pose"].equals(stacked.indexes["pose"])
-    assert (told.detection == sweep.decode_flags(stacked.detection)).all()
-
-
-def test_what_is_no_flag_is_unknown_not_another_flag(results):
     for value in (0.5, -1, 257):  # 257 is 1 in eight bits, as "detected" is
         other = results.detection.astype(type(value)) * 0 + value
         other.attrs = results.detection.attrs

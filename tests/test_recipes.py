@@ -2,17 +2,55 @@
 
 import dataclasses
 import inspect
+import json
+import os
 import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.recipes import added, printed_by
+import sweep
 from sweep.evaluation import variables
 from sweep.evaluation.variables import check_complete
 from sweep.experiment.parameters import Stage
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import EstimateStatus
+
+PACKAGE = Path(sweep.__file__).parent
+TESTS = Path(__file__).parent
+
+
+def added(folder, *changes):
+    """Copy the package to a folder; each change (file, anchor, text) puts text after an anchor.
+
+    An anchor stands once in its file; without one, the file is new.
+    """
+    shutil.copytree(PACKAGE, folder / "sweep")  # with its compiled code, for unchanged sources
+    for file, anchor, text in changes:
+        path = folder / "sweep" / file
+        if anchor is None:
+            path.write_text(text, encoding="utf-8")
+            continue
+        source = path.read_text(encoding="utf-8")
+        assert source.count(anchor) == 1, f"{file}: {anchor!r} stands {source.count(anchor)} times"
+        path.write_text(source.replace(anchor, anchor + text), encoding="utf-8")
+    return folder
+
+
+def printed_by(folder, script):
+    """Run a script with the package in a folder; return its last line, read as JSON."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, cwd=folder,
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
 
 EFFECTS = """
     Effect(

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from support.comparisons import holm, with_detected
 from support.lengths import lengths
-from support.small_datasets import perfect
+from support.small_datasets import holm, perfect, with_detected
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
 from sweep.measure.flags import Flipped
 

@@ -38,4 +38,3 @@ def test_examples_run(module):
     assert runner.failures == 0
     examples = [f for f in FUNCTIONS if f.__module__ == module.__name__]
     assert runner.tries >= 2 * len(examples)
-

@@ -22,7 +22,7 @@ from support.small_datasets import (
     with_every_flag,
 )
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 SCENE = {"distance_m": 2, "marker_id": 3, "trial": 5}
@@ -230,11 +230,3 @@ def test_renderers_are_compared_pose_by_pose():
             "range_bias_percent": apart(percent, solved).mean(),
             "rotation_shift_deg": rms(lengths_of(apart(
                 lambda p: np.degrees(p["rotation_error_rad"]), right)))})
-
-
-def test_a_renderer_that_is_not_there_is_refused(mixed):
-    with pytest.raises(DatasetError, match=r"^renderer: no such dimension; there are distance_m"):
-        renderer_bias(mixed)
-    renamed = mixed.isel(marker_id=[0, 1]).assign_coords(marker_id=["warp", "fine"])
-    with pytest.raises(ArgumentError, match="reference = exact: the renderers are warp, fine"):
-        renderer_bias(renamed.rename(marker_id="renderer"))

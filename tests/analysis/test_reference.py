@@ -38,7 +38,6 @@ from support.small_datasets import (
     student,
 )
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
-from sweep.analysis.estimator import MeanEstimate, length_interval
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -259,17 +258,6 @@ def test_what_was_cut_away_was_not_run():
     expected = detection_rate(whole, bins=kept).isel(marker_area_px=0)
     for name in ("looked_for", "detected", "detection_rate"):
         assert detection_rate(cut)[name] == expected[name], name
-
-
-@pytest.mark.parametrize(("components", "freedom"), [(2, 1.0), (3, 2.5), (3, 30.0)])
-def test_the_interval_of_a_length_is_scheffes_and_students(components, freedom):
-    one = MeanEstimate(*map(np.atleast_1d, (10.0, 0.5, freedom)))
-    value, low, high = (each.item() for each in length_interval(one, components))
-    rest = freedom - components + 1
-    reach = math.sqrt(components * freedom / rest * stats.f.ppf(0.95, components, rest)
-                      ) if rest > 0 else math.inf
-    assert (value, low) == (10.0, pytest.approx(max(0.0, 10.0 - 0.5 * reach), rel=1e-9))
-    assert high == pytest.approx(10.0 + 0.5 * stats.t.ppf(0.975, freedom), rel=1e-9)
 
 
 def test_a_solved_pose_without_a_number_counts_in_no_mean():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from support.comparisons import with_detected
-from support.small_datasets import perfect
+from support.small_datasets import perfect, with_detected
 from sweep.analysis import compare, detection_rate, error_statistics, marker_ranking
 from sweep.errors import DatasetError
 from sweep.experiment.draws import sobol_uniform
@@ -84,17 +83,6 @@ def test_intervals_cover(sims, trials, cells, least, claim):
     claim("95 % intervals of Sobol' draws", "quadrature; 12,000 simulations",
           max(0.0, 95 - 100 * min(shares.values())), "% below 95 %")
     assert min(shares.values()) >= least
-
-
-def test_a_point_counts_once_however_many_settings_see_it():
-    once = dataset(3)
-    settings = xr.DataArray([0.0, 1.0], dims="believed_focal_scale", name="believed_focal_scale")
-    seen = ["estimate", "flipped", "rotation_error_rad", "translation_error_m"]
-    twice = xr.concat([once, once], settings, data_vars=seen)
-    tables = [error_statistics(each, per=["sim"]) for each in (once, twice)]
-    for name in ("rotation_rmse_deg", "position_rmse_m", "range_bias_percent"):
-        for end in ("", "_low", "_high"):
-            np.testing.assert_allclose(*(table[f"{name}{end}"] for table in tables), rtol=1e-12)
 
 
 def test_intervals_are_narrower_than_those_of_independent_draws():

@@ -1,12 +1,10 @@
 """Decisions on requirements are those of plain NumPy and SciPy, condition by condition."""
 
-
 import numpy as np
 import pytest
 from scipy import stats
 
-from support.comparisons import with_detected
-from support.small_datasets import perfect
+from support.small_datasets import perfect, with_detected
 from sweep.analysis.decisions import Reach, requirement_limits
 from sweep.analysis.requirements import (
     Decision,
@@ -15,7 +13,7 @@ from sweep.analysis.requirements import (
     parse_requirements,
     verdicts,
 )
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 
 
@@ -178,14 +176,3 @@ def test_a_requirement_that_cannot_be_is_refused(texts, problem):
     with pytest.raises(ArgumentError, match=problem.replace("?", r"\?")) as error:
         parse_requirements(texts)
     assert len(str(error.value).splitlines()) == 1 + ("foo_deg" in problem)
-
-
-@pytest.mark.parametrize(("change", "text", "problem"), [
-    (lambda r: r.isel(trial=0), "detection >= 0.5", "a single draw of each pose"),
-    (lambda r: r, "rotation_efficiency >= 0.5", "lacks bound_std"),
-    (lambda r: r.drop_vars("true_rvec"), "yaw_bias_deg <= 1", "lacks true_rvec"),
-])
-def test_a_store_that_cannot_answer_says_so(change, text, problem):
-    results = change(perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1}))
-    with pytest.raises(DatasetError, match=problem):
-        check_requirements(results, [text])

@@ -19,10 +19,9 @@ import pytest
 
 from support.reports import command
 from sweep import cli, installation
-from sweep.cli.command import SESSION, print_error
+from sweep.cli.command import print_error
 from sweep.cli.parser import COMMANDS, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
-from sweep.execution.progress import Progress
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import to_json
 
@@ -33,27 +32,6 @@ HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja
 def python(code):
     return subprocess.run(
         [sys.executable, "-c", code], cwd=TOP, capture_output=True, text=True, check=False)
-
-
-# Ctrl-C.
-
-@pytest.mark.parametrize(("flags", "begun", "line"), [
-    ([], False, "stopped; the same command continues"),
-    (["--overwrite"], False, "stopped before anything was computed"),
-    (["--overwrite"], True, "stopped; the same command without --overwrite continues"),
-])
-def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monkeypatch):
-    def execute(*_, progress, **__):
-        if begun:
-            progress(Progress(0, 1, 0))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("sweep.execution.runner.execute", execute)
-    pipeline = tmp_path / "one.toml"
-    pipeline.write_text("pose = { side_px = 40 }\n")
-    code, out, err = command("run", str(pipeline), *flags)
-    assert (code, out) == (130, "")
-    assert err.splitlines()[-1] == line
 
 
 # Help and version.
@@ -90,25 +68,6 @@ def test_help_and_version_import_nothing_heavy():
 
 
 # Messages.
-
-@pytest.fixture
-def parsed(monkeypatch):
-    """Return a function that parses arguments as the session's command."""
-    return lambda *arguments: monkeypatch.setattr(
-        SESSION, "flags", build_parser()[0].parse_args(arguments).flags)
-
-
-def test_an_argument_is_named_by_its_flag(capsys, parsed):
-    flags = {
-        ("run", "workers"): "--workers", ("run", "settings"): "--set",
-        ("tradeoff", "limit_s"): "--seconds", ("report", "store"): "STORE",
-        ("fit", "folders"): "FOLDER", ("verify", "some_other"): "--some-other",
-    }
-    for (name, argument), flag in flags.items():
-        parsed(name, "x")
-        for value, shown in ((0, " 0"), ("", "")):
-            assert print_error(ArgumentError(argument, value, "expected a number")) == 2
-            assert capsys.readouterr().err == f"{flag}{shown}: expected a number\n"
 
 
 @pytest.mark.parametrize(
@@ -197,12 +156,6 @@ def test_each_script_is_one_of_its_shell_and_has_every_command_and_option(shell,
     if shutil.which(shell) is not None:
         (tmp_path / "script").write_text(text)
         subprocess.run([shell, "-n", tmp_path / "script"], check=True)
-
-
-def test_without_its_package_the_remedy_is_one_line(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    assert cli.main(["completion", "bash"]) == 1
-    assert capsys.readouterr().err.strip().endswith("pip install shtab")
 
 
 def strict(text):

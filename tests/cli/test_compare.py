@@ -1,18 +1,16 @@
-"""``sweep compare``: its table, its JSON, and what it refuses."""
+"""``sweep compare``: its table, its JSON, and its figure."""
 
 import json
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import sweep
 from support.board_photographs import POSES, write_set
 from support.photograph_results import results_of, twins
 from support.reports import command
 from sweep.analysis import simulation_gap
-from sweep.report.comparison_tables import gap_figures, gap_lines, gap_table
-from sweep.report.figure import panels_file
+from sweep.report.comparison_tables import gap_lines, gap_table
 
 
 def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
@@ -35,63 +33,6 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
     assert gap_lines(few)[-1] == "fewer than 5 photographs: errors without intervals"
 
 
-def test_the_figure_has_the_distributions_of_both_sources():
-    rng = np.random.default_rng(3)
-    first, second = results_of(rng), twins(rng, scale=0.5)
-    figures = gap_figures(first, second)
-    assert [figure.name for figure in figures] == ["rotation", "depth"]
-    panels = figures[0].panels
-    assert [panel.title for panel in panels] == [
-        f"Share of solved poses, cornerRefinementMethod {name}" for name in ("none", "subpix")]
-    axes = Figure().add_subplot()
-    panels[0].draw(axes)
-    solved = first.sel(cornerRefinementMethod="none").rotation_error_rad.values.reshape(-1, 3)
-    angles = np.sort(np.degrees(np.linalg.norm(solved[~np.isnan(solved[:, 0])], axis=1)))
-    real, simulated = axes.lines[0], axes.lines[2]
-    assert np.allclose(real.get_xdata(), np.percentile(angles, real.get_ydata()))
-    assert np.median(simulated.get_xdata()) < np.median(angles)
-    assert b"<svg" in panels_file(panels[:1], ".svg")
-
-
-@pytest.fixture(scope="module")
-def stores(tmp_path_factory):
-    """Two stores of one pipeline, one of them with another seed, and one of two refinements."""
-    text = "[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\ntrial = 2\n"
-    refined = text + 'cornerRefinementMethod = ["none", "subpix"]\n'
-    folder = tmp_path_factory.mktemp("stores")
-    for name, made in (("a", text), ("b", text), ("c", "seed = 2\n" + text), ("d", refined)):
-        sweep.run(sweep.Pipeline.from_text(made), store=folder / f"{name}.zarr")
-    return folder
-
-
-def test_two_stores_of_a_pipeline_are_compared(stores):
-    code, out, err = command("compare", stores / "a.zarr", stores / "b.zarr", "--json")
-    assert (code, err) == (0, "")
-    said = json.loads(out)
-    assert said["fingerprint"] == []
-    (one,) = said["detection"]
-    assert (one["compared"], one["another flag"]) == (2, 0)
-    (one,) = said["corners"]
-    assert one["compared"] == 8
-    assert one["worst, px"]["value"] is None
-    code, out, _ = command("compare", stores / "a.zarr", stores / "b.zarr")
-    assert code == 0
-    assert "next: sweep report" in out
-
-
-@pytest.mark.parametrize(("other", "flags", "named"), [
-    ("c.zarr", [], "seeds 0 and 2"), ("d.zarr", [], "cornerRefinementMethod"),
-    ("none.zarr", [], "none.zarr"), ("b.zarr", ["--bins", "side_px=1,2"], "--bins"),
-    ("s.toml", ["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
-    ("s.toml", ["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
-])
-def test_what_is_no_pair_is_refused_in_one_line(other, flags, named, stores):
-    code, out, err = command("compare", stores / "a.zarr", stores / other, *flags)
-    assert (code, out) == (2, "")
-    assert named in err
-    assert err.count("\n") == 1
-
-
 def test_photographs_are_simulated_and_compared_in_one_command(tmp_path):
     shots = write_set(tmp_path, POSES)
     given = ["--camera", tmp_path / "camera.json", "--board", tmp_path / "board.toml"]
@@ -102,8 +43,10 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path):
         "--set", 'cornerRefinementMethod=["none", "subpix"]',
     )
     assert code == 0
-    code, out, _ = command("compare", tmp_path / "shots.zarr", scene)
+    figure = tmp_path / "gap.svg"
+    code, out, _ = command("compare", tmp_path / "shots.zarr", scene, "-o", figure)
     assert code == 0
+    assert "<svg" in figure.read_text()
     assert "5 photographs and their twins" in out
     assert (tmp_path / "shots-same.zarr").is_dir()
     code, out, _ = command(

@@ -53,6 +53,12 @@ def folder(stores, monkeypatch):
         ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
         ("repro small.toml", "`sweep run small.toml` makes its store"),
         ("status small", "did you mean runs/small.zarr?"),
+        ("size small.toml", "expected what is chosen: [search] smallest = "),
+        ("limit missing.toml", "missing.toml: cannot be read: No such file"),
+        ("reference tilt", "did you mean tilt_deg?"),
+        ("error-model missing.zarr -o m.hpp", ".json"),
+        ("compare runs/small.zarr none.zarr", "none.zarr"),
+        ("compare runs/small.zarr runs/small.zarr --bins side_px=1,2", "--bins"),
         ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
         ("report runs/unfinished.zarr", "unfinished: 1 of 1 blocks; `sweep run` continues it"),
         ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
@@ -104,16 +110,6 @@ def test_a_store_that_is_being_written_is_not_said_to_need_a_run():
         _, _, err = command(*shlex.split(f"report {url}"))
     assert out.splitlines()[-1] == f"next: sweep status {url}"
     assert err.endswith("it is being written: wait until it is finished\n")
-
-
-@pytest.mark.usefixtures("folder")
-def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
-    with sweep.run("runs/small.zarr") as results:
-        assert results.sizes["trial"] == 2
-    with pytest.raises(SweepError, match="a folder that is no store"):
-        sweep.run("runs")
-    with pytest.raises(SweepError, match=r"but a pipeline file; `sweep run small.toml` makes"):
-        sweep.open("small.toml")
 
 
 def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):

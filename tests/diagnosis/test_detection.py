@@ -85,11 +85,3 @@ def test_outside_what_was_simulated_nothing_is_known_also_from_json(model):
     other = DetectionModel.from_json(model.to_json())
     pose = ([[3.0, 0.2, 0.0]], [[0.1, 0.0, 2.0]], 0.3)
     assert model.at(*pose).equals(other.at(*pose))
-
-
-def test_few_poses_and_several_settings_are_refused():
-    with pytest.raises(DatasetError, match="more trials"):
-        error_model(drawn(1, 100))
-    two = xr.concat([drawn(1, 100)[["estimate"]]] * 2, "solver")
-    with pytest.raises(DatasetError, match="solver"):
-        error_model(drawn(1, 100).assign(estimate=two["estimate"]))

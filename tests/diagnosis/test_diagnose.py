@@ -11,7 +11,6 @@ import tomlkit
 
 import sweep
 from sweep.cli import main
-from sweep.diagnosis.inference import next_measurement, rank
 from sweep.diagnosis.observations import CORNERS, read_observations
 from sweep.model.calibration import Calibration
 
@@ -53,33 +52,13 @@ def test_rows_that_agree_are_said_to(away, words):
     assert words in found.numbers["sentence"]
 
 
-def test_rows_that_nothing_explains_are_said_to_be():
-    found = sweep.diagnose({"range_m": [0.5, 1.9, 0.9, 3.0], "tape_m": [0.9, 0.5, 1.5, 1.0]})
-    assert "No known cause" in found.numbers["sentence"]
-
-
-def test_next_measurement_is_where_predictions_differ():
-    rows = read_observations({"range_m": [1.1], "tape_m": [1.0]}, camera=CAMERA, size_m=0.1)
-    found = {each.names: each for each in rank(rows)}
-    scale, offset = found[frozenset({"size"})], found[frozenset({"offset"})]
-    there = next_measurement(rows, scale, offset)
-    assert there.component in {"distance", "z"}
-    assert there.distance_m > 1.5 or there.distance_m < 0.7
-    assert there.difference > 2
-
-
 @pytest.mark.parametrize(("columns", "words"), [
     ({"tvec_z_m": [1], "rvec_x": [0.1]}, "rvec_x needs rvec_y beside it"),
-    ({"tvec_z_m": [1], "corner2_x_px": [9]}, "corner2_x_px needs corner2_y_px beside it"),
-    ({"tvec_z_m": [1], "position_sd_m": [0.1]}, "needs x_m or y_m or z_m"),
     ({"tvec_z_m": [1], "yaw_deg": [20]}, "needs rvec_x or corner0_x_px"),
     ({"range_m": [1.0], "tape_m": ["nan"]}, "row 1, tape_m = nan"),
     ({"range_m": [1.0, ""], "tape_m": [1.0, 2.0]}, "row 2: expected tvec_z_m or range_m"),
-    ({"range_m": [1.0, 2.0], "tape_m": [1.0, ""]}, "row 2: expected tape_m"),
     ({"rang_m": [1.0]}, "did you mean range_m?"), ({"range_m": [1, 2]}, "same length"),
     ({"range_m": [1.0], "tape_sd_m": [0.0]}, "tape_sd_m = 0.0: expected a number between"),
-    ({"range_m": [1.0], "x_m": [0.1]}, "x_m and y_m need tvec_x_m"),
-    ({"range_m": [1e300]}, "range_m = 1e+300: expected a number between"),
     ({"tape_m": []}, "no rows"), ({"tape_m": [1.0] * 1001}, "1001 rows"),
 ])
 def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
@@ -88,22 +67,12 @@ def test_rows_that_cannot_be_are_refused_in_a_line(columns, words):
     assert "\n" not in str(error.value)
 
 
-def test_impossible_units_and_missing_uncertainty_are_noted():
-    found = sweep.diagnose({"range_m": [57.0], "tape_m": [0.57]}, camera=CAMERA, size_m=0.1)
-    assert first(found) == ["units"]
-    assert any("side of 1.6 px" in note for note in found.numbers["notes"])
-    assert any("2 mm or 0.5 %" in note for note in found.numbers["notes"])
-
-
 def test_poses_are_solved_from_corners_in_the_cameras_image():
     square = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
     corners = np.array([639.5, 359.5]) + 900 * square / AWAY[:, None, None]
     columns = dict(zip(CORNERS, corners.reshape(-1, 8).T, strict=True))
     rows = read_observations({**columns, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
     assert np.allclose(rows.said[:, 2], AWAY, atol=1e-6)
-    columns["corner0_x_px"] = columns["corner0_x_px"] + 1500.0
-    with pytest.raises(sweep.ArgumentError, match="1280 x 720"):
-        sweep.diagnose({**columns, "tape_m": AWAY}, camera=CAMERA, size_m=0.1)
 
 
 def test_poses_are_solved_from_images(tmp_path):
@@ -124,14 +93,9 @@ def test_poses_are_solved_from_images(tmp_path):
     assert first(sweep.diagnose(rows, size_m=0.1, **settings)) == ["agree"]
     wrong = sweep.diagnose(rows, size_m=0.125, **settings)
     assert "the white margin" in wrong.numbers["causes"][0]["size"]
-    for text, words in (
-        ("image,tape_m,marker_id\n" + f"{names[0]},1,7\n", "(IDs 0): expected one, or marker_id"),
-        ("image,tape_m\nnone.png,1\n", "none.png"), ("tape_m;range_m\n1,5;1,5\n", "commas"),
-        ("image,tape_m\n1\n", "row 1 has 1 cells, the header 2"),
-    ):
-        rows.write_text(text)
-        with pytest.raises(sweep.ArgumentError, match=re.escape(words)):
-            sweep.diagnose(rows, size_m=0.1, **settings)
+    rows.write_text(f"image,tape_m,marker_id\n{names[0]},1,7\n")
+    with pytest.raises(sweep.ArgumentError, match=r"\(IDs 0\): expected one, or marker_id"):
+        sweep.diagnose(rows, size_m=0.1, **settings)
 
 
 def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):
@@ -147,9 +111,6 @@ def test_command_prints_a_table_a_sentence_json_and_a_figure(tmp_path, capsys):
     assert main([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["causes"][0]["causes"] == ["size"]
     assert main(["diagnose", str(path), "--set", "sise_m=1"]) == 2
-    path.write_text("range_m,range_m,tape_m\n1,2,1\n")
-    with pytest.raises(sweep.ArgumentError, match="range_m is there twice"):
-        sweep.diagnose(path)
 
 
 def test_public_cases_are_ranked_as_their_threads_found_out():

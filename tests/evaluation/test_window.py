@@ -5,8 +5,7 @@ import pytest
 
 from support.blocks import run_block
 from support.lengths import lengths
-from support.searching import searched
-from support.windows import corners_of, outcomes_elsewhere
+from support.windows import outcomes_elsewhere, searched
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import visibility_flags
 from sweep.experiment.grid import Block
@@ -76,7 +75,8 @@ def compared(scenes, setting):
         # OpenCV itself is not invariant to where these very pixels lie in the frame.
         assert len(outcomes_elsewhere(scenes, row, setting)) > 1, row
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
+    corners, expected = (each.found.marker_corners[:, 0] for each in (windowed, framed))
+    difference = np.abs(corners - expected)[both].max(axis=(1, 2))
     assert difference.max(initial=0.0) <= limit_px(setting, scenes.frame[0, 0])
     return difference, len(exceptions)
 

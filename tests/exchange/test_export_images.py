@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from support.answers import TEXT, rows_of
-from support.blocks import run_cells
 from sweep import cli
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export as exporting
@@ -59,23 +58,6 @@ def test_truth_is_what_opencv_projects_with_the_camera_file(exported):
         image = cv2.imread(str(folder / "images" / row["image"]), cv2.IMREAD_UNCHANGED)
         assert image.shape == (height, width) == (160, 200)
         assert (float(row["fx_px"]), float(row["cx_px"])) == (matrix[0, 0], matrix[0, 2])
-
-
-def test_images_are_those_of_a_run_to_the_last_bit(exported, pipeline):
-    folder, _ = exported
-    whole = Pipeline.from_text(pipeline.text, ['window="full"'])
-    run = run_cells(whole, whole.experiment.all_scenes.indices(np.arange(18))).columns
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
-    for k, row in enumerate(truth(folder)):
-        image = cv2.imread(str(folder / "images" / row["image"]), cv2.IMREAD_UNCHANGED)
-        quads, ids, _ = detector.detectMarkers(image)
-        assert (ids is not None) == (run["detection"][0][k] == 1)
-        if ids is not None:
-            assert (quads[0][0] - corners_of(row) == run["corner_error_px"][0][k]).all()
-    assert (run["detection"][0] == 1).sum() > 5
 
 
 def test_windows_are_parts_of_the_frames_and_their_truth_is_shifted(exported, pipeline, tmp_path):

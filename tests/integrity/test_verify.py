@@ -13,8 +13,7 @@ import pytest
 import sweep
 from support.here import calls_here
 from support.poison import Poison, poisoned, raising
-from support.store_files import edit_receipt, edit_root, editable, files
-from support.stores import by_hand, same
+from support.stores import by_hand, edit_receipt, edit_root, editable, files, same
 from sweep.cli import main
 from sweep.errors import StoreError, SweepError
 from sweep.execution.block_task import compute_block

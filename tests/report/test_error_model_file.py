@@ -2,15 +2,13 @@
 
 import json
 import math
-import re
 
 import numpy as np
 import pytest
 
-from support.pose_errors import FX, SIZE_M, poses_with_law, power_law, reader_of_the_guide
+from support.pose_errors import poses_with_law, power_law, reader_of_the_guide
 from sweep.analysis import error_models, model_errors
 from sweep.analysis.error_models import Use
-from sweep.cli import main
 from sweep.report.error_model_file import (
     error_model_table,
     error_model_text,
@@ -61,23 +59,6 @@ def test_the_reader_of_the_guide_gives_the_same_numbers(models, document):
     assert math.isnan(read(document["models"][0], 0.0, 0.0, -2.0, 0.0, 74.25)["z"]["sigma"])
 
 
-def test_the_json_has_all_that_a_reader_needs(models, document):
-    assert document["schema"] == "sweep-error-model/3"
-    assert {"u", "sigma", "bias", "region", "covariance"} <= set(document["formula"])
-    assert document["units"]["distance_m"] == "m"
-    assert document["title"] == TITLE
-    assert [each["configuration"] for each in document["models"]] == [
-        {"solver": "a"}, {"solver": TITLE}]
-    one = document["models"][1]
-    assert one["side_px_times_distance_m"] == FX * SIZE_M
-    sigma = np.array(one["quantities"]["z"]["sigma"])
-    np.testing.assert_array_equal(sigma, models.isel(solver=1).sigma.sel(quantity="z"))
-    low, high = (np.array(one["quantities"]["z"][f"sigma_{end}"]) for end in ("low", "high"))
-    assert ((low < sigma) & (sigma < high)).all()
-    assert set(np.ravel(one["quantities"]["z"]["use"])) <= {flag.name for flag in Use}
-    assert any("bearings from 0 to 2" in line for line in document["warnings"])
-
-
 def test_the_table_compares_the_usual_rule(models):
     table = error_model_table(models)
     assert table.headings[0] == "configuration"
@@ -90,14 +71,3 @@ def test_the_table_compares_the_usual_rule(models):
     assert len(lines) == 2
     for line in lines:
         assert float(line.rpartition("to the power ")[2].split()[0]) == pytest.approx(2.5, abs=0.15)
-
-
-@pytest.mark.parametrize("arguments", [
-    ["error-model", "missing.zarr", "-o", "m.hpp"],
-    ["report", "missing.zarr", "--error-model", "m.py"],
-])
-def test_another_file_is_refused_with_what_to_do_instead(arguments, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    assert re.fullmatch(r".*\.json.*reader of 20 lines.*\n", capsys.readouterr().err)
-    assert not list(tmp_path.iterdir())

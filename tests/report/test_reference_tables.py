@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 import sweep
 from sweep.cli import main
 from sweep.experiment.parameters import PARAMETERS, SECTIONS
@@ -28,11 +26,3 @@ def test_terminal_json_and_python_have_the_same_rows(capsys):
     assert numbers == sweep.reference("tilt_deg", "flags").numbers
     assert [row["parameter"] for row in numbers["parameters"]] == ["tilt_deg"]
     assert all(row["flag"] in text for row in numbers["flags"])
-
-
-@pytest.mark.parametrize(("name", "meant"), [("tilt", "tilt_deg"), ("flag", "flags")])
-def test_an_unknown_name_is_told_with_the_nearest(name, meant, capsys):
-    assert main(["reference", name]) == 2
-    error = capsys.readouterr().err
-    assert len(error.splitlines()) == 1
-    assert f"did you mean {meant}?" in error

@@ -15,7 +15,6 @@ from support.reports import CAMERA, FULL, command, made
 from sweep.analysis import ambiguity, detection_rate, error_statistics, failure_composition
 from sweep.report.figures import figures_of
 from sweep.report.report_data import read_report_data
-from sweep.report.scenes import scenes_of
 from sweep.report.table import number
 from sweep.store.lifecycle import open_dataset, open_store
 
@@ -24,6 +23,8 @@ ODD = {
                         "tilt_deg = [0, 60]\ntrial = 3\n",
     "nothing visible": f"{CAMERA}[pose]\ntilt_deg = 180\n[axes]\nside_px = [20, 40]\n",
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
+    "a wanted precision": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nside_px = [8, 40]\n"
+                          "[search]\nmax_trials = 60\nprecision.detection_rate = 0.2\n",
     "lists and words": f"{CAMERA}[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\n"
                        'distortion = [[], [-0.1, 0.01, 0, 0]]\nrenderer = ["exact", "warp"]\n'
                        "guarded = [true, false]\ntrial = 3\n",
@@ -127,16 +128,6 @@ def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
         100 * float(rates["detection_rate"].sel(marker_id=7)))
 
 
-def test_a_scene_s_command_shows_it(full, tmp_path):
-    pipeline = tmp_path / "full.toml"
-    pipeline.write_text(open_store(full).pipeline.text, encoding="utf-8")
-    scene = next(scenes_of(read_report_data(full)))
-    at = re.fullmatch(r"sweep show full.toml --at '?([^']*)'?", scene.command)[1]
-    code, out, err = command("show", pipeline, "--at", at, "-o", tmp_path / "scene.png")
-    assert (code, err) == (0, "")
-    assert out.splitlines()[0].endswith(": detected, solved")
-
-
 def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(tmp_path):
     url = made(tmp_path, NO_DRAWS, "plain")
     output, folder, mine = (tmp_path / name for name in ("answer.md", "pictures", "mine"))
@@ -182,13 +173,3 @@ def test_a_report_is_never_written_into_a_store(tmp_path):
             assert (code, out, len(err.splitlines())) == (2, "", 1)
             assert "cannot be written: it is inside the store" in err
     assert held() == before
-
-
-def test_poses_that_are_missing_are_told(tmp_path):
-    url, output = made(tmp_path, NO_DRAWS, "lost"), tmp_path / "report.html"
-    next(path for path in (Path(url) / "detection" / "c").rglob("*") if path.is_file()).unlink()
-    code, _, err = command("report", url, "-o", output)
-    assert code == 2
-    assert "1 of 2 blocks lack chunks" in err
-    assert "sweep verify --repair" in err
-    assert not output.exists()

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.comparisons import with_detected
-from support.reports import CAMERA, command, made
-from support.small_datasets import perfect
+from support.reports import command, made
+from support.small_datasets import perfect, with_detected
 from sweep.analysis import compare, error_statistics
 from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
@@ -22,17 +21,6 @@ from sweep.store.lifecycle import open_dataset
 
 GUIDE = (Path(__file__).parents[2] / "pipelines" / "README.md").read_text(encoding="utf-8")
 TUTORIAL = re.search(r"<!-- file: mine.toml -->\n```toml\n(.*?)```", GUIDE, re.DOTALL)[1]
-SMALL = f"""title = "How far?"
-{CAMERA}
-[pose]
-jitter_px = 0.5
-[scene]
-noise_grey = 2
-[axes]
-side_px = [8, 40]
-cornerRefinementMethod = ["none", "subpix"]
-trial = 4
-"""
 
 def blank(_, file, **__):
     """Write a drawing that is empty, as text on a page and as bytes of a file."""
@@ -44,11 +32,6 @@ def blank(_, file, **__):
 def _undrawn(monkeypatch):
     """Draw no figures: the answers do not depend on them."""
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
 def told(url, *arguments):
@@ -180,24 +163,3 @@ def test_a_wrong_belief_is_never_named():
         assert "wrong" not in shown.headline
     (table,) = (each for each in shown.tables if each.caption.startswith("Configurations, with"))
     assert sum("(wrong)" in row[0] for row in table.rows) == 4
-
-
-def test_page_markdown_json_and_terminal_have_the_answer_of_require(small, tmp_path):
-    arguments = ["--require", "detection >= 0.9", "--per", "side_px"]
-    text = tmp_path / "r.md"
-    found, shown = told(small, *arguments)
-    assert found["required"] == ["detection_rate >= 0.9"]
-    printed = json.loads(command("require", small, "detection >= 0.9", *arguments[2:], "--json")[1])
-    for mine, theirs in zip(found["requirements"], printed["requirements"], strict=True):
-        assert mine == {name: theirs[name] for name in mine}
-    code, out, err = command("report", small, *arguments, "-o", text)
-    assert (code, err) == (0, "")
-    assert found["answer"] == out.splitlines()[1]
-    line = re.search(r'<p class="verdict">(.*?)</p>', shown)[1]
-    assert line.replace("&gt;", ">") == found["answer"]
-    written = text.read_text(encoding="utf-8").replace("\\", "").replace("&gt;", ">")
-    assert f"**{found['answer']}**" in written
-    assert all(isinstance(each["value"], float | None) for each in found["numbers"])
-    for each in found["numbers"]:
-        assert f'<span class="value">{each["text"]}</span>' in shown
-        assert f"**{each['text']}**" in written

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from support.searches import flags_of, is_covered, pipeline_of, searched, true_limits
+from support.searches import flags_of, searched, true_limits
 from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.intervals import looks_factor
 from sweep.analysis.requirements import Decision
@@ -18,7 +18,6 @@ from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import (
     BEYOND,
     group_dataset,
-    search_rule,
     size_shrinks_upwards,
     wanted_values,
 )
@@ -77,24 +76,6 @@ def test_values_are_wanted_that_may_move_the_limit():
             assert set(np.flatnonzero(wanted).tolist()) == expected
 
 
-def test_every_wanted_cell_is_of_the_condition_alone():
-    # A group of several conditions is decided as each of them would be by itself.
-    rng = np.random.default_rng(2)
-    curves = special.expit((SIDES - rng.uniform(10, 40, (4, 1))) / 3)
-    pipeline = pipeline_of(curves, SIDES, "detection >= 0.9", 200)
-    rule = search_rule(pipeline, pipeline.stopping)
-    hits = rng.random((*curves.shape, 80)) < curves[..., None]
-    detection = np.where(hits, DetectionStatus.detected, DetectionStatus.rejected)
-    whole = rule.needed(GroupResults(
-        pipeline, (0, 0), curves.shape, 2, 80, flags_of(detection)))
-    assert whole.any()
-    assert not whole.all()
-    for k in range(len(curves)):
-        one = rule.needed(GroupResults(pipeline, (k, 0), (k + 1, len(SIDES)), 2, 80,
-                                       flags_of(detection[k : k + 1])))
-        np.testing.assert_array_equal(one[0], whole[k])
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("rate", "shape"), [
     (0.9, "slow"), (0.9, "dip"), (0.9, "at the limit"), (0.99, "at the limit")])
@@ -110,7 +91,8 @@ def test_intervals_cover_the_limit(rate, shape, claim):
         curves[np.arange(count), first] = rate - 1e-9
         curves[np.arange(count), np.minimum(first + 1, 19)] = 0.5 * rate
     limits = searched(curves, SIDES, f"detection >= {rate}", 2400, seed=4)
-    covered = int(is_covered(limits, true_limits(curves, SIDES, rate)).sum())
+    truth = true_limits(curves, SIDES, rate)
+    covered = int(((limits["low"] <= truth) & (truth <= limits["high"])).sum())
     claim("95 % intervals of limits that are searched for", "600 simulated searches each",
           max(0.0, 95 - 100 * covered / count), "% below 95 %")
     assert covered / count >= 0.95

@@ -1,6 +1,5 @@
 """The rule of [precision] against plain loops over its conditions."""
 
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -6,8 +6,7 @@ import pytest
 
 from support.here import calls_here
 from support.stores import by_hand, in_waves, same
-from sweep.errors import OtherExperimentError, StoreError
-from sweep.execution.forecast import check_affordable
+from sweep.errors import OtherExperimentError
 from sweep.execution.runner import execute, tighten
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
@@ -103,26 +102,3 @@ def test_fixed_trials_and_waves_reuse_each_other(first, second, tmp_path):
     assert same(target, reference)
     assert summary.computed_scenes < whole.computed_scenes
     assert (summary.computed_scenes == 0) == (first == "fixed")
-
-
-@pytest.mark.long
-def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
-    change = ["side_px = {linspace = [8, 30, 12]}", "search.max_trials = 600"]
-    reference = str(tmp_path / "reference.zarr")
-    summary = execute(precise("0.05", change), reference)
-    assert summary.unsettled == 0
-    assert summary.needed < summary.poses == 12 * 600
-    for workers, block_s in ((1, 0.01), (2, 0.1), (4, 1.0)):
-        url = str(tmp_path / f"{workers}-{block_s}.zarr")
-        for width in ("0.2", "0.05") if workers == 2 else ("0.05",):
-            execute(precise(width, change), url, workers=workers, block_s=block_s)
-        assert same(url, reference), url
-        assert verify(url, 5).damage == []
-
-
-def test_a_run_in_waves_is_refused_if_all_its_trials_would_take_too_long():
-    """How many it needs, nobody knows before it is run."""
-    pipeline = precise("0.02", ["side_px = [8, 30]", "search.max_trials = 1_500_000"])
-    with pytest.raises(StoreError, match="takes up to"):
-        check_affordable("none.zarr", pipeline, 1.0, 1, 30_000, 30_000)
-    check_affordable("none.zarr", pipeline, 0.02, 1, 30_000, 30_000)

@@ -4,7 +4,6 @@ Each repetition is a condition of a pipeline, and the rule itself decides wave b
 need more trials. Of a coverage of 0.95 a test fails with a probability below 1e-6.
 """
 
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -11,8 +11,7 @@ import zarr
 import zarr.storage._local as local
 
 import sweep
-from support.store_files import editable
-from support.stores import by_hand, same
+from support.stores import by_hand, editable, same
 from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block

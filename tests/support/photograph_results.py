@@ -3,8 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from support.comparisons import with_detected
-from support.small_datasets import perfect
+from support.small_datasets import perfect, with_detected
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 PHOTOGRAPHS, MARKERS = 12, 9

@@ -86,9 +86,3 @@ def true_limits(curves, values, rate):
     order = np.argsort(values)[::-1]
     reached = np.logical_and.accumulate(curves[:, order] >= rate, axis=1).sum(axis=1)
     return np.concatenate([[np.inf], np.asarray(values)[order]])[reached]
-
-
-def is_covered(limits, truth):
-    """Return where intervals cover limits (conditions,), read from large sides to small ones."""
-    low, high = limits["low"].values, limits["high"].values
-    return (low <= truth) & (truth <= high)

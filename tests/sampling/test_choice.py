@@ -54,11 +54,8 @@ def chosen(monkeypatch):
 def test_an_answer_that_a_better_one_may_replace_is_not_decided(wish, rates, bound, chosen):
     choice = chosen(rates, 200, wish)
     shown = size_lines.as_json(choice)
-    first, following, *_ = shown["sentences"]
     assert choice.decision is Decision.undecided
-    assert first.startswith(f"not decided: {bound}")
-    assert following.startswith("detection_rate >= 0.9 is not decided: 0.930 (")
-    assert "200 draws, about " in following
+    assert shown["sentences"][0].startswith(f"not decided: {bound}")
     assert (shown["decision"], shown["answer"]) == (Decision.undecided, None)
     assert list(shown["known"]) == ["size_m"]
 

@@ -23,7 +23,6 @@ def faults_of(**change):
     ({"search": {"largest": "size_m"}}, "precision, not smallest and largest"),
     ({"search": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
     ({"search": {"max_trials": 30}}, "search.max_trials = 30: expected at least "),
-    ({"search": {"smalest": 1}}, "search.smalest: unknown key; expected along, smallest"),
     ({"axes": {"size_m": [0.02]}}, "an axis of several numbers, from easy to hard"),
     ({"search": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
      "distance_m: no such axis; expected one under [axes] of the scene: "),
@@ -35,7 +34,6 @@ def faults_of(**change):
     ({"search": LIMIT | {"among": ["solver"]}}, "beside smallest"),
     ({"search": PRECISION | {"precision": {"detection_rate": 0.1, "detection": 0.2}}},
      "another half-width"),
-    ({"search": PRECISION, "axes": 3}, "axes = 3: expected a table: [axes]"),
 ])
 def test_a_search_that_cannot_be_made_is_a_line(change, line):
     faults = faults_of(**change)

@@ -14,14 +14,13 @@ import pytest
 import trustme
 
 import sweep
-from support.blocks import run_block
 from support.clusters import Cluster
 from support.commands import command, started
+from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
-from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.locations import exists
@@ -39,16 +38,6 @@ tilt_deg = [0, 50]
 solver = ["ippe_square", "iterative"]
 trial = 3
 """
-
-
-def see_expected(url):
-    """Assert that a store holds what one block, computed here without a store, does."""
-    pipeline = Pipeline.from_text(SMALL)
-    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    with sweep.open(url) as results:
-        whole = results.reset_coords().load()
-    for name, values in run_block(pipeline, Block((0,) * len(lengths), lengths)).values.items():
-        assert whole[name].to_numpy().tobytes() == values.tobytes(), name
 
 
 @pytest.fixture
@@ -187,7 +176,11 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
         ran = capfd.readouterr()
         assert ran.err in ("", "starting\n")  # the latter on a busy machine
         assert json.loads(ran.out)["computed_scenes"] == 48
-        see_expected(url)
+        by_hand(str(tmp_path / "local.zarr"), Pipeline.from_toml(small))
+        there, here = (sweep.open(each).load() for each in (url, tmp_path / "local.zarr"))
+        assert there.equals(here)
+        for name in here.data_vars:
+            assert there[name].to_numpy().tobytes() == here[name].to_numpy().tobytes(), name
         assert main(["status", url, "--json"]) == 0
         state = capfd.readouterr()
         assert json.loads(state.out)["finished"]

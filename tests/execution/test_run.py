@@ -59,14 +59,16 @@ def test_number_of_workers_changes_no_bit(pipeline, undisturbed, tmp_path):
     assert open_store(url).finished
 
 
-def test_stopped_run_in_other_blocks_continues_and_finished_one_is_left_alone(
+def test_stopped_run_is_reused_and_continues_and_finished_one_is_left_alone(
     pipeline, undisturbed, tmp_path
 ):
-    url = str(tmp_path / "stopped.zarr")
+    url, new = str(tmp_path / "stopped.zarr"), str(tmp_path / "new.zarr")
     # A block that is computed twice is harmless.
     store = by_hand(url, pipeline, (1, 3, 2, 2), (0, 1, 2, 0))
     assert committed(store) == {0, 1, 2}
     assert not open_store(url).finished
+    assert execute(pipeline, new, reuse=[url]).computed_scenes == 48 - (12 + 6 + 4)
+    assert same(new, undisturbed)
     summary = execute(pipeline, url)
     assert summary.computed_blocks == len(store.blocks) - 3
     assert same(url, undisturbed)
@@ -144,15 +146,6 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(
     receipt = compute_block(back, store.run_id, store.blocks[0], (fresh,))
     assert receipt.computed["estimates"] == 192 - shared
     assert same(back, undisturbed)
-
-
-def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
-    part = str(tmp_path / "part.zarr")
-    by_hand(part, pipeline, (1, 4, 2, 3), [0])
-    new = str(tmp_path / "new.zarr")
-    summary = execute(pipeline, new, reuse=[part])
-    assert summary.computed_scenes == 24
-    assert same(new, undisturbed)
 
 
 def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):

@@ -12,9 +12,6 @@ from sweep.evaluation import block, search
 
 POISONED = Path(__file__).parent / "poisoned"
 
-RAISES = ("raise",)
-
-
 @dataclasses.dataclass(frozen=True)
 class Poison:
     """What one scene does: to detectors with ``setting``, to estimators with ``solver``."""
@@ -27,7 +24,7 @@ class Poison:
 
     @property
     def deadly(self):
-        return self.how not in RAISES
+        return self.how != "raise"
 
     def written(self):
         return {**dataclasses.asdict(self), "setting": dict(self.setting),

@@ -47,18 +47,6 @@ WAYS = {
 }
 
 
-def _kind():
-    """Return what this process is: worker, child, client or other."""
-    words = " ".join(sys.orig_argv)
-    if "sweep.isolation.child_process" in words:
-        return "child"
-    if "--multiprocessing-fork" in words:
-        return "worker"
-    if "-m sweep " in words:
-        return "client"
-    return "other"
-
-
 class _Source:
     """A source of detections that tells which row it is asked for, before it searches."""
 
@@ -99,7 +87,7 @@ def poison(block, search, poisons, log):
             )
             if hit:
                 with Path(log).open("a") as notes:
-                    notes.write(json.dumps({"kind": _kind(), **each}) + "\n")
+                    notes.write(json.dumps(each) + "\n")
                 WAYS[each["how"]]()
 
     def images(source, batch, *rest):

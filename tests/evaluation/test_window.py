@@ -108,14 +108,15 @@ SETTINGS = [
     {"minMarkerDistanceRate": 0.0}, {"markerBorderBits": 2},
     {"perspectiveRemovePixelPerCell": 10, "validBitIdThreshold": 0.2},
     {"detectInvertedMarker": True}, {"useAruco3Detection": True},
-    # cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %.
-    {"cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
-     "relativeCornerRefinmentWinSize": 100.0},
     *({"cornerRefinementMethod": "apriltag", name: value} for name, value in {
         "aprilTagQuadSigma": 2.0, "aprilTagQuadDecimate": 2.0, "aprilTagMinWhiteBlackDiff": 100,
         "aprilTagMinClusterPixels": 100, "minDistanceToBorder": 0,
     }.items()),
 ]
+# cornerSubPix refuses images narrower than its window: with a margin of 16 px, 40 %.
+WIDE = {"cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
+        "relativeCornerRefinmentWinSize": 100.0}
+WHOLE = ["bearing_x_deg=0", "bearing_y_deg=0", "side_px={geom=[12, 200, 12]}"]
 PROCESSING = [
     ["quiet_zone_modules=0"], ["distortion=[-0.3, 0.1, 0.001, -0.002]"], ["noise_grey=8"],
     ["noise_grey=16", "noise_correlation=0.99"],
@@ -129,6 +130,7 @@ PROCESSING = [
 
 @pytest.mark.parametrize(("setting", "scene"), [
     *((setting, []) for setting in SETTINGS), *(({}, scene) for scene in PROCESSING),
+    (WIDE, WHOLE),
 ], ids=str)
 @lengths(10, 100)
 def test_window_finds_what_the_frame_holds_under_any_setting_and_processing(count, setting, scene):

@@ -20,7 +20,7 @@ from pathlib import Path
 
 TOP = Path(__file__).parents[1]
 ROOMS = {
-    "model": ("measure", "evaluation"), "measure": ("evaluation", "exchange"),
+    "model": ("measure", "evaluation", "experiment"), "measure": ("evaluation", "exchange"),
     "analysis": ("sampling", "report"),
 }
 """Room -> rooms above it, whose tests use it."""

@@ -17,16 +17,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import nbformat
-import numpy as np
 import pytest
 from nbclient import NotebookClient
 
 from support.here import calls_here
 from sweep.cli import main
-from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import read_board
-from sweep.experiment.pipeline import Pipeline, cell
+from sweep.experiment.pipeline import Pipeline
 from sweep.photographs.twins import read_scene
 
 TOP = Path(__file__).parent.parent
@@ -243,32 +241,6 @@ def test_every_pipeline_is_sound(path):
     pipeline = Pipeline.from_toml(path)
     assert pipeline.title
     assert pipeline.size(*Stage) > 1
-
-
-def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):
-    smoke = str(TOP / "pipelines" / "smoke.toml")
-    at = "distance_m=0.3,tilt_deg=45"
-    for options in ([], ["--plain"], ["--full", "--plain"]):
-        assert main(["show", smoke, "--at", at, "-o", str(tmp_path / "a.png"), *options]) == 0
-        assert "detected, solved" in capsys.readouterr().out
-        assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["show", smoke, "--at", "tilt=3"]) == 2
-    assert "unknown parameter; did you mean tilt_deg?" in capsys.readouterr().err
-    assert main(["show", smoke, "--at", "marker_id=99"]) == 2
-    assert "expected IDs from 0 to 49" in capsys.readouterr().err
-    assert main(["show", smoke, "-o", "/proc/none/a.png"]) == 2
-    assert "cannot be written" in capsys.readouterr().err
-
-
-def test_a_close_look_is_that_of_the_run():
-    pipeline = Pipeline.from_toml(TOP / "pipelines" / "smoke.toml")
-    windowed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"))
-    framed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"), whole_frame=True)
-    assert framed.image.shape == (480, 640)
-    left, top, right, bottom = windowed.window
-    np.testing.assert_array_equal(framed.image[top:bottom, left:right], windowed.image)
-    np.testing.assert_array_equal(framed.markers, windowed.markers)
-    assert windowed.errors["rotation_error_deg"] > 0
 
 
 def test_plan_says_what_a_run_takes(capsys):

@@ -153,12 +153,6 @@ def test_workflow_names_files_and_extras_that_exist():
     assert extras <= set(PROJECT["optional-dependencies"])
 
 
-def test_scripts_name_tests_that_exist():
-    for script in (path for path in (TOP / ".ci").iterdir() if path.is_file()):
-        for path in re.findall(r"(?<![\w/])tests/[\w/]+(?:\.py)?", script.read_text()):
-            assert (TOP / path).exists(), f"{script.name}: {path}"
-
-
 def test_pythons_that_are_promised_are_tried():
     tried = JOBS["pythons"]["strategy"]["matrix"]["python"]
     promised = [found[1] for each in PROJECT["classifiers"]

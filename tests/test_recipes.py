@@ -1,10 +1,7 @@
 """The recipes of the developers' guide, followed on one changed copy of the package."""
 
-import dataclasses
-import inspect
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -17,7 +14,6 @@ import sweep
 from sweep.evaluation import variables
 from sweep.evaluation.variables import check_complete
 from sweep.experiment.parameters import Stage
-from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import EstimateStatus
 
 PACKAGE = Path(sweep.__file__).parent
@@ -109,9 +105,6 @@ FUNCTION = """    "range_error": lambda results: (
     ),
 """
 
-SETTING = "minOtsuStdDev"
-"""A detector setting that is taken away, and put back as the last of the fields."""
-
 SCRIPT = """
 import json
 import numpy as np
@@ -186,18 +179,6 @@ def flag():
         "tables": [TABLES["flags"]().rows, TABLES["variables"]().rows],
     }
 
-def setting():
-    axes = {"minOtsuStdDev": [40.0, 5.0]}
-    pipeline = Pipeline.from_dict({
-        "marker": {"size_m": 0.05}, "pose": {"distance_m": 0.5}, "axes": axes,
-        "scene": {"black": 100, "white": 130, "background": 130},
-    })
-    return {
-        "detection": [column.tolist() for column in
-                      run_cells(pipeline.experiment, []).columns["detection"]],
-        "table": [row[:4] for row in TABLES["detector"]().rows],
-    }
-
 def variable():
     with calls_here():
         results = sweep.run({
@@ -217,7 +198,7 @@ def variable():
         "table": [row[:2] for row in TABLES["variables"]().rows],
     }
 
-print(json.dumps({each.__name__: each() for each in (effects, solver, flag, setting, variable)}))
+print(json.dumps({each.__name__: each() for each in (effects, solver, flag, variable)}))
 """
 
 pytestmark = pytest.mark.system
@@ -226,12 +207,6 @@ pytestmark = pytest.mark.system
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """What the script prints with all that is added."""
-    source = inspect.getsource(DetectorSetting)
-    names = [each.name for each in dataclasses.fields(DetectorSetting)]
-    field, last = (
-        re.search(rf"    {name}: .*?\n    \)\n", source, re.DOTALL)[0]
-        for name in (SETTING, names[-1])
-    )
     (highest,) = (flag for flag in EstimateStatus if flag == FLAG - 1)
     folder = added(
         tmp_path_factory.mktemp("recipes"),
@@ -246,9 +221,6 @@ def results(tmp_path_factory):
         ("experiment/schema.py", "             flags=flags.Flipped),\n", VARIABLE),
         ("evaluation/variables.py", '    "flipped": _flipped,\n', FUNCTION),
     )
-    detectors = folder / "sweep" / "measure" / "detectors.py"
-    without = detectors.read_text().replace(field, "")
-    detectors.write_text(without.replace(last, last + field))
     return printed_by(folder, SCRIPT)
 
 
@@ -296,14 +268,6 @@ def test_a_flag_is_one_member(results):
     flags, rows = got["tables"]
     assert ["estimate", str(FLAG), "unlikely", SENTENCE, "yes"] in flags
     assert any("solved or not_explained or unlikely" in row[-1] for row in rows)
-
-
-def test_a_detector_setting_is_one_field(results):
-    got = results["setting"]
-    assert [SETTING, "5", "grey level", "a number at least 0"] in got["table"]
-    # Levels 30 apart have a standard deviation of at most 15: below 40 they count as one colour.
-    (strict,), (lax,) = got["detection"]
-    assert (strict != 1, lax) == (True, 1)
 
 
 def test_a_variable_is_a_record_and_a_function(results):

@@ -15,10 +15,10 @@ import numpy as np
 import xarray as xr
 
 from benchmarks.tables import header, row
+from support.blocks import whole
 from support.flags_and_numbers import faults
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure
-from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -47,8 +47,7 @@ class Measured:
 
 def measured(pipeline, count=None):
     """Run a pipeline's scenes: all, or ``count`` of them, drawn by its seed."""
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    indices = Block((0,) * len(shape), shape).indices()
+    indices = whole(pipeline).indices()
     if count is not None and count < len(indices[0]):
         chosen = np.random.default_rng(pipeline.seed).permutation(len(indices[0]))[:count]
         indices = [index[np.sort(chosen)] for index in indices]

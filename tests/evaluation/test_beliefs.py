@@ -15,11 +15,10 @@ and s' solves for K'⁻¹·x. What it then finds:
 import numpy as np
 import pytest
 
-from support.blocks import run_block, run_cells
+from support.blocks import run_block, run_cells, whole
 from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
-from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -36,11 +35,6 @@ ROTATION_RAD = 2e-5
 its steps are small (measured 1e-7 and 1e-6 rad, far from the axis 3e-6 and 5e-6 rad), the others
 leave 1e-9 and 5e-8 rad, but where they fail the guard takes ITERATIVE's solution. What is tested
 below are effects of 1e-2 and more."""
-
-
-def whole(pipeline):
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return Block((0,) * len(shape), shape)
 
 
 class Estimated:

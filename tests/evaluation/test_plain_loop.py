@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.blocks import run_block, run_cells
+from support.blocks import run_block, run_cells, whole
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, opencv_board
 from support.lengths import first_of, lengths
-from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
@@ -30,12 +29,11 @@ NOT_FLIPPED, FLIPPED, NO_ESTIMATE = 1, 2, 3
 
 def ran(pipeline):
     """Return a whole grid's scenes, and its variables with the scenes along the first axis."""
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    block = Block((0,) * len(shape), shape)
+    block = whole(pipeline)
     result = run_block(pipeline, block)
     assert not result.failures
     values = {
-        name: column.reshape(len(block), *column.shape[len(shape):])
+        name: column.reshape(len(block), *column.shape[len(block.shape):])
         for name, column in result.values.items()
     }
     return build_scenes(pipeline.experiment.scene_values(block.indices()), len(block)), values
@@ -129,9 +127,8 @@ def marker_loop(trials):
     only the poses and the images are taken.
     """
     pipeline = Pipeline.from_dict(GRID, [f"trial={trials}", "window=full"])
-    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
-    indices = [index.ravel() for index in np.indices(lengths)]
-    scenes = build_scenes(pipeline.experiment.scene_values(indices), len(indices[0]))
+    block = whole(pipeline)
+    scenes = build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
     boxes, detectors = marker_boxes(scenes), {}
     for (name, number), (refinement, method) in (
         (one, other) for one in DICTIONARIES.items() for other in REFINEMENTS.items()

@@ -296,17 +296,6 @@ def test_of_a_misspelled_file_the_nearest_in_its_folder_is_named(
         open_store("smok.zarr")
 
 
-def test_the_canonical_value_is_what_is_kept_and_compared():
-    for name, written in (("renderer", "Exact"), ("renderer", "Supersample-4-Jittered"),
-                          ("window", "FULL"), ("bound", "Known_Blur"), ("solver", "Photometric")):
-        assert PARAMETERS[name].check(written) == written.lower()
-    plain = Pipeline.from_text('[pose]\nside_px = 40\n[axes]\nsolver = ["SOLVEPNP_IPPE", "Sqpnp"]')
-    assert plain.axes[0].values == ("ippe", "sqpnp")
-    assert parse_selection("solver=SOLVEPNP_IPPE", plain) == {"solver": "ippe"}
-    with pytest.raises(PipelineError, match="each value once"):
-        Pipeline.from_text('[axes]\nsolver = ["ippe", "SOLVEPNP_IPPE"]')
-
-
 # Boards of several kinds in one pipeline, and the most that a board can be.
 
 KEYS = {"none": {}, "grid": {"rows": 2, "columns": 2, "gap_m": 0.01},
@@ -321,12 +310,6 @@ def of_board(*settings, size_m=0.05, **sections):
     }, settings)
 
 
-def of_kinds():
-    kinds = {"kind": ["none", "charuco", "grid"], "size_m": [0.1, 0.03, 0.05]}
-    return of_board(size_m=None, board=KEYS["grid"] | KEYS["charuco"],
-                    axes={"target": {"zip": kinds}})
-
-
 def test_warp_s_bitmap_of_a_board_has_a_limit():
     """OpenCV warps no more than 2^15 pixels a side."""
     def board(x_m):
@@ -339,16 +322,14 @@ def test_warp_s_bitmap_of_a_board_has_a_limit():
         bitmap_shape(board(30))
 
 
-def test_each_of_several_kinds_uses_its_own_keys():
-    boards = of_kinds().experiment.scene_values([np.arange(3)])["board"].listed(3)
-    assert [len(board) for board in boards] == [1, 4, 4]
-
-
 @pytest.mark.parametrize("kind", KEYS)
 def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind):
+    kinds = {"kind": ["none", "charuco", "grid"], "size_m": [0.1, 0.03, 0.05]}
+    several = of_board(size_m=None, board=KEYS["grid"] | KEYS["charuco"],
+                       axes={"target": {"zip": kinds}})
     single = of_board(f"kind={kind}", *(f"{name}={value}" for name, value in KEYS[kind].items()),
                       board={"kind": "grid", "rows": 5, "columns": 7, "gap_m": 0.01})
-    for each in (cell(of_kinds(), f"kind={kind},size_m=0.03"), single):
+    for each in (cell(several, f"kind={kind},size_m=0.03"), single):
         own = {name for name in each.given if each.parameters[name].section == "board"}
         assert own == {"kind", *KEYS[kind]}
 

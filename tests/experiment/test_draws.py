@@ -5,10 +5,9 @@ import pytest
 from scipy import stats
 
 import sweep
-from support.blocks import run_block, run_cells
+from support.blocks import run_cells, whole
 from support.lengths import lengths
 from sweep.experiment.draws import BITS, REPLICATES, points, scrambled, sobol_uniform
-from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.store.provenance import fingerprint
 
@@ -23,11 +22,6 @@ DRAWN = {
 }
 ORDER = ("marker_id", "distance_m", "bearing_x_deg", "trial")
 QUANTITIES = ("shift_u_px", "shift_v_px", "tilt_deg", "azimuth_deg")
-
-
-def whole(pipeline):
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return Block((0,) * len(shape), shape)
 
 
 def drawn(*settings, document=DRAWN, order=ORDER, take=None):
@@ -120,26 +114,6 @@ def test_draws_are_uniform_normal_and_independent(count):
         score = stats.pearsonr(a, b).statistic * np.sqrt(len(a))
         assert abs(score) < stats.norm.isf(0.5e-6), name
 
-
-@pytest.mark.parametrize("distortion", ["[]", "[-0.3, 0.1, 0.001, -0.002]"])
-def test_jitter_moves_the_undistorted_projection_of_the_centre_by_the_shift(distortion):
-    settings = [f"distortion={distortion}", "bearing_y_deg=-4", "fx_px=700", "fy_px=650",
-                "cx_px=300.25", "cy_px=260"]
-    pipeline = Pipeline.from_dict(DRAWN, settings)
-    block = whole(pipeline)
-    values = pipeline.experiment.scene_values(block.indices())
-    truth = run_block(pipeline, block).values["true_tvec_m"].reshape(-1, 3)
-    bearings = [values["bearing_x_deg"].values, np.full(len(block), -4.0)]
-    expected = np.tan(np.radians(np.stack(bearings)))
-    shift = np.stack([values["shift_u_px"].values, values["shift_v_px"].values])
-    # 1e-10 px: a few roundings of coordinates of some hundred pixels.
-    for axis, (focal, centre) in enumerate(((700.0, 300.25), (650.0, 260.0))):
-        pixel = focal * truth[:, axis] / truth[:, 2] + centre
-        unshifted = focal * expected[axis] + centre
-        np.testing.assert_allclose(pixel - unshifted, shift[axis], rtol=0, atol=1e-10)
-    np.testing.assert_array_equal(truth[:, 2], values["distance_m"].values)
-    assert np.abs(shift).max() <= 0.5
-    assert np.abs(shift).max() > 0.4
 
 # Draws that are Sobol' points, scrambled.
 

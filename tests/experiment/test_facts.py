@@ -6,8 +6,6 @@ import itertools
 
 import pytest
 
-import sweep.analysis
-from support.example_results import example_results
 from sweep.declaration import declared_fields
 from sweep.experiment.experiment import MAX_SAMPLE, distinct, used_settings
 from sweep.experiment.parameters import PARAMETERS, SECTIONS
@@ -175,10 +173,3 @@ def test_names_of_variables_and_parameters_are_short_and_distinct():
     declared = [name for groups, _ in SECTIONS.values() for each in groups
                 for name in declared_fields(each)]
     assert len(declared) == len(PARAMETERS)
-
-
-def test_results_of_analyses_have_them_too():
-    table = sweep.analysis.error_statistics(example_results())
-    for each, variable in table.data_vars.items():
-        assert len(variable.attrs["long_name"]) <= 42, each
-        assert variable.attrs["description"], each

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from support.blocks import whole
 from support.documents import LENS, any_document
 from support.lengths import first_of, lengths
 from sweep.evaluation.search import visibility_flags
@@ -22,10 +23,9 @@ SCIPY = "SciPy's `Rotation`"
 def made(pose, axes=None, seed=1, **sections):
     """Return the values and scenes of a pipeline's whole grid."""
     pipeline = Pipeline.from_dict({"seed": seed, "pose": pose, "axes": axes or {}, **sections})
-    lengths = [len(axis) for axis in pipeline.experiment.scene_axes]
-    indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-    values = pipeline.experiment.scene_values(indices)
-    return values, build_scenes(values, int(np.prod(lengths)))
+    block = whole(pipeline)
+    values = pipeline.experiment.scene_values(block.indices())
+    return values, build_scenes(values, len(block))
 
 
 def drawn(pose, count):
@@ -157,9 +157,7 @@ def test_any_pose_has_a_truth_and_is_the_same_alone(count):
     for _ in range(count):
         document = any_document(rng)
         pipeline = Pipeline.from_dict(document)
-        indices = [index.ravel() for index in np.indices(
-            [len(axis) for axis in pipeline.experiment.scene_axes], dtype=np.intp)]
-        scene_count = len(indices[0]) if indices else 1
+        indices, scene_count = whole(pipeline).indices(), len(whole(pipeline))
         values = pipeline.experiment.scene_values(indices)
         scenes = build_scenes(values, scene_count)
         unseen = visibility_flags(scenes) == DetectionStatus.not_visible

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from support.exact_image import LENSES
 from support.lengths import lengths
-from sweep.measure.estimation import point_covariance, solve_positive, squared_deviations
+from sweep.measure.estimation import point_covariance, squared_deviations
 from sweep.measure.flags import (
     BoundStatus,
     CalibrationStatus,
@@ -124,29 +124,6 @@ def test_squared_deviations_are_those_of_independent_numbers_that_are_mixed():
     off = np.abs(found / (normal**2).sum(axis=1) - 1)
     assert (off < 1e-14 * np.linalg.cond(plain) + 1e-12).all()
 
-
-# The solver of positive definite systems.
-
-def test_positive_definite_systems_are_solved_whatever_their_scale():
-    rng = np.random.default_rng(8)
-    for trial in range(300):
-        n, columns = int(rng.integers(1, 11)), int(rng.integers(1, 5))
-        factor = rng.normal(size=(n, 2 * n))
-        plain = factor @ factor.T
-        right = rng.normal(size=(n, columns))
-        expected = np.linalg.solve(plain, right)
-        # A power of two of each unknown changes no digit: those of x do exactly the inverse.
-        most = (0, 3, 30, 500)[trial % 4]
-        power = rng.integers(-most, most + 1, size=n)
-        matrix = np.ldexp(plain, power[:, None] + power)
-        # Up to 1e±150 on each unknown, 1e±300 on the diagonal.
-        scaled_right = np.ldexp(right, power[:, None])
-        before = matrix.copy()
-        assert solve_positive(matrix, scaled_right)
-        np.testing.assert_array_equal(matrix, before)
-        found = np.ldexp(scaled_right, power[:, None])
-        bound = 1e-14 * np.linalg.cond(plain) * np.abs(expected).max()
-        assert np.abs(found - expected).max() < bound
 
 # Calibrations of points with known noise: the truth comes back, reported deviations hold it.
 

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from support.blocks import run_block
+from support.blocks import run_block, whole
 from support.lengths import lengths
-from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import TargetScenes, classify
 from sweep.measure.detectors import (
@@ -135,7 +134,7 @@ def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(diction
         f'dictionary = ["{dictionary}"]\nmarker_id = {ids_of(dictionary)}\n'
         "roll_deg = [0, 90, 180, 270]"
     )
-    block = Block((0,) * 3, tuple(len(axis) for axis in pipeline.experiment.scene_axes))
+    block = whole(pipeline)
     values = run_block(pipeline, block).values
     assert (values["detection"] == DetectionStatus.detected).all()
     # Unrefined corners are whole pixels just within the true ones: half a pixel, plus one for

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.blocks import run_cells
+from support.blocks import run_cells, whole
 from support.lengths import lengths
 from support.solving import BOARD_METHODS, BoardPoints, detected, estimate
 from sweep.evaluation.search import visibility_flags
-from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -23,7 +22,7 @@ from sweep.measure.solver import OPENCV_SOLVERS, PointSolver
 from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
-from sweep.model.pose import rotation_of_angles, vector_of_rotation
+from sweep.model.pose import rotation_of_angles
 from sweep.model.scene import build_scenes
 
 FOCAL_PX = 1600 / 3
@@ -34,47 +33,6 @@ RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 def cameras(count, view=(FOCAL_PX, FOCAL_PX, 319.5, 239.5), lens=()):
     return Cameras(np.tile(view, (count, 1)), np.repeat(pack(lens)[None], count, axis=0),
                    np.full(count, bool(lens)))
-
-
-def scenes_of(document):
-    pipeline = Pipeline.from_dict(document)
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    block = Block((0,) * len(shape), shape)
-    return build_scenes(pipeline.experiment.scene_values(block.indices()), len(block))
-
-
-# What OpenCV takes for a pose, or for pixels.
-
-def test_rotation_that_is_not_a_number_has_no_vector():
-    """cv2.Rodrigues gives it the vector 0: a failed pose would be a perfect one."""
-    nothing = np.full((3, 3), np.nan)
-    assert (cv2.Rodrigues(nothing)[0] == 0).all()
-    assert np.isnan(vector_of_rotation(nothing)).all()
-    error = pose_error(nothing[None], np.ones((1, 3)), np.eye(3)[None], np.ones((1, 3)))
-    assert np.isnan(error.rotation_angle_rad).all()
-
-
-def test_marker_that_reaches_behind_the_camera_is_not_visible():
-    """cv2.projectPoints divides by z whatever its sign: such markers would be drawn, and sought."""
-    scenes = scenes_of({
-        "seed": 7, "scene": {"background": 128},
-        "pose": {"azimuth_deg": {"uniform": [0, 360]}, "roll_deg": {"uniform": [0, 360]}},
-        "axes": {
-            "side_px": [300, 600, 1000, 2000, 5000], "tilt_deg": [0, 30, 60, 80, 85, 89],
-            "bearing_x_deg": [0, 25], "bearing_y_deg": [0, -20, 60], "trial": 3,
-        },
-    })
-    square = scenes.size_m[:, None, None] * SQUARE
-    corners = np.einsum("nij,nkj->nki", scenes.rotation, square) + scenes.translation[:, None]
-    behind = np.flatnonzero((corners[..., 2] <= 0).any(axis=1))
-    assert len(behind) > 100
-    assert (visibility_flags(scenes)[behind] == DetectionStatus.not_visible).all()
-    none, frame = np.zeros(3), np.array([640, 480])
-    drawn = [
-        cv2.projectPoints(corners[row], none, none, scenes.cameras.matrix(row), None)[0][:, 0]
-        for row in behind
-    ]
-    assert sum(((pixels > 0) & (pixels < frame)).all(axis=1).any() for pixels in drawn) > 50
 
 
 # Solvers of markers: OpenCV's success flag says nothing of what was solved.
@@ -136,7 +94,7 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens):
     makes them take the other solution; ITERATIVE, which only starts from the inverse, for none.
     Tilts from 10 degrees and a roll of 20, where the solvers themselves are stable in any frame.
     """
-    scenes = scenes_of({
+    pipeline = Pipeline.from_dict({
         "seed": 3, "marker": {"size_m": 0.1}, "axes": {"trial": count},
         "camera": {"fx_px": 600, "width_px": 1280, "height_px": 960, "distortion": list(lens)},
         "pose": {
@@ -145,6 +103,7 @@ def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens):
             "bearing_y_deg": {"uniform": [-30, 30]},
         },
     })
+    scenes = build_scenes(pipeline.experiment.scene_values(whole(pipeline).indices()), count)
     seen = visibility_flags(scenes) == DetectionStatus.not_run
     for solver, guarded in itertools.product(RELIABLE, (True, False)):
         found = estimate(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sweep
-from support.blocks import run_cells
+from support.blocks import run_cells, whole
 from support.board_photographs import (
     BOARD,
     POSES,
@@ -20,7 +20,6 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.analysis import error_statistics
 from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.grid import Block
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
@@ -172,15 +171,10 @@ def prepared(tmp_path_factory):
     ).pipeline
 
 
-def all_indices(pipeline):
-    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    return Block((0,) * len(lengths), lengths).indices()
-
-
 def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
     record, _ = PHOTOGRAPH_RECORDS.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
     twins = twin_pipeline(prepared, SCENE, repeats=2)
-    columns = run_cells(twins, all_indices(twins)).columns
+    columns = run_cells(twins, whole(twins).indices()).columns
     shown = record.shown
     assert not shown.all()
     flags = columns["detection"][0].reshape(2, *shown.shape)
@@ -201,7 +195,7 @@ def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
 
 def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared):
     twins = twin_pipeline(prepared, SCENE, repeats=2)
-    indices = all_indices(twins)
+    indices = whole(twins).indices()
     values = twins.experiment.scene_values(indices)
     blur = values["blur_px"].values.reshape(6, -1)
     assert (blur == blur[:, :1]).all()

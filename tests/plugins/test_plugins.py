@@ -105,14 +105,6 @@ def test_a_detector_of_other_conventions_gives_opencv_s_corners(folder):
     assert (np.array(columns["detection"]) == DetectionStatus.detected).all()
 
 
-@pytest.mark.parametrize(("setting", "told"), [
-    ("shift_px = [0, 10]", "axes.shift_px = [0, 10]: expected a number from -9 to 9 (not 10)"),
-    ("shift_pixels = [0, 10]", "unknown key; did you mean shift_px?"),
-])
-def test_settings_are_checked_as_our_own(setting, told, folder):
-    assert told in refusal(f"{GRID}{setting}\n", folder=folder)
-
-
 def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):
     (folder / "other.py").write_text(MINE)
     both = GRID.replace('"mine:TURNED"]', '"mine:TURNED", "other:TURNED"]\nshift_px = [0, 1]')
@@ -289,19 +281,6 @@ def test_the_pipeline_runs_with_all_four():
     assert (np.array(cells.columns["estimate"]) == EstimateStatus.solved).all()
 
 
-def test_the_renderer_samples_each_pixel_at_its_centre():
-    images = [
-        scene_image(Pipeline.from_dict({
-            "camera": {"width_px": 160, "height_px": 120, "fx_px": 200, "fy_px": 200},
-            "marker": {"size_m": 0.05, "marker_id": 3},
-            "pose": {"distance_m": 0.2, "tilt_deg": 35, "azimuth_deg": 20, "roll_deg": 12},
-            "scene": {"renderer": name, "background": 90},
-        }, folder=FOLDER), whole_frame=True) for name in ("sampled:RENDERER", "supersample-1")
-    ]
-    np.testing.assert_array_equal(*images)
-    assert len(np.unique(images[0])) == 3
-
-
 # Plug-ins at fault.
 
 BAD_DETECTOR = """
@@ -398,17 +377,23 @@ def test_a_plug_in_that_cannot_be_used_is_one_line(tmp_path, source, told, monke
         assert told in line
 
 
+POSE = "[pose]\nside_px = 24\n"
+
+
 @pytest.mark.parametrize(("text", "told"), [
-    ('[detector]\ndetector = "nowhere:D"',
+    (GRID + "shift_px = [0, 10]",
+     "axes.shift_px = [0, 10]: expected a number from -9 to 9 (not 10)"),
+    (GRID + "shift_pixels = [0, 10]", "unknown key; did you mean shift_px?"),
+    (POSE + '[detector]\ndetector = "nowhere:D"',
      'detector.detector = "nowhere:D": expected the file nowhere.py in'),
-    ('[detector]\ndetector = "apriltagg"', "expected an installed detector plug-in"),
-    ('[estimator]\nsolver = "ippee"', "did you mean ippe?"),
-    ('[scene]\nrenderer = "nowhere:R"', "expected the file nowhere.py in"),
-    ('effects = ["fog"]', "expected an installed effect"),
-    ('effects = "fog"', "expected a list of plug-ins, each once"),
+    (POSE + '[detector]\ndetector = "apriltagg"', "expected an installed detector plug-in"),
+    (POSE + '[estimator]\nsolver = "ippee"', "did you mean ippe?"),
+    (POSE + '[scene]\nrenderer = "nowhere:R"', "expected the file nowhere.py in"),
+    ('effects = ["fog"]\n' + POSE, "expected an installed effect"),
+    ('effects = "fog"\n' + POSE, "expected a list of plug-ins, each once"),
 ])
-def test_names_of_plug_ins_that_are_not_there(text, told, tmp_path):
-    assert told in refusal(f"{text}\n[pose]\nside_px = 24\n", folder=tmp_path)
+def test_names_and_settings_of_plug_ins_that_are_not_there(text, told, folder):
+    assert told in refusal(text, folder=folder)
 
 
 BAD_SOLVER = """

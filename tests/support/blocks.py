@@ -5,6 +5,13 @@ from typing import Any
 
 from sweep.evaluation import block as cells_of_blocks
 from sweep.evaluation.results import Failure, to_dataset_layout
+from sweep.experiment.grid import Block
+
+
+def whole(pipeline):
+    """Return the block that is a pipeline's whole grid."""
+    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
+    return Block((0,) * len(shape), shape)
 
 
 def run_cells(pipeline, indices, *needs):

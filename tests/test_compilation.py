@@ -32,17 +32,11 @@ def run(script, top=TOP, **environment):
     return done.stdout.split()
 
 
-@pytest.fixture
-def package(tmp_path):
-    """The folder of a copy of the package that was never compiled."""
-    ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(TOP / "sweep", tmp_path / "package" / "sweep", ignore=ignored)
-    return tmp_path / "package"
-
-
 @pytest.mark.system
-def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package, tmp_path):
-    cached = str(tmp_path / "cached")
+def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_path):
+    package, cached = tmp_path / "package", str(tmp_path / "cached")
+    ignored = shutil.ignore_patterns("__pycache__")  # never compiled
+    shutil.copytree(TOP / "sweep", package / "sweep", ignore=ignored)
     first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
     assert list(Path(cached).glob("*/renderers._unit*.nbc"))
     other = package / "sweep" / "model" / "coverage.py"

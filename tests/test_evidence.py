@@ -10,10 +10,6 @@ PART = {
 }
 
 
-def claim(worst):
-    return {"what": "pixels", "against": "clipping", "unit": "px", "worst": worst, "test": "t"}
-
-
 def test_shards_are_joined_and_faults_named(tmp_path, capsys):
     page = tmp_path / "README.md"
     page.write_text(f"before\n{evidence.BEGIN}\nold\n{evidence.END}\nafter\n")
@@ -21,7 +17,8 @@ def test_shards_are_joined_and_faults_named(tmp_path, capsys):
     for shard, worst in ((1, 2e-13), (2, 3e-12)):
         files.append(str(tmp_path / f"{shard}.json"))
         (tmp_path / f"{shard}.json").write_text(json.dumps({
-            **PART, "shard": shard, "status": 0, "seconds": {"t": 1800}, "claims": [claim(worst)],
+            **PART, "shard": shard, "status": 0, "seconds": {"t": 1800},
+            "claims": [{"what": "pixels", "against": "clipping", "unit": "px", "worst": worst}],
             "outcomes": {"t": {"passed": 3}, "u": {"failed": shard - 1}}}))
     assert evidence.table(*files, page=page) == 1
     assert "failed: u" in capsys.readouterr().out

@@ -37,17 +37,6 @@ def added(folder, *changes):
     return folder
 
 
-def printed_by(folder, script):
-    """Run a script with the package in a folder; return its last line, read as JSON."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, cwd=folder,
-        capture_output=True, text=True, check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
-
-
 EFFECTS = """
     Effect(
         "haze", "light",
@@ -221,7 +210,13 @@ def results(tmp_path_factory):
         ("experiment/schema.py", "             flags=flags.Flipped),\n", VARIABLE),
         ("evaluation/variables.py", '    "flipped": _flipped,\n', FUNCTION),
     )
-    return printed_by(folder, SCRIPT)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=environment, cwd=folder,
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def test_effects_are_a_record_each(results):

@@ -187,11 +187,6 @@ def distracted(board, *settings, **sections):
     }, settings=settings)
 
 
-def scene_of(chosen):
-    values = chosen.experiment.scene_values([])
-    return build_scenes(values, 1), values
-
-
 def one(chosen, name):
     return run_cells(chosen, []).columns[name][0][0]
 
@@ -233,7 +228,8 @@ def test_an_id_of_the_board_elsewhere_is_no_detection_of_its_marker():
 ])
 def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(beside, tilt, expected):
     chosen = distracted({**SQUARES, "distractors": beside}, pose={"tilt_deg": tilt})
-    scenes, values = scene_of(chosen)
+    values = chosen.experiment.scene_values([])
+    scenes = build_scenes(values, 1)
     flags = visibility_flags(scenes)
     assert flags[0] == expected
     boards = target_scenes(

@@ -137,21 +137,17 @@ def test_window_finds_what_the_frame_holds_under_any_setting_and_processing(coun
     compared(visible_scenes(count, settings=scene), DetectorSetting(**setting))
 
 
-def paired(*settings):
-    return Pipeline.from_dict({
-        "seed": 3, "scene": {"background": 128},
-        "pose": {"tilt_deg": {"uniform": [0, 70]}, "bearing_x_deg": {"uniform": [-30, 30]}},
-        "axes": {
-            "side_px": [15, 40, 120], "trial": 12, "cornerRefinementMethod": list(REFINEMENTS),
-            "adaptiveThreshWinSizeMax": [23], "solver": ["ippe_square", "iterative"],
-        },
-    }, settings)
-
-
 def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
     alone, beside = (
-        run_block(paired(*settings), Block((0, 0), (3, 12))).values
-        for settings in ((), ("adaptiveThreshWinSizeMax=[61, 23]",))
+        run_block(Pipeline.from_dict({
+            "seed": 3, "scene": {"background": 128},
+            "pose": {"tilt_deg": {"uniform": [0, 70]}, "bearing_x_deg": {"uniform": [-30, 30]}},
+            "axes": {
+                "side_px": [15, 40, 120], "trial": 12, "cornerRefinementMethod": list(REFINEMENTS),
+                "adaptiveThreshWinSizeMax": sizes, "solver": ["ippe_square", "iterative"],
+            },
+        }), Block((0, 0), (3, 12))).values
+        for sizes in ([23], [61, 23])
     )
     assert (alone["detection"] == DetectionStatus.detected).any()
     for name, expected in alone.items():

@@ -155,14 +155,6 @@ def views(count, noise_px, draw, tilt_deg=45.0):
     return [BOARD] * count, pixels
 
 
-def test_points_without_noise_give_the_camera():
-    found = calibrate(*views(10, 0.0, np.random.default_rng(1)), FRAME)
-    assert found.status == CalibrationStatus.calibrated
-    np.testing.assert_allclose(found.values[:4], TRUTH[:4], atol=0.01)
-    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.3, 0.3, 7), [1.0]), -1)
-    assert np.abs(image_of(grid, found.values) - image_of(grid)).max() < 0.01
-
-
 @lengths(20, 600)
 def test_reported_deviations_hold_the_truth_of_unbiased_points(count):
     """A calibration whose intervals of 95 % hold 93 % fails with a probability of 1e-7 each."""

@@ -66,20 +66,15 @@ def held_by(setting, side=64, frame_side=64):
     return search.__self__.getDetectorParameters()
 
 
-def expected_of(setting):
-    """Return the values that OpenCV must hold; floats to float32's precision."""
-    return {
-        name: REFINEMENTS[value] if name == "cornerRefinementMethod"
-        else pytest.approx(value, rel=1e-7)
-        for name, value in dataclasses.asdict(setting).items() if name in OTHER
-    }
-
-
 def test_field_that_is_set_reaches_opencv_and_no_other_changes():
     for name, value in OTHER.items():
         setting = DetectorSetting(**{name: value})
         assert value != FIELDS[name]
-        assert opencv_fields(held_by(setting)) == expected_of(setting), name
+        assert opencv_fields(held_by(setting)) == {
+            each: REFINEMENTS[wanted] if each == "cornerRefinementMethod"
+            else pytest.approx(wanted, rel=1e-7)  # some are float32
+            for each, wanted in dataclasses.asdict(setting).items() if each in OTHER
+        }, name
 
 
 @given(
@@ -119,19 +114,16 @@ def test_corners_of_an_upright_square_follow_opencvs_known_conventions(refinemen
     np.testing.assert_allclose(corners[0][0], [[a, a], [b, a], [b, b], [a, b]], atol=0.01)
 
 
-def ids_of(dictionary):
-    """Return the first, a middle and the last ID; the original dictionary's last is symmetric."""
-    count = marker_count(dictionary)
-    return [0, count // 2, count - (2 if dictionary == "DICT_ARUCO_ORIGINAL" else 1)]
-
-
 @pytest.mark.parametrize("dictionary", opencv_dictionary_names())
 def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(dictionary):
+    # The first, a middle and the last ID; the original dictionary's last is symmetric.
+    count = marker_count(dictionary)
+    ids = [0, count // 2, count - (2 if dictionary == "DICT_ARUCO_ORIGINAL" else 1)]
     # A whole even number of pixels a module: every module's edges lie between pixels.
     side = module_count(dictionary) * (140 // module_count(dictionary) // 2 * 2)
     pipeline = Pipeline.from_text(
         f"[pose]\nside_px = {side}\n[scene]\nbackground = 128\n[axes]\n"
-        f'dictionary = ["{dictionary}"]\nmarker_id = {ids_of(dictionary)}\n'
+        f'dictionary = ["{dictionary}"]\nmarker_id = {ids}\n'
         "roll_deg = [0, 90, 180, 270]"
     )
     block = whole(pipeline)

@@ -156,24 +156,19 @@ def test_python_that_is_not_run_has_the_right_syntax(block):
     "block", [block for block in BLOCKS if block.language == "sh"],
     ids=lambda block: block.guide)
 def test_flags_of_commands_exist(block, capsys):
-    for command, *arguments in commands_of(block):
-        if command == "sweep":
-            flags_exist(arguments, capsys)
+    for arguments in (words[1:] for words in commands_of(block) if words[0] == "sweep"):
+        with pytest.raises(SystemExit, match="0"):
+            main([arguments[0], "--help"])
+        helped = capsys.readouterr().out
+        for argument in arguments[1:]:
+            if re.fullmatch(r"--?[a-z][a-z-]*", argument):
+                assert re.search(rf"(?<![\w-]){argument}\b", helped), argument
 
 
 @pytest.mark.system
 def test_blocks_for_a_shell_have_its_syntax():
     blocks = "\n".join(block.text for block in BLOCKS if block.language == "sh")
     subprocess.run(["bash", "-n"], input=blocks, text=True, check=True)
-
-
-def flags_exist(arguments, capsys):
-    with pytest.raises(SystemExit, match="0"):
-        main([arguments[0], "--help"])
-    helped = capsys.readouterr().out
-    for argument in arguments[1:]:
-        if re.fullmatch(r"--?[a-z][a-z-]*", argument):
-            assert re.search(rf"(?<![\w-]){argument}\b", helped), argument
 
 
 def cells(row):

@@ -45,18 +45,25 @@ def assert_same(table, expected):
         np.testing.assert_array_equal(table[name], expected[name], err_msg=name)
 
 
-def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid():
-    expected = drawn()
+@pytest.mark.parametrize("sampling", ["independent", "sobol"])
+def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid(sampling):
+    own = f"sampling={sampling}", "trial=32"
+    expected = drawn(*own)
+    assert len(set(expected["tilt_deg"].ravel().tolist())) == 3 * 3 * 2 * 32
     cut = {name: column[1:2, 2:, 0:1] for name, column in expected.items()}
-    assert_same(drawn("marker_id=[0]", "distance_m=[1.0]", "bearing_x_deg=[0]"), cut)
-    fixed = drawn("marker_id=0", "distance_m=1", "bearing_x_deg=0", order=("trial",))
+    assert_same(drawn(*own, "marker_id=[0]", "distance_m=[1.0]", "bearing_x_deg=[0]"), cut)
+    fixed = drawn(*own, "marker_id=0", "distance_m=1", "bearing_x_deg=0", order=("trial",))
     assert_same(fixed, {name: column[0, 0, 0] for name, column in cut.items()})
     wider = drawn(
-        "marker_id={range=[0, 9]}", "distance_m=[0.1, 1.0, 0.3, 0.5, 0.2]",
-        "bearing_x_deg=[-3, 7.5, 0]", "trial=9",
-        take=np.ix_([3, 0, 8], [4, 3, 1], [2, 1], range(4)),
+        own[0], "marker_id={range=[0, 9]}", "distance_m=[0.1, 1.0, 0.3, 0.5, 0.2]",
+        "bearing_x_deg=[-3, 7.5, 0]", "trial=64",
+        take=np.ix_([3, 0, 8], [4, 3, 1], [2, 1], range(32)),
     )
     assert_same(wider, expected)
+    one = cell(Pipeline.from_dict(DRAWN, own), "marker_id=0,distance_m=1,bearing_x_deg=0,trial=29")
+    alone = one.experiment.scene_values([np.array([0])])
+    assert_same({name: alone[name].values for name in QUANTITIES},
+                {name: column[0, 0, 0, 29:30] for name, column in cut.items()})
 
 
 @pytest.mark.parametrize("settings", [
@@ -117,22 +124,6 @@ def test_draws_are_uniform_normal_and_independent(count):
 
 # Draws that are Sobol' points, scrambled.
 
-def sobol_pipeline(*settings, trials=64, **sections):
-    document = {
-        "seed": 4, "sampling": "sobol",
-        "pose": {"distance_m": 0.5, "tilt_deg": {"uniform": [0, 60]},
-                 "roll_deg": {"normal": [0, 30]}, "jitter_px": 1},
-        "axes": {"azimuth_deg": [0, 40], "trial": trials},
-    }
-    return sweep.Pipeline.from_dict(document | sections, list(settings))
-
-
-def sobol_drawn(grid, *indices):
-    values = grid.experiment.scene_values([np.asarray(index) for index in indices])
-    return {name: values[name].values for name in
-            ("tilt_deg", "roll_deg", "shift_u_px", "shift_v_px")}
-
-
 def test_points_are_sobols_wherever_they_are_asked_for():
     # Of the first dimension they are van der Corput's, in the order of the Gray code.
     index = np.array([0, 1, 2, 3, 70_000, 70_001, 5, 3])
@@ -174,25 +165,6 @@ def test_pairs_of_quantities_fill_their_square_evenly():
         assert len(set(cells.tolist())) == 256
 
 
-def test_a_draw_depends_on_its_own_cell_and_trial_alone():
-    grid, index = sobol_pipeline(), (np.repeat([0, 1], 64), np.tile(np.arange(64), 2))
-    ours = sobol_drawn(grid, *index)
-    # A grid that is extended, cut into other blocks, in other order, with a fixed azimuth.
-    longer = sobol_drawn(sobol_pipeline(trials=4096), *index)
-    fixed = sobol_pipeline(axes={"trial": 64}, pose={
-        "distance_m": 0.5, "tilt_deg": {"uniform": [0, 60]}, "roll_deg": {"normal": [0, 30]},
-           "jitter_px": 1, "azimuth_deg": 40,
-    })
-    for name, values in ours.items():
-        np.testing.assert_array_equal(longer[name], values)
-        np.testing.assert_array_equal(sobol_drawn(fixed, np.arange(64))[name], values[64:])
-        some = sobol_drawn(grid, [1, 0], [33, 2])[name]
-        np.testing.assert_array_equal(some, values[[64 + 33, 2]])
-    one = cell(grid, "azimuth_deg=40,trial=33")
-    assert sobol_drawn(one, [0])["tilt_deg"][0] == ours["tilt_deg"][64 + 33]
-    assert len(set(ours["tilt_deg"].tolist())) == 128
-
-
 def test_replicates_are_independent():
     # The correlation of the means of two replicates over 4,000 cells is 0 to 0.08 but for a chance
     # below 1e-6 (normal, 1 / sqrt(4000) = 0.016).
@@ -206,14 +178,18 @@ def test_replicates_are_independent():
 
 
 def test_sampling_is_part_of_what_stores_must_share():
-    grid = sobol_pipeline()
-    assert sweep.Pipeline.from_text(grid.to_toml()) == grid
-    assert fingerprint(grid)["sampling"] == "sobol"
-    assert fingerprint(sobol_pipeline("sampling='Sobol'"))["sampling"] == "sobol"
-    plain = sobol_pipeline("sampling=independent")
+    grid, same, plain = (
+        Pipeline.from_dict(DRAWN, [f"sampling='{sampling}'", "trial=32"])
+        for sampling in ("sobol", "Sobol", "independent")
+    )
+    assert Pipeline.from_text(grid.to_toml()) == grid
+    assert fingerprint(grid)["sampling"] == fingerprint(same)["sampling"] == "sobol"
     assert "sampling" not in fingerprint(plain)
-    index = np.zeros(3, dtype=int), np.arange(3)
-    assert (sobol_drawn(plain, *index)["tilt_deg"] != sobol_drawn(grid, *index)["tilt_deg"]).all()
+    ours, others = (
+        each.experiment.scene_values(whole(each).indices())["tilt_deg"].values
+        for each in (grid, plain)
+    )
+    assert (ours != others).all()
 
 # How much evenly spread draws gain on real scenes: variances of means against independent ones.
 

@@ -63,17 +63,6 @@ def cameras_of(view, lens=()):
     return Cameras(view, np.tile(pack(lens), (count, 1)), np.full(count, len(lens) > 0))
 
 
-def slopes_of(rotation, translation, size_m, view, lens):
-    """OpenCV's derivatives (8, 6) by a turn and a shift in the camera frame.
-
-    Those by its rotation vector at 0, of a marker whose points are turned already.
-    """
-    points = (CORNERS * size_m) @ rotation.T
-    camera = np.array([[view[0], 0, view[2]], [0, view[1], view[3]], [0, 0, 1]])
-    lens = np.array(lens) if lens else None
-    return cv2.projectPoints(points, np.zeros(3), translation, camera, lens)[1][:, :6]
-
-
 def off(found, expected):
     """The largest difference of two covariances in units of the standard deviations."""
     spread = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
@@ -87,8 +76,12 @@ def test_covariance_is_the_pseudo_inverse_of_opencvs_projection_differentiated(l
     found = corner_covariance(rotation, translation, cameras_of(view, lens), size_m, noise_px)
     assert found.shape == (40, 6, 6)
     worst = 0.0
-    for n in range(40):
-        slopes = slopes_of(rotation[n], translation[n], 0.1, view[n], lens)
+    for n, (fx, fy, cx, cy) in enumerate(view):
+        # By OpenCV's rotation vector at 0, of a marker whose points are turned already.
+        camera = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        slopes = cv2.projectPoints(
+            0.1 * CORNERS @ rotation[n].T, np.zeros(3), translation[n], camera,
+            np.array(lens) if lens else None)[1][:, :6]
         unit = np.repeat([1.0, 0.1], 3)
         inverse = np.linalg.pinv(slopes * unit, rcond=1e-12)
         expected = noise_px**2 * (inverse @ inverse.T) * np.outer(unit, unit)

@@ -59,15 +59,14 @@ def poses(count, seed, sides=(10, 40), max_tilt=75, **given):
     return found
 
 
-def image_of(value, window=None):
-    """The image that is rendered, quantised."""
-    scenes = build_scenes(value, 1)
-    window = window or (0, 0, value["width_px"], value["height_px"])
-    return render_all(scenes, np.array([0]), marker_boxes(scenes), np.array([window]))[0]
-
-
 def whole(value):
     return 0, 0, value["width_px"], value["height_px"]
+
+
+def image_of(value):
+    """The image that is rendered, quantised."""
+    scenes = build_scenes(value, 1)
+    return render_all(scenes, np.array([0]), marker_boxes(scenes), np.array([whole(value)]))[0]
 
 
 # Blur.

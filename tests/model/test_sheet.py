@@ -19,14 +19,28 @@ from sweep.model.exposure import (
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 
+LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
 
-def flat_points(directions, rotation, centre, bend, curvature, turn_rad):
-    """The points (n, 2) of the flat sheet, right and up in metres, that rays (n, 3) from the camera
-    meet first (a bulge towards the viewer) or last (a hollow); NaN where they miss."""
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
+
+def scenes_of(**given):
+    value = values(**(NEUTRAL | {
+        "width_px": 48, "height_px": 44, "fx_px": 60.0, "size_m": 0.1, "side_px": 24.0,
+    } | LEVELS | given))
+    return value, build_scenes(value, 1)
+
+
+def on_bent_sheet(directions, value):
+    """Column and row on the flat sheet of the points that rays (n, 3) from the camera meet first
+    (a bulge towards the viewer) or last (a hollow); NaN where they miss."""
+    plane = plane_of(value).astype(np.float64)
+    n = len(modules_of(value)) - 2
+    module = np.linalg.norm(plane[:, 0])
+    right, up = plane[:, 0] / module, -plane[:, 1] / module
+    turn, k, bend = np.radians(value["bend_deg"]), value["curvature_per_m"], value["bend"]
+    c, s = np.cos(turn), np.sin(turn)
     along = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    origin = along @ (rotation.T @ -np.asarray(centre))
-    d, k = directions @ rotation @ along.T, curvature
+    frame = np.column_stack([right, up, np.cross(right, up)]) @ along.T
+    origin, d = frame.T @ -(plane @ [n / 2, n / 2, 1]), directions @ frame
     if bend == "cylinder":
         # x² + (z + 1/k)² = 1/k²
         a = d[:, 0] ** 2 + d[:, 2] ** 2
@@ -47,32 +61,7 @@ def flat_points(directions, rotation, centre, bend, curvature, turn_rad):
     x, y, z = (origin + t[:, None] * d).T
     if bend == "cylinder":
         x = np.arctan2(k * x, k * z + 1) / k
-    return np.column_stack([x, y]) @ along[:2, :2]
-
-
-LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
-
-
-def scenes_of(**given):
-    value = values(**(NEUTRAL | {
-        "width_px": 48, "height_px": 44, "fx_px": 60.0, "size_m": 0.1, "side_px": 24.0,
-    } | LEVELS | given))
-    return value, build_scenes(value, 1)
-
-
-def on_bent_sheet(directions, value):
-    """Column and row on the flat sheet of the points that rays (n, 3) from the camera meet first
-    (a bulge towards the viewer) or last (a hollow); NaN where they miss."""
-    plane = plane_of(value).astype(np.float64)
-    n = len(modules_of(value)) - 2
-    module = np.linalg.norm(plane[:, 0])
-    right, up = plane[:, 0] / module, -plane[:, 1] / module
-    frame = np.column_stack([right, up, np.cross(right, up)])
-    centre = plane @ [n / 2, n / 2, 1]
-    flat = flat_points(
-        directions, frame, centre, value["bend"], value["curvature_per_m"],
-        np.radians(value["bend_deg"]),
-    )
+    flat = np.column_stack([x, y]) @ along[:2, :2]
     return flat[:, 0] / module + n / 2, n / 2 - flat[:, 1] / module
 
 

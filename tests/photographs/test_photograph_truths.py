@@ -137,19 +137,16 @@ def test_the_other_camera_is_the_truth_in_two_folders_and_side_by_side(stereo, t
             assert np.median(error) < 0.01  # of 0.3 m; poses by four corners of 25 px
 
 
-def exif(jpeg, orientation):
-    """Return a JPEG file with the tag by which viewers turn it."""
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
-    segment = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", 1) + entry + b"\0\0\0\0"
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
-
-
 def test_turned_deep_and_coloured_photographs_have_the_poses_of_plain_ones(faulty, tmp_path):
     grey = cv2.imread(str(faulty / "shots" / "shot1.png"), cv2.IMREAD_GRAYSCALE)
     quality = [cv2.IMWRITE_JPEG_QUALITY, 100]
-    turned = cv2.imencode(".jpg", cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE), quality)[1]
+    jpeg = cv2.imencode(
+        ".jpg", cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE), quality)[1].tobytes()
+    # The tag by which viewers turn it clockwise.
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
+    segment = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", 1) + entry + b"\0\0\0\0"
     files = {
-        "turned": exif(turned.tobytes(), 6),  # to be turned clockwise
+        "turned": jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:],
         "deep": cv2.imencode(".png", grey.astype(np.uint16) * 257)[1].tobytes(),
         "colour": cv2.imencode(".png", cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA))[1].tobytes(),
     }

@@ -265,11 +265,7 @@ def code_cells(notebook):
     return [each for each in notebook.cells if each.cell_type == "code"]
 
 
-def test_all_notebooks_are_known():
-    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == set(FIGURES)
-
-
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", [path.stem for path in NOTEBOOKS.glob("*.ipynb")])
 def test_notebook_is_stored_with_the_outputs_of_its_sources(name):
     notebook = read(name)
     nbformat.validate(notebook)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from support.blocks import run_block
+from support.blocks import run_block, whole
 from support.lengths import lengths
 from support.windows import outcomes_elsewhere, searched
 from sweep.evaluation.opencv_threads import single_threaded
@@ -34,12 +34,12 @@ def visible_scenes(count, width=640, height=480, settings=()):
     """Return ``count`` scenes of the grid, each visible at least in part."""
     document = SCENES | {"camera": {"width_px": width, "height_px": height}}
     pipeline = Pipeline.from_dict(document, settings)
-    shape = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    order = np.random.default_rng(5).permutation(int(np.prod(shape)))
+    block = whole(pipeline)
+    order = np.random.default_rng(5).permutation(len(block))
 
     def built(cells):
-        indices = list(np.unravel_index(cells, shape))
-        return build_scenes(pipeline.experiment.scene_values(indices), len(cells))
+        return build_scenes(
+            pipeline.experiment.scene_values(block.indices(cells)), len(cells))
 
     candidates = order[: count * 5 // 4 + 20]
     seen = np.flatnonzero(visibility_flags(built(candidates)) == DetectionStatus.not_run)

@@ -16,10 +16,6 @@ from sweep.store.lifecycle import planned_arrays
 
 # What may surprise of poses is told in a line, by `plan` and at the start of a run.
 
-def told(pose, axes=None, **sections):
-    return Pipeline.from_dict({"pose": pose, "axes": axes or {}, **sections}).facts.notes
-
-
 @pytest.mark.parametrize(("pose", "axes", "named"), [
     ({"distance_m": 0.3}, {"tilt_deg": [0, 45, 80], "bearing_x_deg": [0, 4.9]}, []),
     ({"distance_m": 0.3}, {"tilt_deg": [0, 120]}, ["50 % of the poses show the marker's back"]),
@@ -29,22 +25,19 @@ def told(pose, axes=None, **sections):
      ["all poses are cut off by the frame's edge"]),
     ({"camera_z_m": 1, "marker_yaw_deg": 180}, {"marker_x_m": [-2, -1]},
      ["all poses have a corner behind the camera: not_visible"]),
+    # r(1 - 0.3 r²) grows up to r = 1/sqrt(0.9): tan 46.5°.
+    ({"distance_m": 1}, {"bearing_x_deg": [0, 50], "size_m": [0.1], "fx_px": [300],
+                         "distortion": [[-0.3, 0, 0, 0]]},
+     ["50 % of the poses lie where the lens folds"]),
     ({"camera_z_m": 1}, {"marker_x_m": [0.5], "marker_yaw_deg": [0, 180]},
      ["50 % of the poses show the marker's back",
       "50 % of the poses are outside the frame: not_visible"]),
 ])
 def test_what_may_surprise_of_poses_is_a_line_each(pose, axes, named):
-    lines = told(pose, axes)
+    lines = Pipeline.from_dict({"pose": pose, "axes": axes}).facts.notes
     assert len(lines) == len(named), lines
     for line, part in zip(lines, named, strict=True):
         assert part in line
-
-
-def test_poses_where_the_lens_folds_are_told():
-    # r(1 - 0.3 r²) grows up to r = 1/sqrt(0.9): tan 46.5°.
-    line = told({"distance_m": 1.0}, {"bearing_x_deg": [0, 50]}, marker={"size_m": 0.1}, camera={
-        "fx_px": 300, "distortion": [-0.3, 0, 0, 0]})[0]
-    assert line.startswith("50 % of the poses lie where the lens folds")
 
 
 def test_poses_of_a_large_grid_are_a_sample_with_its_corners():

@@ -20,6 +20,8 @@ from sweep.model import lens
 from sweep.model.exposure import areas_px
 from sweep.model.pose import (
     angle_between,
+    angles_of_rotation,
+    rotation_of_angles,
     rotation_of_vector,
     towards,
     vector_of_rotation,
@@ -429,10 +431,18 @@ def test_areas_are_those_of_the_exact_quadrilateral_and_under_a_lens_of_many_cho
         # Measured 4.5e-7: 256 chords a side cut off (1/256)² of what one chord would.
         assert abs(areas_px(scenes)[0] / area - 1) < 5e-6
 
-# Rotations to lines of sight, against SciPy's; by angles: tests/experiment/test_pose_values.py.
+# Rotations and their angles, against SciPy's; special angles: tests/experiment/test_pose_values.py.
 
 TOLERANCE = 4e-15
 """Of an element: some ten roundings of sines, cosines and their products, each of 1.1e-16."""
+
+
+def test_tilt_azimuth_and_roll_of_a_rotation_make_it_and_lie_in_their_ranges():
+    rotation = Rotation.random(5000, rng=2).as_matrix()
+    tilt, *around = angles_of_rotation(rotation)
+    np.testing.assert_allclose(rotation_of_angles(tilt, *around), rotation, atol=TOLERANCE)
+    assert ((tilt >= 0) & (tilt <= np.pi)).all()
+    assert (np.abs(around) <= np.pi).all()
 
 
 def test_the_smallest_rotation_to_a_line_of_sight_is_scipys():

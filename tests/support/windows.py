@@ -5,12 +5,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from sweep.evaluation.search import (
-    SceneBatch,
-    detections_of,
-    search_windows,
-    visibility_flags,
-)
+from sweep.evaluation.search import SceneBatch, detections_of, search_windows
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import REFINEMENTS, BoardDetectorSetting
 from sweep.model.camera import Column
@@ -63,20 +58,15 @@ def outcomes_elsewhere(scenes, row, setting):
     return seen
 
 
-def searched(scenes, setting, *, full=False, wanted=None, boards=None, keep=False):
-    """Search windows, or whole frames with ``full``, of the scenes ``wanted`` (N,): by default all.
-
-    ``boards`` are the scenes' targets and the most markers and corners, if they are no markers. No
-    search may raise.
-    """
+def searched(scenes, setting, *, full=False):
+    """Search windows, or whole frames with ``full``, of scenes of markers. No search may raise."""
     count, failures = len(scenes), []
-    flags = np.zeros(count, dtype=np.uint8) if boards is None else visibility_flags(scenes)
-    targets = target_scenes(scenes, flags, *(boards or ()))
+    flags = np.zeros(count, dtype=np.uint8)
     experiment = SimpleNamespace(detectors=[setting], board_settings=[BoardDetectorSetting()])
-    windows = ["full" if each else "target" for each in np.broadcast_to(full, count).tolist()]
+    windows = ["full" if full else "target"] * count
     values = {"window": Column.of(windows), "background": Column.of(0.0)}
+    targets = target_scenes(scenes, flags)
     batch = SceneBatch(experiment, [], values, scenes, flags, targets, marker_boxes(scenes))
-    wanted = np.broadcast_to(True if wanted is None else wanted, count)
-    (result,), _ = detections_of(batch, wanted[:, None], failures, keep=keep)
+    (result,), _ = detections_of(batch, np.ones((count, 1), dtype=bool), failures, keep=False)
     assert not failures
     return result

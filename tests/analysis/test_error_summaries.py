@@ -22,7 +22,7 @@ from support.small_datasets import (
     with_every_flag,
 )
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 SCENE = {"distance_m": 2, "marker_id": 3, "trial": 5}
@@ -123,6 +123,12 @@ def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count, co
     for name, truth in (("range_bias_percent", mean), ("range_rmse_percent", rmse)):
         covered(summary, name, truth)
     covered(summary, "solved_rate", chances.mean(), 0.95, 0.99)
+
+
+def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(mixed, monkeypatch):
+    monkeypatch.setattr("sweep.analysis.estimator.MAX_VALUES", 9)
+    with pytest.raises(DatasetError, match="expected at most 9; divide them: keep an axis apart"):
+        error_statistics(mixed)
 
 
 # Efficiency.

@@ -51,8 +51,7 @@ PLACES = {
     "/dev/null": "not a sweep store; choose another path",
     "loop.zarr": "cannot be read: Too many levels of symbolic links",
     "file:/a/b.zarr": "a store on this machine is named by its path: /a/b.zarr",
-    "memory://x.zarr":
-        "no other process sees this one's memory; choose a path or s3://",
+    "memory://x.zarr": "no other process sees this one's memory; choose a path or s3://",
     "~/x.zarr": "~ is not expanded here; expected /home/someone/x.zarr, or ./~/x.zarr for a "
                 "folder of that name",
     "nonsense://x": "cannot be reached: Protocol not known: nonsense",

@@ -19,6 +19,7 @@ from support.blocks import run_block, run_cells, whole
 from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
+from sweep.experiment.experiment import wrong_beliefs
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA
@@ -289,3 +290,19 @@ def test_a_believed_calibration_is_what_each_trial_s_numbers_give_on_their_own()
         alone = run_cells(stated, [np.array([trial])]).columns
         np.testing.assert_array_equal(
             found["translation_error_m"][0][trial], alone["translation_error_m"][0][0])
+
+
+@pytest.mark.parametrize(("axis", "wrong"), [
+    ("believed_focal_scale = [0.99, 1, 1.01]", [True, False, True]),
+    ("believed_fx_px = [500, 510]", [False, True]),
+    ('believed = ["truth", "calibration"]', [False, True]),
+    ("believed_distortion = [[], [0.1, 0, 0, 0], [0, 0, 0, 0]]", [False, True, False]),
+    ('solver = ["ippe", "iterative"]', [False, False]),
+    ('pair = { zip = { believed_focal_scale = [1.0, 1.1], solver = ["ippe", "ap3p"] } }',
+     [False, True]),
+])
+def test_a_belief_is_wrong_where_it_differs_from_the_truth(axis, wrong):
+    calibrated = "calibration_sd = [1, 1, 1, 1]" if "calibration" in axis else ""
+    pipeline = Pipeline.from_text(
+        f"seed = 1\n[camera]\nfx_px = 500\n{calibrated}\n[pose]\nside_px = 40\n[axes]\n{axis}")
+    assert list(wrong_beliefs(pipeline, pipeline.axes[0])) == wrong

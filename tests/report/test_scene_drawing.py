@@ -1,4 +1,4 @@
-"""The picture of one scene: what its caption says, and that a small marker is seen in it."""
+"""The picture of one scene: a small marker is seen in it."""
 
 import cv2
 import numpy as np
@@ -6,17 +6,13 @@ import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report.scenes import TRUTH, cut_to_marker, draw_scene, scene_png
+from sweep.report.scenes import TRUTH, draw_scene, scene_png
 
 FRAME = {
     "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},
     "scene": {"background": 120}, "pose": {"azimuth_deg": {"uniform": [0, 360]}, "tilt_deg": 30},
     "axes": {"bearing_x_deg": [-30, 0, 30], "side_px": [12, 60, 700], "trial": 2},
 }
-
-
-def inspected(at, *, whole_frame=True):
-    return inspect_scene(cell(Pipeline.from_dict(FRAME), at), whole_frame=whole_frame)
 
 
 def share_of(picture, colour, box):
@@ -27,7 +23,8 @@ def share_of(picture, colour, box):
 
 @pytest.mark.parametrize(("bearing", "corner"), [(-30, "right"), (30, "left")])
 def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(bearing, corner):
-    scene = inspected(f"bearing_x_deg={bearing},side_px=60")
+    pipeline = cell(Pipeline.from_dict(FRAME), f"bearing_x_deg={bearing},side_px=60")
+    scene = inspect_scene(pipeline, whole_frame=True)
     picture = draw_scene(scene, "title")
     left, right = (0, 0, 600, 1200), (1000, 0, 1600, 1200)
     assert share_of(picture, TRUTH, right if corner == "right" else left) > 0.0005
@@ -35,14 +32,3 @@ def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(beari
     assert plain.shape == (1200, 1600, 3)
     assert share_of(plain, TRUTH, right if corner == "right" else left) == 0
     assert picture.shape[0] > plain.shape[0]
-
-
-def test_a_cut_is_the_marker_with_its_surroundings_within_the_window():
-    scene = inspected("side_px=60")
-    cut = cut_to_marker(scene)
-    x0, y0, x1, y1 = cut.window
-    assert np.array_equal(cut.image, scene.image[y0:y1, x0:x1])
-    low, high = scene.true_corners.min(axis=0), scene.true_corners.max(axis=0)
-    assert (low >= [x0, y0]).all()
-    assert (high < [x1, y1]).all()
-    assert max(x1 - x0, y1 - y0) < 2 * (high - low).max()

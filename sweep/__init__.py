@@ -66,7 +66,7 @@ __all__ = [
 ]
 
 class LocalOptions(TypedDict, total=False):
-    """Options of what runs on this machine, as :func:`run` has them."""
+    """Options of runs on this machine, as :func:`run` has them."""
 
     workers: int | None
     overwrite: bool
@@ -300,7 +300,7 @@ def _pipeline(
 
 
 def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray and zarr have it)
-    """Open a store's results, lazily; also those of an unfinished run.
+    """Open a store's results, lazily; also an unfinished run's.
 
     Parameters
     ----------

@@ -118,7 +118,7 @@ def compiled_sources() -> tuple[Path, ...]:
 
 @cache
 def _drop_code_of_other_sources(folder: str) -> None:
-    """Delete what was compiled from other sources: Numba compares a function's own file only.
+    """Delete code that was compiled from other sources: Numba compares a function's own file only.
 
     It would go on using code in which a function of another file is inlined as that was. A constant
     that compiled code uses must be declared in one of :func:`compiled_sources`, too.

@@ -26,7 +26,7 @@ def _letters_and_digits(word: str) -> str:
 class Declared:
     """The declaration of a value: name, types, default, meaning, unit, allowed values.
 
-    ``types`` are those of the value without None; ``default`` is MISSING if it must be given.
+    ``types`` are the value's without None; ``default`` is MISSING if it must be given.
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
@@ -244,7 +244,7 @@ def check_table(
 def table_reader(
     declared: Mapping[str, Declared], owner: str, expected: str = ""
 ) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
-    """Return what reads tables as tuples of the values of ``declared``, in its order.
+    """Return a reader of tables as tuples of the values of ``declared``, in its order.
 
     It raises ValueError if they are no tables, in words that are ``expected``, and
     :class:`TablesError` for the faults in them, as :func:`check_table` tells them.

@@ -35,9 +35,9 @@ class ArgumentError(SweepError, ValueError):
     argument
         Python's name of the argument, such as ``time_limit_s``.
     value
-        What was given.
+        The given value.
     problem
-        What is wrong, or what was expected instead: "expected seconds above 0".
+        The fault, or the expectation: "expected seconds above 0".
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the last bits of results depend on in a machine's processor, and as libraries use it."""
+"""Features of a processor, and of libraries on it, that decide the last bits of results."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        What follows ``sweep`` on the command line; by default that of this process.
+        The words after ``sweep`` on the command line; by default this process'.
     """
     accept_any_text()
     parser, _ = build_parser()

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sweep.report.table import Findings
 
 # --------------------------------------------------------------------------------------------------
-# A command: a function, and what is read from its signature and its docstring.
+# A command: a function, with flags and help from its signature and its docstring.
 
 #: Names that are listed behind commas; a flag that may be repeated. None if it is not given.
 Names = Sequence[str] | None
@@ -49,7 +49,7 @@ ELSEWHERE = re.compile(r"As for `(\w+)`\.?")
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """What a docstring says of a parameter: flags, what stands for its value, and meaning."""
+    """A parameter in a docstring: flags, what stands for its value, and meaning."""
 
     flags: tuple[str, ...]
     metavar: str | None
@@ -87,7 +87,7 @@ class Command:
 
     @property
     def summary(self) -> str:
-        """What it does, without a final full stop."""
+        """Its summary, without a final full stop."""
         line = self.description.partition("\n")[0]
         return line[:1].lower() + line[1:].removesuffix(".")
 
@@ -128,7 +128,7 @@ def command(
 
 
 def described(function: Callable[..., Any]) -> dict[str, Described]:
-    """Return what a function's docstring says of its parameters, by name.
+    """Return the parameters in a function's docstring, by name.
 
     Of parameters described as "As for `run`." it is what that command's docstring says.
     """
@@ -199,7 +199,7 @@ CONTINUES = "stopped; the same command continues"
 
 
 # --------------------------------------------------------------------------------------------------
-# What commands do before they run something: read a pipeline, say that code is compiled.
+# Before a run: commands read the pipeline, and say that code is compiled.
 
 def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
     """Return settings, as ``--set`` takes them, that say how well quantities are to be known.
@@ -383,7 +383,7 @@ def check_png(output: str) -> None:
     Raises
     ------
     ArgumentError
-        If its name is that of another format.
+        If its name ends as another format's.
     StoreError
         If it cannot be.
     """
@@ -413,7 +413,7 @@ def executed(
 def summarised(
     summary: Summary, line: str, notes: Sequence[str] = (), then: str = "", **numbers: Any
 ) -> Findings:
-    """Return what became of a run: ``line``, the dataset, warnings, and what to do next."""
+    """Return the outcome of a run: ``line``, the dataset, warnings, and what to do next."""
     again = [] if summary.computed_blocks or summary.retried else [
         f"{summary.store} is already finished; --overwrite recomputes it"
         + (" and --retry-failed what failed" if summary.failures and "retry_failed" in SESSION.flags
@@ -429,7 +429,7 @@ def summarised(
 
 MAX_LINE_LENGTH = 2000
 
-#: What to change after an error of the system.
+#: Advice after an error of the system.
 ADVICE = {
     errno.EMFILE: "allow more open files (ulimit -n)",
     errno.EAGAIN: "allow more processes (ulimit -u)",
@@ -439,13 +439,13 @@ ADVICE = {
 }
 
 
-#: What writing may end with.
+#: Errors with which writing may end.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
-#: What Python says in a RuntimeError where the system allows no more threads.
+#: Python's message in a RuntimeError where the system allows no more threads.
 NO_THREAD = "can't start new thread"
 
-#: Errors of what was asked for (exit status 2); others occur while a command runs (1).
+#: Errors of a request (exit status 2); others occur while a command runs (1).
 REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
 
 

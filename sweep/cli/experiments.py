@@ -207,7 +207,7 @@ def _dimensions(pipeline: Pipeline) -> list[str]:
 
 
 def _required(pipeline: Pipeline) -> list[str]:
-    """Return what is required, and where."""
+    """Return the requirements, and their conditions."""
     if not pipeline.requirements:
         return []
     names = ", ".join(_conditions(pipeline))
@@ -216,7 +216,7 @@ def _required(pipeline: Pipeline) -> list[str]:
 
 
 def _rule_lines(rule: StoppingRule) -> list[str]:
-    """Return what a section by which sampling stops says."""
+    """Return the section by which sampling stops, in words."""
     lines = [f"in waves until [search] is answered, at most {rule.max_trials:,}"]
     if rule.precision:
         lines += [f"{name} to {width:g}" for name, width in rule.precision]
@@ -348,7 +348,7 @@ def repro(
 
 
 def _cell_lines(again: Reproduction) -> Iterator[Any]:
-    """Yield what was recomputed, as lines and a table."""
+    """Yield the recomputed values, as lines and a table."""
     yield f"--at {again.at}"
     for line in again.changes:
         yield f"changed since the store was created: {line}"

@@ -94,7 +94,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _hint(message: str) -> str:
-    """Return what may be meant in place of what argparse refuses; empty if nothing is similar."""
+    """Return a hint at words similar to the ones that argparse refuses; empty without any."""
     if chosen := INVALID_COMMAND.match(message):
         if chosen[1] == "help":
             return "; `sweep --help` and `sweep COMMAND --help` print the help"
@@ -117,7 +117,7 @@ def _meant(word: str) -> str:
 
 
 def build_parser() -> tuple[Parser, list[argparse.ArgumentParser]]:
-    """Return the parser of ``sweep``, and those of the commands.
+    """Return the parser of ``sweep``, and the commands' parsers.
 
     Parsed, ``command`` is the chosen :class:`Command`, or None.
     """

@@ -309,7 +309,7 @@ def plugins(
 
 
 def _plugin_lines(plugin: dict[str, Any]) -> list[str]:
-    """Return what a plug-in needs, knows, and has settings of."""
+    """Return the distributions, dictionaries and settings of a plug-in."""
     meaning = f": {plugin['meaning']}" if plugin["meaning"] else ""
     known = [f"  knows      {', '.join(plugin['dictionaries'])}"] if plugin["dictionaries"] else []
     return [

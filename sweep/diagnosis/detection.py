@@ -215,7 +215,7 @@ def widened(model: DetectionModel, photographs: xr.Dataset) -> DetectionModel:
 
 
 def judged(model: DetectionModel, results: xr.Dataset) -> xr.Dataset:
-    """Return what a model says of the solved poses of a dataset, beside their errors.
+    """Return a model's errors of the solved poses of a dataset, beside their own errors.
 
     Returns
     -------
@@ -333,7 +333,7 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
 
 
 def frames(rvec: Floats, tvec: Floats) -> Floats:
-    """Return what turns errors (6,) of estimates to the camera's axes, in m and rad (n, 6, 6).
+    """Return the matrices that turn errors (6,) to the camera's axes, in m and rad (n, 6, 6).
 
     They are of the position over the range and of the rotation, along and about x in the direction
     in which the estimated marker is tilted, y across, z along the line of sight.

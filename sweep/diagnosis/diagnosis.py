@@ -61,7 +61,7 @@ def diagnose(
     zero_sd_m
         Standard deviation of the tape's zero point, in metres.
     compared
-        What was compared with the tape: "z", the third number of tvec, or "range".
+        The number that was compared with the tape: "z", the third number of tvec, or "range".
     output
         A PNG or SVG file for the figure of residuals.
 

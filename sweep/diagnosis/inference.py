@@ -320,7 +320,7 @@ class Explanation:
         Posterior mean (k,) and covariance (k, k) of its unknown numbers, in prior standard
         deviations: the causes' own first, then bias and zero points.
     fitted, sd
-        What the tape should have read (d,), and the standard deviations of its noise.
+        Expected readings of the tape (d,), and the standard deviations of its noise.
     yaw_evidence
         Log-likelihood of the measured yaws.
     probability
@@ -352,7 +352,7 @@ class Explanation:
 def predict(
     rows: Observations, causes: Sequence[Cause], ways: Sequence[Ways]
 ) -> tuple[Floats, Floats, Floats]:
-    """Return what the tape should read by each way (c,) of undoing causes.
+    """Return the expected readings of the tape by each way (c,) of undoing causes.
 
     Of all measured numbers (c, d), how unknown numbers change them (c, d, k), and the variance of
     their noise (c, d).
@@ -473,7 +473,8 @@ class Measurement(NamedTuple):
     distance_m, bearing_deg
         Where the marker is to stand.
     component
-        What is measured: "distance" along the line of sight, "x" to the right, "z" along the axis.
+        The measured component: "distance" along the line of sight, "x" to the right, "z" along
+        the axis.
     difference
         Difference of both predictions, in standard deviations.
     """
@@ -498,7 +499,7 @@ def next_measurement(rows: Observations, a: Explanation, b: Explanation) -> Meas
         np.radians(DIRECTIONS_DEG), np.geomspace(near, far, 15), indexing="ij"))
     truth = distance[:, None] * np.stack(
         [np.sin(bearing), np.zeros_like(bearing), np.cos(bearing)], axis=-1)
-    # What the program would say if a were right.
+    # The program's answer if a were right.
     said = truth @ np.linalg.inv(undo).T
     said[:, 2] = np.maximum(said[:, 2], 1e-3)
     unknown = np.full((len(said), 2), np.nan)

@@ -1,4 +1,4 @@
-"""Observations to diagnose: rows of what a program said and of what was measured by tape."""
+"""Observations to diagnose: rows of a program's answers and of measurements by tape."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def settings_of(texts: Sequence[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Observations:
-    """Rows of poses that a program said and of what was measured.
+    """Rows of a program's poses and of measurements.
 
     Attributes
     ----------
@@ -147,9 +147,9 @@ class Observations:
     zero_sd_m
         Standard deviation of the tape's zero point.
     compared
-        What was compared with the tape: "z" or "range".
+        The number that was compared with the tape: "z" or "range".
     notes
-        Lines on what was assumed.
+        Lines on assumptions.
     """
 
     said: Floats

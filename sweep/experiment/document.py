@@ -69,7 +69,7 @@ def read_document(text: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        What was expected, or why it is no TOML.
+        Says what was expected, or why it is no TOML.
     """
     try:
         size = len(text.encode())
@@ -163,10 +163,10 @@ def toml_item(value: Any) -> tomlkit.items.Item:
 # --------------------------------------------------------------------------------------------------
 # The keys of a document. All faults are gathered: a value that cannot be is left out of the grid.
 
-#: The section of what the results must fulfil (`sweep.experiment.sampling`).
+#: The section of requirements on the results (`sweep.experiment.sampling`).
 REQUIRE = "require"
 
-#: The section of what is searched (`sweep.experiment.sampling`).
+#: The section of the search (`sweep.experiment.sampling`).
 SEARCH = "search"
 
 MAX_TITLE_LENGTH = 200
@@ -205,7 +205,7 @@ def section_of(name: str, known: Mapping[str, Parameter] = PARAMETERS) -> str:
 
 @dataclass(frozen=True)
 class Reading(Grid):
-    """What a document says, as far as it could be read, and its faults.
+    """The content of a document, as far as it could be read, and its faults.
 
     Attributes
     ----------
@@ -311,7 +311,7 @@ def read_keys(
     document: Mapping[str, Any], source: str, folder: str,
     recorded: Mapping[str, str] | None = None, stored: Sequence[DeclaredPlugin] | None = None,
 ) -> Reading:
-    """Return what a document says: its keys, each checked on its own.
+    """Return the content of a document: its keys, each checked on its own.
 
     ``recorded`` files and ``stored`` plug-ins are those of a store, which are not read. Files that
     it names, and the sections of requirements and of a search, are read elsewhere.

@@ -156,7 +156,7 @@ def resolve_pose(values: Columns) -> None:
 def canonical_pose(values: Mapping[str, Column], drawn: Collection[str]) -> Columns:
     """Return the values with a pose that is the same in whichever way it is given.
 
-    That is tilt, azimuth, roll, distance and bearings, without jitter. What follows from values
+    These are tilt, azimuth, roll, distance and bearings, without jitter. What follows from values
     that are ``drawn`` stays as it is given.
     """
     canonical: Columns = {**values, **dict.fromkeys(SHIFTS, Column.of(0.0))}
@@ -182,9 +182,9 @@ class Step:
     given
         The parameters of this way: the step is taken if one of them is given.
     others
-        What it reads beside them.
+        Parameters that it reads beside them.
     makes
-        What it resolves.
+        Parameters that it resolves.
     resolve
         Returns the values (n,) of ``makes`` for n scenes.
     """
@@ -274,7 +274,7 @@ def _centres(values: Mapping[str, Column], count: int) -> Floats:
 
 
 def _shifts(values: Mapping[str, Column], count: int, names: Sequence[str] = SHIFTS) -> Floats:
-    """Return what the jitter's pixels are at the centre's depth, along x and y, (count, 2) m."""
+    """Return the jitter in metres at the centre's depth, along x and y, (count, 2)."""
     depth, pixels = values["distance_m"].broadcast(count), _numbers(values, names, count)
     return np.stack([depth * (pixel / length)
                      for pixel, length in zip(pixels, _view(values)[:2], strict=True)], axis=1)
@@ -302,7 +302,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
         return pose.transform_points(
             points[part], facing(rows[part], position), np.zeros_like(position))
 
-    # What a scene gets must not depend on whether others have a lens.
+    # A scene's values must not depend on whether others have a lens.
     for curved in (False, True):
         rows = np.flatnonzero(cameras.distorted == curved)
         points = along_sides(outline[rows], camera.PER_SIDE if curved else 1)

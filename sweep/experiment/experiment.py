@@ -49,7 +49,7 @@ def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
     return Column.of([part[index] for index in (indices - low).tolist()])
 
 
-#: Values of what differs from marker to marker in a photograph, as if it did not.
+#: Values of parameters that differ from marker to marker in a photograph, as if they did not.
 ANY_MARKER = {
     name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
 }
@@ -81,7 +81,7 @@ def effect_of(plugin: DeclaredPlugin) -> Effect:
 # The experiment: what a pipeline asks for, resolved once in each process.
 
 class Experiment:
-    """What follows from a checked pipeline: axes, draws, settings and variables, resolved once.
+    """A compiled pipeline: axes, draws, settings and variables, resolved once.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Experiment:
 
     @cached_property
     def board_settings(self) -> list[BoardDetectorSetting]:
-        """What the detector settings do with boards, in their order."""
+        """The settings of boards of the detector settings, in their order."""
         return [_made(BoardDetectorSetting, values)
                 for values, _ in self._settings("detector")]
 
@@ -151,7 +151,7 @@ class Experiment:
 
     @cached_property
     def scene_plugins(self) -> ScenePlugins:
-        """What plug-ins add to the scenes, imported.
+        """The effects and renderers of plug-ins, imported.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class Experiment:
 
     @cached_property
     def drawn(self) -> tuple[Variable, ...]:
-        """Those of them that hold what is drawn for each scene."""
+        """The variables that hold each scene's drawn values."""
         return drawn_variables(self.grid)
 
     @cached_property
@@ -293,7 +293,7 @@ PIXEL_SETTINGS = {
 
 
 def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
-    r"""Return those of some axes' values that the detector and the solver among them have.
+    r"""Return the axes' values that are settings of the detector and the solver among them.
 
     ``values`` has an axis' name -> its value, or its label if parameters go together.
 
@@ -427,7 +427,7 @@ class Part:
 
 
 class Facts:
-    """What an experiment's camera and poses are, which parts are active, and what may surprise.
+    """Facts on an experiment's camera and poses, its active parts, and notes on surprises.
 
     Of large grids, and of what is drawn, by the scenes that are looked at. `sweep plan` prints all
     of it; the start of a run prints the notes.

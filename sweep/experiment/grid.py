@@ -342,7 +342,7 @@ def _checked(parameter: Parameter, value: Any) -> Any:
 
 
 # --------------------------------------------------------------------------------------------------
-# What a document and the pipeline that is read from it have in common: values on a grid.
+# Common to a document and the pipeline that is read from it: values on a grid.
 
 @dataclass(frozen=True)
 class Grid:
@@ -450,7 +450,7 @@ class Grid:
 
     @property
     def target_word(self) -> str:
-        """What the scenes show, in a word: marker, board, or target if both."""
+        """The targets of the scenes, in a word: marker, board, or target if both."""
         if not self.shows_boards:
             return "marker"
         return "target" if self.any_value("kind", lambda kind: kind == SINGLE) else "board"

@@ -1,4 +1,4 @@
-"""Every parameter of every section, gathered from where it is declared; those of plug-ins."""
+"""Every parameter of every section, gathered from its declaration; parameters of plug-ins."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ SIMULATED = "simulated"
 #: The parameters that cannot be an axis.
 ONE_VALUE = ("camera_file", *STATED, SIMULATED, "ids", "markers", "distractors")
 
-#: Parameter of one of the ways -> those of the other ways.
+#: Parameter of one of the ways -> the parameters of the other ways.
 #:
 #: >>> sorted(RIVALS["yaw_deg"]) ['azimuth_deg', 'tilt_deg', 'view_angle_deg']
 RIVALS: dict[str, frozenset[str]] = {

@@ -1,7 +1,7 @@
 """Photographs: files of their boards, and the record of their files and of each marker's pose.
 
 A pipeline names it by the parameter ``photographs``. Its scenes are then photographs, one a trial,
-and the poses are those of the record; with ``simulated`` the images are not the photographs.
+and the poses are the record's; with ``simulated`` the images are not the photographs.
 """
 
 from __future__ import annotations

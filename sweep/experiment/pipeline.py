@@ -62,7 +62,7 @@ def apart(
         Whether a value of each cannot meet. Of numbers it gets the least and the largest, and of
         IDs the largest alone: in each number it changes once.
     expected
-        What is expected in place of the first: text, or a function of a value of each.
+        Expectation in place of the first: text, or a function of a value of each.
     """
     def check(reading: Reading) -> None:
         for values in reading.meeting(*names):
@@ -98,7 +98,7 @@ def _is_no_noise_table(table: Sequence[float]) -> bool:
 
 
 def _without(*names: str) -> Callable[[Reading], bool]:
-    """Return what says whether none of some parameters is given."""
+    """Return a function that says whether none of some parameters is given."""
     return lambda reading: reading.given.isdisjoint(names)
 
 
@@ -112,7 +112,7 @@ SEVERAL_PLANES = "for prints with z_m or tilt_deg"
 #: The ways to give a camera beside focal lengths in pixels, and beside a file.
 OTHER_WAYS = (*parameters.IN_MM, *parameters.FIELDS_OF_VIEW)
 
-#: Parameter -> those of which one must be given beside it, or one of a rival way.
+#: Parameter -> the parameters of which one must be given beside it, or one of a rival way.
 PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
 
 RECORDS: tuple[Check, ...] = (
@@ -333,13 +333,13 @@ def photographs_alone(reading: Reading) -> None:
 
 
 # --------------------------------------------------------------------------------------------------
-# Targets: boards, what is beside them, what can search and solve them.
+# Targets: boards, prints beside them, their detectors and solvers.
 
 #: The most boards of a grid: all are checked before anything is computed.
 MAX_BOARDS = 10_000
 
 def boards_can_be_printed(reading: Reading) -> None:
-    """Demand what each kind of board needs, and boards whose parts do not overlap."""
+    """Demand the parameters of each kind of board, and boards whose parts do not overlap."""
     kinds = dict.fromkeys(reading.values_of("kind"))
     needed = {name: kind for kind in kinds for name in NEEDED[kind] if name not in reading.given}
     for name, kind in needed.items():
@@ -505,7 +505,7 @@ RULES: tuple[Callable[[Reading], None], ...] = (
 
 
 # --------------------------------------------------------------------------------------------------
-# Values that replace those of a pipeline document: ``--set`` changes it, ``--at`` fixes it.
+# Values that replace a pipeline document's: ``--set`` changes it, ``--at`` fixes it.
 
 #: Parameter -> those that say the same in another way: choosing it drops them.
 ALTERNATIVES: dict[str, Collection[str]] = {
@@ -656,7 +656,7 @@ class Pipeline(Grid):
     text
         The effective TOML text: settings and the values of a camera file included.
     requirements, require_per, budget_ms
-        What is required of the results, as texts, the axes whose values are conditions, and the
+        Requirements on the results, as texts, the axes whose values are conditions, and the
         most milliseconds of a frame: the section [require]. No part of an experiment's identity.
     stopping
         When sampling stops, as [search] says; None if every trial is computed.
@@ -689,11 +689,11 @@ class Pipeline(Grid):
 
     @cached_property
     def facts(self) -> Facts:
-        """What its camera and poses are, and what may surprise of them."""
+        """Facts on its camera and poses, and notes on surprises."""
         return Facts(self.experiment)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what another process gets; it resolves the experiment itself."""
+        """Return the state for another process, which resolves the experiment itself."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
@@ -746,7 +746,7 @@ class Pipeline(Grid):
         name
             What stores are named after.
         source
-            What the lines of an error begin with.
+            The beginning of the lines of an error.
         folder
             Where relative paths start.
         files

@@ -1,4 +1,4 @@
-"""The sections that control sampling: what is required of results, and what is searched."""
+"""The sections that control sampling: requirements on results, and searches."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ def wave_ends(max_trials: int, unit: int) -> tuple[int, ...]:
 
 
 # --------------------------------------------------------------------------------------------------
-# What a search is for. None of it is part of the identity of a cell: the draws of a trial depend
+# Searches. None of this is part of the identity of a cell: the draws of a trial depend
 # on its number alone, and a search decides only which trials are computed.
 
 CHOICES = ("smallest", "largest", "cheapest")
-#: Keys that say what is searched, one in a section.
+#: Keys of the kinds of search, one in a section.
 KINDS = ("along", *CHOICES, "precision")
 
 
 @dataclass(frozen=True, slots=True)
 class StoppingRule:
-    """Trials come in waves until what is searched is known.
+    """Trials come in waves until the answer of a search is known.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class StoppingRule:
 
 
 def digest_of(rule: StoppingRule) -> str:
-    """Return what tells a rule from others: receipts hold it.
+    """Return the digest that tells a rule from others: receipts hold it.
 
     >>> digest_of(StoppingRule("precision", 2400, 50, precision=(("detection_rate", 0.02),)))
     'db369f7a'
@@ -154,7 +154,7 @@ class RequirementText:
     Attributes
     ----------
     name
-        What is required of, as it was given.
+        The required quantity, as it was given.
     relation
         One of `RELATIONS`.
     limit
@@ -175,7 +175,7 @@ def read_requirement(text: object) -> RequirementText:
     Raises
     ------
     ValueError
-        What was expected, on one line.
+        Says on one line what was expected.
 
     Examples
     --------
@@ -195,21 +195,21 @@ def read_requirement(text: object) -> RequirementText:
 
 
 # --------------------------------------------------------------------------------------------------
-# Keys of the sections, each with what reads its value, or raises ValueError with what is expected.
+# Keys of the sections, each with a reader of its value, which raises ValueError(expectation).
 
-#: What may be required beside quantities where a choice is made: the time of a frame.
+#: A requirement beside quantities where a choice is made: the time of a frame.
 BUDGET = "budget_ms"
 
 #: The key with the most trials, the length of the axis ``trial``.
 MAX_TRIALS = "max_trials"
 
-#: What is expected where nothing says how many trials there are at most.
+#: Expectation where nothing says how many trials there are at most.
 NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
 
 #: Draws of a condition in the first wave, about: all pooled cells together.
 FIRST_DRAWS = 50
 
-#: The same of a value of the axis along which a limit is searched.
+#: Draws of a value of the axis along which a limit is searched, in the first wave.
 COARSE_DRAWS = 40
 
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
@@ -295,11 +295,11 @@ def _axis_at(reading: Reading, path: str, name: str, *, scene: bool = True) -> A
 # The section [require] of a pipeline: what its results must fulfil.
 #
 # It is no part of an experiment's identity: a store is continued, whatever is required of it.
-# What a requirement may be of is known to the analysis alone (`sweep.analysis.requirements`),
+# The quantities of requirements are known to the analysis alone (`sweep.analysis.requirements`),
 # which checks the names.
 
 def read_required(reading: Reading) -> dict[str, Any]:
-    """Return what the section says, as fields of a pipeline, and note its faults.
+    """Return the section as fields of a pipeline, and note its faults.
 
     The axes have been read.
     """
@@ -352,7 +352,7 @@ def texts_in(document: Mapping[str, Any]) -> list[str]:
 # to the analysis alone; the rules that sample (`sweep.sampling.searches`) check them.
 
 def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule | None:
-    """Return what is searched, and make the axis ``trial``; the other axes have been read.
+    """Return the search, and make the axis ``trial``; the other axes have been read.
 
     ``required`` is what :func:`read_required` returned. None without the section, or with faults
     in it, which are noted.

@@ -73,7 +73,7 @@ def with_descriptions(dataset: xr.Dataset) -> xr.Dataset:
 
 
 # --------------------------------------------------------------------------------------------------
-# Coordinates of the dataset beside its axes: what is fixed, and what is drawn for each scene.
+# Coordinates of the dataset beside its axes: fixed values, and values drawn for each scene.
 
 #: Sections whose fixed parameters are coordinates also where the file does not give them.
 ALWAYS_GIVEN = ("marker", "pose")
@@ -109,7 +109,7 @@ def fixed_values(pipeline: Grid) -> dict[str, tuple[float | bool | str, dict[str
 
 
 # --------------------------------------------------------------------------------------------------
-# What the dataset knows of one variable, and the dimensions that are no axes.
+# The declaration of one variable of the dataset, and the dimensions that are no axes.
 
 XYZ = ("x", "y", "z")
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
@@ -215,7 +215,7 @@ class Variable:
     dtype
         NumPy's type string, as stored.
     meaning, units
-        What it means (``description``), and its ``units``.
+        Its ``description``, and its ``units``.
     inner
         Names of its dimensions beside the axes: keys of :data:`LABELS`.
     flags
@@ -227,7 +227,7 @@ class Variable:
         No scene may lie outside the tolerance of a scene's variable, few may outside the others'.
     drawn_as
         Name among the scene's values of the drawn quantity that it holds; such a variable is a
-        coordinate of the dataset. Empty for what is computed.
+        coordinate of the dataset. Empty for computed variables.
     lengths
         Length of each inner dimension without labels, which differs from pipeline to pipeline.
 
@@ -408,12 +408,12 @@ BOARD_SCHEMA: tuple[Variable, ...] = (
 
 NOT_OF_BOARDS = frozenset({"corner_error_px"})
 
-#: Every variable by its name, those of boards included.
+#: Every variable by its name, boards' included.
 VARIABLES = {each.name: each for each in (*SCHEMA, *BOARD_SCHEMA)}
 
 
 # --------------------------------------------------------------------------------------------------
-# Variables that not every pipeline has: draws, and what is known of photographs.
+# Variables that not every pipeline has: draws, and the record of photographs.
 
 def _drawn(name: str, meaning: str, unit: str, scale: float = 0.0, drawn_as: str = "") -> Variable:
     """Return the variable of a number of each scene that is drawn, or follows from one that is.
@@ -444,7 +444,7 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
 
 
 def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
-    """Return the variables that hold what is drawn for each scene, except the noise of pixels.
+    """Return the variables that hold each scene's drawn values, except the noise of pixels.
 
     Examples
     --------

@@ -83,11 +83,11 @@ def target_scenes(
 
 
 # --------------------------------------------------------------------------------------------------
-# What a search found of targets: flags, corners, and what estimators get.
+# Results of a search for targets: flags, corners, and detections for estimators.
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What one detector setting found of N targets.
+    """The detections of N targets by one detector setting.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ _MOST_PAIRS = 1 << 12
 def classify(
     targets: TargetScenes, searched: Mapping[int, SearchOutput], origin: Floats
 ) -> Findings:
-    """Return what was found of N targets.
+    """Return the detections of N targets.
 
     Parameters
     ----------

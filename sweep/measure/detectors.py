@@ -247,7 +247,7 @@ class Detector:
 
 
 # --------------------------------------------------------------------------------------------------
-# What OpenCV finds on a board beside its markers: missed markers, and a chessboard's corners.
+# OpenCV's finds on a board beside its markers: missed markers, and a chessboard's corners.
 
 @dataclass(frozen=True, slots=True)
 class BoardDetectorSetting:
@@ -264,7 +264,7 @@ class BoardDetectorSetting:
 
 
 class SearchOutput(NamedTuple):
-    """What is found in one image: markers, and a chessboard's corners.
+    """The finds in one image: markers, and a chessboard's corners.
 
     Attributes
     ----------
@@ -285,7 +285,7 @@ def completed(
     image: NDArray[np.uint8], board: Board, markers: DetectorOutput,
     setting: BoardDetectorSetting, of_markers: DetectorSetting,
 ) -> SearchOutput:
-    """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
+    """Return the finds on a board in an image (h, w) in which ``markers`` were detected.
 
     ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and ``cv2.aruco.CharucoDetector.detectBoard``
     are called without a camera: their homographies are local. ``of_markers`` is the detector whose

@@ -27,7 +27,7 @@ from sweep.typing import Floats, Grey, Integers, Masks
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """What was found of N targets, with the camera, size and noise that the estimator assumes.
+    """Detections of N targets, with the camera, size and noise that the estimator assumes.
 
     A marker is a target of one square: of markers alone K is N and all arrays have a row a marker.
 
@@ -42,7 +42,7 @@ class Detections:
         of their own), noise of a pixel in grey levels, and point spread, as the estimator assumes
         them.
     targets
-        What is printed.
+        The N targets.
     images, origins
         The windows that were searched, and (N, 2) their first pixels in the frame; no images for
         estimators that do not need them.
@@ -373,7 +373,7 @@ def point_covariance(
 ) -> Floats:
     """Return the first-order covariance (N, 6, 6) of poses (N, 3, 3), (N, 3) from points.
 
-    That of least squares, noise_px² (JᵀJ)⁻¹, for points whose pixels have independent errors of
+    By least squares, noise_px² (JᵀJ)⁻¹, for points whose pixels have independent errors of
     ``noise_px`` in both coordinates; the two rows of J (., 6) for a point are its pixel's
     velocities by turn about the camera's axes (radians) and shift along them (metres). Hartley and
     Zisserman, "Multiple view geometry", 2nd edition, section 5.2.1. NaN if the pose is NaN or J

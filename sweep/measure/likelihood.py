@@ -312,7 +312,7 @@ def eliminate(
         for m in range(count):
             inner[k, m] = matrix[free + k, free + m]
         if not inner[k, k] > 0.0:
-            # What covers no pixel gets the level 0.
+            # An area that covers no pixel gets the level 0.
             inner[k, k] = 1.0
         for m in range(free):
             right[k, m] = matrix[free + k, m]
@@ -376,7 +376,7 @@ class Pixels(NamedTuple):
     marker: MarkerView
 
 
-#: What is seen -> the function that does what :func:`squared_residuals` does by its model.
+#: Type of pixels -> the function of its model that takes the place of :func:`squared_residuals`.
 MODELS: dict[type, Callable[..., float]] = {}
 
 
@@ -429,7 +429,7 @@ def descend(
     Parameters
     ----------
     seen, work
-        What is seen, whose ``marker`` is a :class:`MarkerView`, and scratch space.
+        Pixels, whose ``marker`` is a :class:`MarkerView`, and scratch space.
     state
         Where it starts; gets where it ends.
     freedom
@@ -624,7 +624,7 @@ def locate(
     seen, work, freedom
         As :func:`descend` takes them.
     coarse, coarse_work
-        What is seen in the means of 2 x 2 pixels.
+        The means of 2 x 2 pixels.
     starts
         (K, 18) states; those behind the camera are skipped.
     search
@@ -719,7 +719,7 @@ def locate(
 def locate_exactly(
     image: Floats, starts: Floats, view: MarkerView, information: Floats
 ) -> tuple[Floats, float, bool, Floats, int]:
-    """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
+    """Return the result of :func:`locate` by the exact image (height, width), and the freedom."""
     freedom = int((~np.isnan(image)).sum()) - len(information) - LEVELS
     small = np.empty((image.shape[0] // 2, image.shape[1] // 2))
     halve(image, 0.25, small)
@@ -764,7 +764,7 @@ def locate_in_sight(
     image: Floats, starts: Floats, view: MarkerView,
     seen_from: Callable[[tuple[Floats, Floats]], MarkerView], information: Floats,
 ) -> tuple[Floats, float, bool, Floats, int]:
-    """Return what :func:`locate_exactly` does of a target in several planes, from each start."""
+    """As :func:`locate_exactly`, of a target in several planes, from each start."""
     free, square_sum, work = len(information), squares(image), work_space(*image.shape)
     freedom = int((~np.isnan(image)).sum()) - free - LEVELS
     missing, found = np.full(STATE_LENGTH, math.nan), np.empty((free, free))

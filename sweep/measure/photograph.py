@@ -1,4 +1,4 @@
-"""A photograph of a printed plane: its model, what is fitted of it, and what residuals say."""
+"""A photograph of a printed plane: its model, its fitted box, and its residuals."""
 
 from __future__ import annotations
 
@@ -541,14 +541,14 @@ def photograph_view(
     marker: Board, on_board: BoardMarker | None, size_m: float, corners: Floats, optics: Optics,
     image: Grey, origin: Integers, toned: bool,
 ) -> PhotographView | None:
-    """Return what is fitted of one marker, and what is known of it; None if that is nothing.
+    """Return the fitted box of one marker, with its print and camera; None if nothing is in it.
 
     The pixels of the marker and of its quiet zone, as far as its corners tell.
 
     Parameters
     ----------
     marker, on_board, size_m
-        What is printed, and the black square's side.
+        The print, and the black square's side.
     corners
         (4, 2) px of the frame.
     optics
@@ -678,7 +678,7 @@ def binned_photograph(view: PhotographView) -> PhotographView:
 
 
 # --------------------------------------------------------------------------------------------------
-# What residuals of a fitted photograph say: noise, its correlation, and misfit of the geometry.
+# Residuals of a fitted photograph: noise, its correlation, and misfit of the geometry.
 #
 # Least squares need no model of the noise for the pose, but for its covariance. The residuals
 # tell two sources. Noise of pixels is correlated from pixel to pixel, as cameras smooth, sharpen
@@ -898,7 +898,7 @@ def judge(
         ridged[k, k] += max(mean_square, 0.0) / LARGEST_SHIFT_PX**2 + 1e-12
     if not solve_positive(ridged, shifts):
         return math.nan
-    # What is left after the best field of shifts is noise.
+    # The rest after the best field of shifts is noise.
     fitted -= likelihood.product(influence, shifts)
     field = np.zeros((height, width, WIDE))
     _write_residuals(view, state, work.images, inverse, fitted, shifts, field)
@@ -972,7 +972,7 @@ REAL = likelihood.Search(4.0, 16.0, 50.0)
 def locate_photograph(
     view: PhotographView, starts: Floats, covariance: Floats
 ) -> tuple[Floats, float, bool, Floats, int, float]:
-    """Return what :func:`locate` does on a photograph, the freedom, and the misfit.
+    """Return the result of :func:`locate` on a photograph, the freedom, and the misfit.
 
     ``covariance`` (6, 6) gets that of the pose in radians and metres; the misfit is NaN if there is
     none.

@@ -102,7 +102,7 @@ def first_side_m(one: Detections) -> float:
 
 
 def window_of(one: Detections, poses: list[Pose]) -> list[int]:
-    """Return what is fitted of the image: left, top, right, bottom.
+    """Return the fitted part of the image: left, top, right, bottom.
 
     Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
     of a board its sheet in any of the poses.

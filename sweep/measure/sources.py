@@ -29,7 +29,7 @@ class ImageSearch:
     setting, on_board
         The detector of markers, and how OpenCV uses what it knows of a board.
     scenes, targets
-        What the images show.
+        The targets in the images.
     """
 
     setting: detectors.AnyDetectorSetting
@@ -46,7 +46,7 @@ class ImageSearch:
         self._sides = self.scenes.frame.max(axis=1).tolist()
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
-        """Return what is found in an image of scene ``row``."""
+        """Return the finds in an image of scene ``row``."""
         target = self.targets.targets[row]
         dictionary = target.dictionary
         if self._last is not None and self._last[0] is image and self._last[1] == dictionary:
@@ -84,7 +84,7 @@ class RecordedSearch:
     needs_images: bool = False
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:  # noqa: ARG002
-        """Return what was found in the image of scene ``row``, in pixels of the frame."""
+        """Return the recorded finds in the image of scene ``row``, in pixels of the frame."""
         quads, ids, _ = self._squares(row)
         decoded, corners = ids != REJECTED, quads[:, None]
         return SearchOutput(

@@ -1,4 +1,4 @@
-"""What is printed around a marker of a board, in the marker's own modules.
+"""Prints around a marker of a board, in the marker's own modules.
 
 The solver of photographs has in its model the edges of the marker and those beside it, within a
 square about the marker; beyond that square everything is black.
@@ -26,7 +26,7 @@ class BoardMarker(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def surroundings(marker: BoardMarker | Board, margin: float, beyond: int = BLACK) -> MarkerEdges:
-    """Return the edges of what is printed within ``margin`` modules of a marker's square.
+    """Return the edges of the print within ``margin`` modules of a marker's square.
 
     Of a marker of a board, or of one alone on its sheet. In modules, from the square's top left
     corner; the square's own edges are among them. ``beyond`` is the area farther out.
@@ -42,7 +42,7 @@ def surroundings(marker: BoardMarker | Board, margin: float, beyond: int = BLACK
 
 @lru_cache(maxsize=4096)
 def with_neighbours(marker: BoardMarker, margin: float) -> Board:
-    """Return a marker of a board as a target: with what is printed within ``margin`` modules."""
+    """Return a marker of a board as a target: with the prints within ``margin`` modules."""
     board, module = marker.board, 1 / module_count(marker.board.dictionary)
     printed = Print(surroundings(marker, margin, OUTSIDE), module, 0.5)
     return Board(

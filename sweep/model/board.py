@@ -53,7 +53,7 @@ class Print(NamedTuple):
     turn: Floats | None = None
 
     def plane(self, rotation: Floats, translation: Floats) -> Floats:
-        """Return what takes (column, row, 1) to the camera frame, (3, 3).
+        """Return the matrix (3, 3) from (column, row, 1) to the camera frame.
 
         For a board at ``rotation`` (3, 3) and ``translation`` (3,). The plane of a marker alone
         (:func:`sweep.model.scene.build_scenes`) is the same to the bit.
@@ -87,7 +87,7 @@ class Board:
     Attributes
     ----------
     dictionary
-        That of all its markers.
+        The dictionary of all its markers.
     marker_ids
         The ID of each of its n markers.
     corners_m
@@ -261,7 +261,7 @@ def sheets_overlap(one: Floats, other: Floats) -> Masks:
 
 
 # --------------------------------------------------------------------------------------------------
-# What a scene shows in one plane: a marker, or a board of several; its edges and its extent.
+# A target in one plane: a marker, or a board of several; its edges and its extent.
 #
 # Lengths are in units: modules of a marker, those of its first one for a board. Columns count to
 # the right and rows downwards, from the top left corner of a marker's square or from a board's
@@ -447,7 +447,7 @@ class _Face(NamedTuple):
 
 @lru_cache(maxsize=64)
 def sheets_of(board: Board) -> tuple[Print, ...]:
-    """Return what is printed on each sheet: a board's own, or its markers', then distractors'."""
+    """Return the print of each sheet: a board's own, or its markers', then distractors'."""
     of_each = len(board.prints) == len(board)
     own = board.prints if of_each else (Print(edges_on_sheet(board.prints), 1.0, 0.0),)
     return own + board.distractors
@@ -540,7 +540,7 @@ def _occluders(faces: list[_Face]) -> list[list[_Face]]:
 
 
 class VisiblePrint(NamedTuple):
-    """What is seen of a sheet's print.
+    """The visible part of a sheet's print.
 
     Attributes
     ----------
@@ -559,7 +559,7 @@ class VisiblePrint(NamedTuple):
 
 
 def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[VisiblePrint]:
-    """Return what is seen of the print of each sheet, from number ``first`` on."""
+    """Return the visible print of each sheet, from number ``first`` on."""
     seen = []
     sheets = sheets_of(board)
     faces = _faces(board, planes)

@@ -21,7 +21,7 @@ from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
-# What declarations of all kinds of boards share: fields, and faults of their values.
+# Shared by the declarations of all kinds of boards: fields, and faults of their values.
 
 #: The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer.
 MAX_MARKERS = 4000
@@ -171,7 +171,7 @@ class Markers:
         return all(each.is_flat for each in self.markers)
 
     def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
+        """Return the faults that keep the values from being a board."""
         faults = []
         if self.margin_m is not None and self.quiet_zone_modules is not None:
             faults.append(Fault(
@@ -235,7 +235,7 @@ class Markers:
 
 
 # --------------------------------------------------------------------------------------------------
-# What stands beside a target and is no part of it: other markers, and plain black squares.
+# Prints beside a target that are no part of it: other markers, and plain black squares.
 #
 # Each is printed on a sheet of its own, with a quiet zone as wide in its modules as that of
 # ``[marker]``, in the target's frame and mostly in its plane.
@@ -278,7 +278,7 @@ def with_distractors(
 
 
 def listing_faults(listed: Sequence[Sequence[Any]] | None, dictionary: str) -> list[Fault]:
-    """Return what keeps single distractors beside a board of a dictionary from being printed."""
+    """Return the faults that keep distractors beside a board of a dictionary from being printed."""
     if listed and len(listed) > MAX_MARKERS:
         return [Fault("distractors", len(listed), f"at most {MAX_MARKERS} of them")]
     for number, (marker_id, *_, own) in enumerate(listed or ()):
@@ -419,7 +419,7 @@ class Charuco(_OnSheet):
         return int((self._codes() == WHITE).sum()), (self.squares_x - 1) * (self.squares_y - 1)
 
     def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
+        """Return the faults that keep the values from being a board."""
         whole, beyond = _printed_side(self.dictionary, self.marker_m)
         faults = []
         if whole >= self.square_m:
@@ -467,7 +467,7 @@ class Grid(_OnSheet):
         return self.rows * self.columns, 0
 
     def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
+        """Return the faults that keep the values from being a board."""
         whole, beyond = _printed_side(self.dictionary, self.marker_m)
         faults = []
         if self.marker_m + self.gap_m < whole:
@@ -510,7 +510,7 @@ class AprilGrid(_OnSheet):
         return self.tagRows * self.tagCols, 0
 
     def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
+        """Return the faults that keep the values from being a board."""
         if marker.overhang(self.dictionary):
             return [Fault(
                 "dictionary", self.dictionary,
@@ -554,7 +554,7 @@ PIPELINE_NAMES = {
     "margin_m": "quiet_zone_modules",
 }
 
-#: What makes a ChArUco diamond of a charuco.
+#: Values that make a ChArUco diamond of a charuco.
 DIAMOND = {"squares_x": 3, "squares_y": 3, "legacy_pattern": False}
 
 _DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
@@ -651,7 +651,7 @@ def used_by(kind: Any) -> tuple[str, ...]:
 
 
 def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
-    """Return what keeps values of :data:`ARRANGING` from being a board, by pipelines' names."""
+    """Return the faults of values of :data:`ARRANGING` as a board, by pipelines' names."""
     given = dict(zip(ARRANGING, values, strict=True))
     listed = given["distractors"]
     faults = arranged(values).faults() + listing_faults(listed, given["dictionary"])

@@ -67,7 +67,7 @@ KINDS = (
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a file says of a camera.
+    """A camera as a file describes it.
 
     Attributes
     ----------
@@ -325,8 +325,8 @@ _COMMENT = re.compile(r"^[ \t]*//[^\n]*$", re.MULTILINE)
 def read_tree(content: bytes) -> Any:
     """Return the tree of a file's content.
 
-    What is not UTF-8 may be a comment, or a date in the locale's encoding: no camera's numbers are
-    outside of ASCII.
+    Bytes that are not UTF-8 may be a comment, or a date in the locale's encoding: no camera's
+    numbers are outside of ASCII.
 
     Raises
     ------
@@ -427,7 +427,7 @@ class CalibrationError:
         Raises
         ------
         ValueError
-            What was expected.
+            Says what was expected.
         """
         n = len(sd) or math.isqrt(len(covariance))
         if n not in (4, 4 + coefficients):

@@ -19,7 +19,7 @@ from sweep.plugins.loading import call, real_numbers
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
-# What an effect declares, and the pixels that pointwise effects are applied to.
+# Declarations of an effect, and the pixels that pointwise effects are applied to.
 
 @dataclass(frozen=True, slots=True)
 class Patch:
@@ -97,7 +97,7 @@ class Effect:
         What it makes worse for the search of windows, where another effect brings it: coarse noise
         needs twice the margin of noise, steep uneven light the whole frame.
     outline
-        What it makes of the straight outline of a print at rest: "curved": bent, or shifted from
+        Its change of the straight outline of a print at rest: "curved": bent, or shifted from
         point to point, as :func:`sweep.model.exposure.scene_sheet` says; "moving": it is where
         :meth:`sweep.model.scene.Scenes.motion` says; "covered": something covers the sheet.
     spread_px
@@ -502,7 +502,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
 
 
 # --------------------------------------------------------------------------------------------------
-# What plug-ins add to scenes: effects and renderers, whose results are checked.
+# Additions of plug-ins to scenes: effects and renderers, whose results are checked.
 
 @dataclass(frozen=True, slots=True)
 class MarkerView:

@@ -600,7 +600,7 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
 
 
 # --------------------------------------------------------------------------------------------------
-# What is seen of the target's prints while its image is taken.
+# The visible prints of a target while its image is taken.
 
 def _path_px(scenes: Scenes, row: int, motion: Motion, begin: float, end: float) -> float:
     """Return the longest path of a corner, in px, from a time to another."""
@@ -618,14 +618,14 @@ def _path_px(scenes: Scenes, row: int, motion: Motion, begin: float, end: float)
 
 
 class Layer(NamedTuple):
-    """What is seen of one sheet during a part of the exposure.
+    """The visible part of one sheet during a part of the exposure.
 
     Attributes
     ----------
     sheet
         The sheet at time 0.
     edges
-        Those of what is seen of its print.
+        Edges of the visible part of its print.
     outline
         (M, 3) points around it: column, row, and height over its plane.
     begin_s, end_s
@@ -648,7 +648,7 @@ MAX_SHADOWS = 512
 
 
 def _layers(scenes: Scenes, row: int, motion: Motion, box: Box, beside: bool) -> list[Layer]:
-    """Return what is seen of one scene in the rows of a box; ``beside``: of distractors alone."""
+    """Return the visible sheets of a scene in the rows of a box; ``beside``: distractors alone."""
     target, effect = scenes.targets[row], scenes.effects.of(row)
     if target.is_flat:
         (sheet,) = seen_sheets(scenes, row)

@@ -266,7 +266,7 @@ def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def missing_package(dictionary: str) -> str | None:
-    """Return what to install for a dictionary's codes; None if nothing is missing."""
+    """Return the package to install for a dictionary's codes; None if none is missing."""
     if dictionary in TAG_FAMILIES and library_path() is None:
         return "an AprilTag library for its codes: pip install 'fiducial-sweep[pyapriltags]'"
     if dictionary in STAG_LIBRARIES and library_file() is None:

@@ -85,7 +85,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """What N scenes show: the distinct targets, and (N,) the number of each scene's."""
+    """The targets of N scenes: the distinct ones, and (N,) the number of each scene's."""
 
     boards: tuple[Board, ...]
     number: NDArray[np.int64]
@@ -254,7 +254,7 @@ class Scenes:
     cameras, frame
         The cameras, and (N, 2) width and height of their frames in pixels.
     targets
-        What the scenes show, markers and boards.
+        The targets of the scenes, markers and boards.
     size_m
         (N,) side of the black square; of a board, of markers without a side of their own.
     rotation, translation
@@ -325,7 +325,7 @@ class Scenes:
         return Projection(self.plane[row], self.cameras.optics(row))
 
     def patch(self, row: int, left: int, top: int) -> Patch:
-        """Return what effects on levels know of one scene; (left, top) is their first pixel."""
+        """Return the patch of one scene for effects on levels; (left, top) is their first pixel."""
         own, (width, height) = self.effects, self.frame[row].tolist()
         return Patch(
             own.of(row), left, top, (width, height), self.cameras.view[row],
@@ -350,7 +350,7 @@ def _target(
     shown: Board | None, dictionary: str, marker_id: int, size_m: float, width: float,
     white: float, background: float | str, occlusion: float,
 ) -> Board:
-    """Return what a scene shows: a board, or a marker alone with a quiet zone of a width.
+    """Return the target of a scene: a board, or a marker alone with a quiet zone of a width.
 
     A quiet zone on a background of its own level is invisible, unless a sheet hides a part of it:
     it is not modelled.

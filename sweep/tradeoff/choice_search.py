@@ -29,7 +29,7 @@ from sweep.tradeoff.costs import measure, median_interval, sample_scenes
 from sweep.tradeoff.pareto import pareto_front
 
 # --------------------------------------------------------------------------------------------------
-# What each alternative of a choice costs: the time of a frame at its answer, measured in turns.
+# The cost of each alternative of a choice: the time of a frame at its answer, measured in turns.
 
 #: Conditions of each answer that are measured; of more, so many from all over the grid.
 MAX_CONDITIONS = 24
@@ -65,13 +65,13 @@ def choice_costs(
     Parameters
     ----------
     pipeline, rule
-        The experiment and what is chosen.
+        The experiment and the choice.
     found
         The answers, in the order of the combinations of the axes ``rule.among``.
     limit_s
         Seconds of the measurement, about.
     report
-        Called with what is being done, and the share of it that is done.
+        Called with the current step, and the share of it that is done.
     """
     axes = {axis.name: axis for axis in pipeline.axes}
     conditions = _conditions(pipeline, rule)
@@ -140,14 +140,14 @@ SECONDS = 20.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What a search found.
+    """The result of a search.
 
     Attributes
     ----------
     store
         The store of the search.
     rule, budget_ms
-        What was sought, and the most milliseconds of a frame, if there is a budget.
+        The search, and the most milliseconds of a frame, if there is a budget.
     conditions
         How many conditions there are.
     answers, costs
@@ -176,7 +176,7 @@ class Choice:
         return self.cells * self.most_trials
 
     def rank(self, k: int, *, possible: bool = False) -> tuple[float, float]:
-        """Return what is smaller for a better alternative: the value that is sought, then the cost.
+        """Return a key that is smaller for a better alternative: the sought value, then the cost.
 
         ``possible``: with the last value that it may have.
         """
@@ -277,7 +277,7 @@ def search_choice(
 
 
 def chosen_by(pipeline: Pipeline) -> StoppingRule:
-    """Return what a pipeline chooses; PipelineError if it has no section [search]."""
+    """Return the choice of a pipeline; PipelineError if it has no section [search]."""
     rule = pipeline.stopping
     if rule is not None and rule.kind in CHOICES:
         return rule

@@ -122,7 +122,7 @@ def median_interval(values: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def any_process_interval(ratio: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the median ratio of (R, ...) rounds, and the interval of what any process measures.
+    """Return the median ratio of (R, ...) rounds, and the interval over processes.
 
     The interval of the baseline, whose ratio is 1 in each round, stays [1, 1].
     """
@@ -199,7 +199,7 @@ def sample_scenes(
 #
 # All are measured on the same images, by paired timing in one process. Frames are searched one at
 # a time, as a user does. Estimators solve :data:`BATCH` detections in one call, so that the
-# overhead of a call is that of a run.
+# overhead of a call is a run's.
 
 #: Detections that an estimator gets in one call.
 BATCH = 16
@@ -308,7 +308,7 @@ def _prepared(
     estimators: Sequence[tuple[EstimatorSetting, PoseEstimator]], most: int,
     interrupts: Interrupts,
 ) -> tuple[list[Callable[[], Any]], Floats, Floats]:
-    """Return what is timed: the search of all scenes of a condition, then each estimator.
+    """Return the timed calls: the search of all scenes of a condition, then each estimator.
 
     With it, of C conditions and D detector settings, (C,) frames, at most ``most``, NaN if no
     scene is visible, and the (C, D) share of them with a detection.

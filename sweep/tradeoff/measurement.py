@@ -76,9 +76,9 @@ def measure_trade(
         Time limit of the measurement in seconds, in which the accuracy is read, too, as far as it
         leaves 30 % of them.
     progress
-        Called with what is being done, and the share of it that is done.
+        Called with the current step, and the share of it that is done.
     question
-        What is asked of the tradeoff, ``criterion`` and ``budget_ms``: kept in its attributes for
+        Options of the tradeoff, ``criterion`` and ``budget_ms``: kept in its attributes for
         the report.
 
     Returns

@@ -19,7 +19,7 @@ from sweep.errors import ArgumentError
 
 Booleans = NDArray[np.bool_]
 
-#: Coordinate of a trade: whether a configuration believes what is known not to be true.
+#: Coordinate of a trade: whether a configuration believes something known not to be true.
 WRONG_BELIEF = "wrong_belief"
 
 UNITS = {"rotation": "deg", "range": "percent"}
@@ -109,7 +109,7 @@ def conditions_of(trade: xr.Dataset) -> Iterator[tuple[str, dict[str, Any], xr.D
 # --------------------------------------------------------------------------------------------------
 # Configurations as text.
 
-#: Behind the label of a configuration whose estimator believes what is not true.
+#: Behind the label of a configuration whose estimator believes something untrue.
 WRONG = " (wrong)"
 
 #: Label of the only configuration of a pipeline without axes of settings.

@@ -136,6 +136,7 @@ class Child:
 
     def __init__(self, module: str = "sweep.isolation.watchdog") -> None:
         self._module = module
+        self._closing = threading.Lock()
         self._start()
 
     def _start(self) -> None:
@@ -202,10 +203,11 @@ class Child:
         return cast("Result", result)
 
     def close(self) -> None:
-        """End the child."""
-        self._process.kill()
-        self._process.wait()
-        self._connection.close()
+        """End the child. An interrupt closes it while another thread, whose call ends, does."""
+        with self._closing:
+            self._process.kill()
+            self._process.wait()
+            self._connection.close()
 
 
 _START = (

@@ -31,6 +31,7 @@ from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle, lock
 from sweep.store.blocks import Receipt, RunStore
 from sweep.store.locations import translate_errors
+from sweep.typing import Integers
 
 # --------------------------------------------------------------------------------------------------
 # Findings of a verification, in one record that each check adds to.
@@ -234,15 +235,14 @@ def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Sc
     """Draw needed scenes, each with the same probability, without repetitions, or all."""
     generator = np.random.default_rng()
     sizes = np.array([receipt.scenes_needed for receipt in sound.values()])
-    needed = {number: np.flatnonzero(scenes_needed(store, store.blocks[number]))
-              for number in sound} if count >= sizes.sum() else {}
-    if needed or not sizes.any():
-        return [(number, row) for number, rows in needed.items() for row in rows.tolist()]
+
+    def needed(number: int) -> Integers:
+        return np.flatnonzero(scenes_needed(store, store.blocks[number]))
+
+    if count >= sizes.sum():
+        return [(number, row) for number in sound for row in needed(number).tolist()]
     numbers = generator.choice(np.array(list(sound)), size=count, p=sizes / sizes.sum())
-    return sorted({
-        (number, int(generator.choice(np.flatnonzero(scenes_needed(store, store.blocks[number])))))
-        for number in numbers.tolist()
-    })
+    return sorted({(number, int(generator.choice(needed(number)))) for number in numbers.tolist()})
 
 
 def _recomputed(store: RunStore, pipeline: Pipeline, scenes: Sequence[Scene]) -> CellsResult:

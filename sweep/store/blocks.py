@@ -182,9 +182,6 @@ def receipt_key(number: int) -> str:
     return f"{files.RECEIPTS}/c/{number}"
 
 
-STAGES = ("scene", "detection", "estimation")
-
-
 @dataclass(frozen=True, slots=True)
 class FailedCell:
     """A scene, or a scene with a configuration, that raised or whose process died.

@@ -43,9 +43,7 @@ ADVICE = "use fewer workers, or give them more memory"
 
 def default_workers() -> int:
     """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def ending(code: int) -> str:
@@ -186,10 +184,11 @@ class Child:
             `MachineFaultError`.
         """
         started = time.monotonic()
+        # It bounds sending, too: a child that hangs while it imports reads nothing.
+        last = threading.Timer(limit_s + grace_s, self._process.kill)
+        last.start()
         try:
             self._connection.send((function, arguments, limit_s))
-            if not self._connection.poll(limit_s + grace_s):
-                self._process.kill()
             raised, result = self._connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError):
             took_s, code = time.monotonic() - started, self._process.wait()
@@ -198,6 +197,9 @@ class Child:
             if took_s >= limit_s + (0.0 if code == 1 else grace_s):
                 raise ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True) from None
             raise ChildDiedError(ending(code)) from None
+        finally:
+            last.cancel()
+            last.join()
         if raised:
             raise result if isinstance(result, SweepError) else ChildRaisedError(result)
         return cast("Result", result)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections import deque
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,16 @@ from sweep.errors import PluginError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.results import CellsResult, Failure, concatenate
+from sweep.evaluation.results import CellsResult, Failure
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation import child_process
-from sweep.isolation.child_process import Child
+from sweep.isolation.child_process import (
+    Child,
+    ChildDiedError,
+    ChildError,
+    ChildRaisedError,
+    explained,
+    last_line,
+)
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -34,8 +39,7 @@ from sweep.typing import Masks
 # - T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
 # - 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
 # - T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering,
-#   each detector setting, each estimator; the limit is halved each time one runs out, and such a
-#   part is tried once more;
+#   each detector setting, each estimator; the limit is halved each time one runs out;
 # - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
 #   is compiled or loaded.
 
@@ -45,8 +49,7 @@ WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 #: Additional time of the first call in a child: a share of the limit, at most so many seconds.
 LOADING, LOADING_S = 1 / 16, 15.0
 
-#: How many fresh processes a part of a scene must end, one after another, to be flagged; one that
-#: never returns counts for two.
+#: How many fresh processes a part of a scene must end, one after another, to be flagged.
 DEATHS = 3
 
 #: Least time limit of a part of a scene.
@@ -73,18 +76,37 @@ def _run_held(
 
 
 class _IsolatedCells:
-    """Computes cells of a pipeline in a child process; starts another after a crash."""
+    """Computes cells of a pipeline in a child process; starts another after a crash.
 
-    def __init__(self, pipeline: Pipeline, limit_s: float) -> None:
-        self._pipeline = pipeline
-        self._limit_s = limit_s
+    ``cells`` are what has been computed so far; the other arguments are as in
+    :func:`run_cells_isolated`.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks, limit_s: float
+    ) -> None:
+        self._pipeline, self._indices, self._need = pipeline, indices, need
+        self._limit_s, self._share = limit_s, PART
         self._child: Child | None = None
-        self._share = PART
-        #: Deaths that did not come again when the same part of a scene was repeated.
-        self.chances: list[str] = []
+        self.cells = CellsResult.not_run(pipeline.experiment, len(need))
 
-    def run(self, share: float, *arguments: Any) -> CellsResult:
-        """Call ``run_cells`` with a share of the time limit.
+    def compute(self, rows: NDArray[np.intp]) -> None:
+        """Compute scenes ``rows`` (n,) together; in smaller pieces if they end the process."""
+        try:
+            self._take(rows, self._run(PIECE, rows, self._need[rows]))
+        except ChildError:
+            if len(rows) > 1:
+                self.compute_pieces(rows)
+            else:
+                self._compute_scene(int(rows[0]))
+
+    def compute_pieces(self, rows: NDArray[np.intp]) -> None:
+        """Compute scenes ``rows`` (n,) in pieces."""
+        for piece in np.array_split(rows, min(PIECES, len(rows))):
+            self.compute(piece)
+
+    def _run(self, share: float, rows: NDArray[np.intp], *masks: Masks) -> CellsResult:
+        """Call ``run_cells`` for some scenes with a share of the time limit.
 
         Raises
         ------
@@ -99,108 +121,94 @@ class _IsolatedCells:
                 self._child = Child()
             try:
                 self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
-            except child_process.ChildError as error:
-                how = child_process.explained(child_process.last_line(error))
-                raise local_fault(
-                    f"a child process ended before it computed anything: {how}") from None
+            except ChildError as error:
+                raise local_fault("a child process ended before it computed anything: "
+                                  f"{explained(last_line(error))}") from None
             limit_s += min(LOADING * self._limit_s, LOADING_S)
         try:
-            return self._child.call(_run_held, *arguments, limit_s=limit_s)
-        except child_process.ChildDiedError:
+            return self._child.call(
+                _run_held, [index[rows] for index in self._indices], *masks, limit_s=limit_s)
+        except ChildDiedError:
             self._child = None
             raise
 
-    def scene(self, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_]) -> CellsResult:
-        """Return the cells of a scene that crashes its process, never returns, or raises.
+    def _take(
+        self, rows: NDArray[np.intp], part: CellsResult, stage: str = "",
+        number: int | slice = slice(None),
+    ) -> None:
+        """Take over the results of scenes: all, or those of one configuration of a stage."""
+        for variable in self._pipeline.experiment.variables:
+            if stage in ("", variable.stage.name):
+                self.cells.columns[variable.name][number, rows] = (
+                    part.columns[variable.name][number])
+        for name, seconds in part.seconds.items():
+            self.cells.seconds[name] = np.add(self.cells.seconds[name], seconds).tolist()
+        self.cells.row_seconds[rows] += part.row_seconds
+        self.cells.failures += [
+            dataclasses.replace(each, scene=int(rows[each.scene])) for each in part.failures
+            if stage in ("", each.stage)]
+
+    def _compute_scene(self, row: int) -> None:
+        """Compute a scene that crashes its process, never returns, or raises.
 
         Its parts are computed one after another, each in addition to those that it depends on:
-        rendering, each detector setting, each estimator. The results of those that work are
-        joined, the others are flagged.
+        rendering, each detector setting, each estimator. The results of those that work are taken
+        over, the others are flagged.
         """
-        joined = CellsResult.not_run(self._pipeline.experiment, 1)
-        flags = joined.columns
-        failures: list[Failure] = []
+        flags, need = self.cells.columns, self._need[row]
+        unseen = self._lost(Failure(row, "scene", ""))
+        for k in np.flatnonzero(need.any(axis=1)).tolist():
+            lost = unseen or self._lost(Failure(row, "detection", "", k), k)
+            if lost:
+                flags["detection"][k][row] = DetectionStatus[lost]
+            for j in np.flatnonzero(need[k]).tolist():
+                number = k * need.shape[1] + j
+                if lost:
+                    flags["estimate"][number][row] = EstimateStatus.no_detection
+                    flags["flipped"][number][row] = Flipped.no_estimate
+                elif unsolved := self._lost(Failure(row, "estimation", "", k, j), number):
+                    flags["estimate"][number][row] = EstimateStatus[unsolved]
+                    flags["flipped"][number][row] = Flipped.no_estimate
 
-        def works(
-            stage: str, number: int = 0, setting: int | None = None, estimator: int | None = None
-        ) -> bool:
-            """Compute a part; take what it gives of its stage, or note why there is nothing."""
-            part = self._part(Failure(0, stage, "", setting, estimator), indices, need)
-            if isinstance(part, Failure):
-                failures.append(part)
-                return False
-            for variable in self._pipeline.experiment.variables:
-                if variable.stage.name == stage:
-                    joined.columns[variable.name][number] = part.columns[variable.name][number]
-            joined.seconds[stage][number] = part.seconds[stage][number]
-            joined.row_seconds += part.row_seconds
-            known = {(each.stage, each.setting, each.estimator) for each in failures}
-            failures.extend(each for each in part.failures
-                            if (each.stage, each.setting, each.estimator) not in known)
-            return True
+    def _lost(self, part: Failure, number: int = 0) -> str:
+        """Compute a part of a scene, named as its failure would be; take over its results.
 
-        def lost() -> str:
-            return "crashed" if failures[-1].crashed else "failed"
-
-        rendered = works("scene")
-        for k in np.flatnonzero(need[0].any(axis=1)).tolist():
-            searched = rendered and works("detection", k, k)
-            if not searched:
-                flags["detection"][k][:] = DetectionStatus[lost()]
-            for j in np.flatnonzero(need[0, k]).tolist():
-                number = k * need.shape[2] + j
-                if not searched:
-                    flags["estimate"][number][:] = EstimateStatus.no_detection
-                    flags["flipped"][number][:] = Flipped.no_estimate
-                elif not works("estimation", number, k, j):
-                    flags["estimate"][number][:] = EstimateStatus[lost()]
-                    flags["flipped"][number][:] = Flipped.no_estimate
-        joined.failures = failures
-        return joined
-
-    def _part(
-        self, part: Failure, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_]
-    ) -> CellsResult | Failure:
-        """Compute a part of a scene, named as its failure would be; else return why not.
+        Returns
+        -------
+        "crashed" or "failed" if there are none, which is noted; nothing otherwise.
 
         Raises
         ------
         MachineFaultError
             If two processes are ended by signals from outside, which is no chance.
         """
-        solve, search = np.zeros_like(need), np.zeros_like(need[..., 0])
+        need = np.zeros_like(self._need[:1])
+        search = np.zeros_like(need[..., 0])
         if part.estimator is not None:
-            solve[0, part.setting, part.estimator] = True
+            need[0, part.setting, part.estimator] = True
         elif part.setting is not None:
             search[0, part.setting] = True
-        deaths: list[child_process.ChildDiedError] = []
-        outside = 0
-        while len(deaths) + sum(death.timed_out for death in deaths) < DEATHS:
+        row, deaths, outside = np.array([part.scene]), list[ChildDiedError](), 0
+        while len(deaths) < DEATHS:
             try:
-                result = self.run(self._share, indices, solve, search)
-            except child_process.ChildRaisedError as error:
-                return dataclasses.replace(part, text=str(error))
-            except child_process.ChildDiedError as death:
-                outside += death.from_outside
-                if outside > 1:
-                    how = child_process.explained(death)
-                    raise local_fault(
-                        "two processes that computed one scene were ended by "
-                        f"{how}; it is --at {self._selected(part, indices)}") from None
-                if death.timed_out:
-                    self._share /= 2
+                computed = self._run(self._share, row, need, search)
+            except ChildRaisedError as error:
+                self.cells.failures.append(dataclasses.replace(part, text=str(error)))
+                return "failed"
+            except ChildDiedError as death:
                 if not death.from_outside:
                     deaths.append(death)
+                elif (outside := outside + 1) > 1:
+                    at = selected(self._pipeline, [int(i[part.scene]) for i in self._indices], part)
+                    raise local_fault("two processes that computed one scene were ended by "
+                                      f"{explained(death)}; it is --at {at}") from None
+                if death.timed_out:
+                    self._share /= 2
             else:
-                if deaths:
-                    self.chances.append(f"--at {self._selected(part, indices)} ended a process by "
-                                        f"{deaths[0]}, and not when it was repeated")
-                return result
-        return dataclasses.replace(part, text=str(deaths[0]), crashed=True)
-
-    def _selected(self, part: Failure, indices: Sequence[NDArray[np.intp]]) -> str:
-        """Return a part of a scene in the form that `--at` takes."""
-        return selected(self._pipeline, [int(index[0]) for index in indices], part)
+                self._take(row, computed, part.stage, number)
+                return ""
+        self.cells.failures.append(dataclasses.replace(part, text=str(deaths[0]), crashed=True))
+        return "crashed"
 
     def close(self) -> None:
         """End the child process."""
@@ -230,43 +238,17 @@ def run_cells_isolated(
     need
         (N, detector settings, estimators): the cells that are computed.
     limit_s
-        Time limit of the block in seconds, divided as the module's docstring says.
+        Time limit of the block in seconds, divided as the comment above says.
 
     Raises
     ------
     MachineFaultError
         If no child process can be started, one raises what no scene's data can cause, or one that
-        computes a single scene is ended twice by a signal from outside; if something would be
-        flagged ``crashed``, but processes also died by chance.
+        computes a single scene is ended twice by a signal from outside.
     """
-    isolated = _IsolatedCells(pipeline, limit_s)
-    done: dict[int, CellsResult] = {}
-    waiting = deque(_pieces(np.arange(len(need))))
-    try:
-        while waiting:
-            rows = waiting.popleft()
-            chosen = [index[rows] for index in indices]
-            try:
-                done[int(rows[0])] = isolated.run(PIECE, chosen, need[rows])
-            except child_process.ChildError:
-                if len(rows) > 1:
-                    waiting.extendleft(reversed(_pieces(rows)))
-                else:
-                    done[int(rows[0])] = isolated.scene(chosen, need[rows])
-    finally:
-        isolated.close()
-    cells = concatenate([done[start] for start in sorted(done)])
-    crashed = sum(failure.crashed for failure in cells.failures)
-    if isolated.chances and crashed:
-        raise local_fault(
-            f"not deterministic: {isolated.chances[0]}; so {crashed} that ended {DEATHS} processes "
-            "may have done so by chance, too"
-        )
-    return cells
-
-
-def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    return list(np.array_split(rows, min(PIECES, len(rows))))
+    with contextlib.closing(_IsolatedCells(pipeline, indices, need, limit_s)) as isolated:
+        isolated.compute_pieces(np.arange(len(need)))
+        return isolated.cells
 
 
 # --------------------------------------------------------------------------------------------------
@@ -300,19 +282,18 @@ def check_repeatable(
     MachineFaultError
         If a scene does not fail again in the same parts, or the machine fails meanwhile.
     """
-    scenes = sorted({failure.scene for failure in cells.failures if not failure.crashed})
+    raised = [failure for failure in cells.failures if not failure.crashed]
+    scenes = sorted({failure.scene for failure in raised})
     if not scenes:
         return
-    rows = np.array(scenes)
-    again = run_cells_isolated(pipeline, [index[rows] for index in indices], need[rows], limit_s)
+    again = run_cells_isolated(
+        pipeline, [index[scenes] for index in indices], need[scenes], limit_s)
     repeated = {dataclasses.replace(each, scene=scenes[each.scene], text="")
                 for each in again.failures}
-    for failure in cells.failures:
-        if failure.scene in scenes and dataclasses.replace(failure, text="") not in repeated:
-            raise local_fault(
-                "raised in a scene, but not when that was repeated in another process: "
-                + failure.text.strip().rpartition("\n")[2]
-            )
+    for failure in raised:
+        if dataclasses.replace(failure, text="") not in repeated:
+            raise local_fault("raised in a scene, but not when that was repeated in another "
+                              f"process: {failure.text.strip().splitlines()[-1]}")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -335,14 +316,14 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
         return; in one line.
     """
     for plugin in pipeline.plugins:
-        name = f"{plugin.kind} {plugin.name}"
         try:
             child.call(use, pipeline, plugin.kind, plugin.name, limit_s=limit_s)
-        except child_process.ChildDiedError as error:
-            child.restart()
-            raise PluginError(f"{name}: ends its process before the first pose: {error}") from None
-        except child_process.ChildRaisedError as error:
-            raise PluginError(f"{name}: {child_process.last_line(error)}") from None
+        except ChildError as error:
+            ends = ""
+            if isinstance(error, ChildDiedError):
+                child.restart()
+                ends = "ends its process before the first pose: "
+            raise PluginError(f"{plugin.kind} {plugin.name}: {ends}{last_line(error)}") from None
 
 
 @single_threaded()
@@ -354,26 +335,20 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
     PluginError
         If that cannot be done.
     """
-    if kind == "detector":
-        width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
-        blank = np.full((height, width), 128, dtype=np.uint8)
-        settings = [
-            setting for setting in pipeline.experiment.detectors
-            if isinstance(setting, PluginSetting) and setting.plugin.name == name
-        ]
-        for setting in _first(settings):
-            search = make_detector(setting)
-            for dictionary in _first(pipeline.values_of("dictionary")):
-                search(blank, dictionary, max(width, height))
-    elif kind == "estimator":
-        for estimator in _first(
-            each for each in pipeline.experiment.estimators
-            if isinstance(each, PluggedEstimatorSetting) and each.solver == name
-        ):
-            build(estimator)
-    else:
-        _ = pipeline.experiment.scene_plugins
-
-
-def _first(values: Iterable[object]) -> list[Any]:
-    return list(dict.fromkeys(values))[:MAX_SETTINGS]
+    experiment = pipeline.experiment
+    if kind in ("effect", "renderer"):
+        _ = experiment.scene_plugins
+    width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
+    blank = np.full((height, width), 128, dtype=np.uint8)
+    searches = dict.fromkeys(
+        (setting, dictionary) for setting in experiment.detectors
+        if isinstance(setting, PluginSetting) and (kind, name) == ("detector", setting.plugin.name)
+        for dictionary in pipeline.values_of("dictionary"))
+    for setting, dictionary in list(searches)[:MAX_SETTINGS]:
+        make_detector(setting)(blank, dictionary, max(width, height))
+    solvers = dict.fromkeys(
+        setting for setting in experiment.estimators
+        if isinstance(setting, PluggedEstimatorSetting) and (kind, name) == (
+            "estimator", setting.solver))
+    for solver in list(solvers)[:MAX_SETTINGS]:
+        build(solver)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import itertools
 import os
 import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
-import numba.core.event
+from numba.core import event
 
 _lock = threading.RLock()
-_deadlines: dict[int, float] = {}
-_numbers = itertools.count()
+#: When each limit of this process runs out; several threads may have some at once.
+_deadlines: dict[object, float] = {}
 _devnull = os.open(os.devnull, os.O_WRONLY)
 
 
@@ -27,55 +26,53 @@ def ending_after(limit_s: float) -> Iterator[None]:
     compiled code that never returns is ended too. The clock stands still while Numba compiles or
     loads code, which takes a minute if nothing is cached. Several threads may have limits at once.
     """
-    number = next(_numbers)
+    mine = object()
     with _lock:
-        _deadlines[number] = time.monotonic() + limit_s
+        _deadlines[mine] = time.monotonic() + limit_s
         _arm()
     try:
         yield
     finally:
         with _lock:
-            del _deadlines[number]
+            del _deadlines[mine]
             _arm()
 
 
 def _arm() -> None:
-    if not _deadlines or _Compiling.depth:
+    if not _deadlines or _compiling.begun:
         faulthandler.cancel_dump_traceback_later()
         return
     left = max(min(_deadlines.values()) - time.monotonic(), 0.001)
     faulthandler.dump_traceback_later(left, exit=True, file=_devnull)
 
 
-class _Compiling(numba.core.event.Listener):
-    """Stops the clock while code is compiled; one compilation may begin others."""
+class _Compiling(event.Listener):
+    """Stops the clock while code is compiled."""
 
-    depth = 0
-    began = 0.0
-    total_s = 0.0
+    def __init__(self) -> None:
+        self.begun: list[float] = []  # one compilation may begin others
+        self.total_s = 0.0
 
-    def on_start(self, event: object) -> None:  # noqa: ARG002
+    def on_start(self, _event: object) -> None:
         with _lock:
-            if not _Compiling.depth:
-                _Compiling.began = time.monotonic()
-            _Compiling.depth += 1
+            self.begun.append(time.monotonic())
             _arm()
 
-    def on_end(self, event: object) -> None:  # noqa: ARG002
+    def on_end(self, _event: object) -> None:
         with _lock:
-            _Compiling.depth -= 1
-            if not _Compiling.depth:
-                took = time.monotonic() - _Compiling.began
-                _Compiling.total_s += took
-                for number in _deadlines:
-                    _deadlines[number] += took
+            took_s = time.monotonic() - self.begun.pop()
+            if not self.begun:
+                self.total_s += took_s
+                for limit in _deadlines:
+                    _deadlines[limit] += took_s
             _arm()
+
+
+_compiling = _Compiling()
+_register: Any = event.register
+_register("numba:compile", _compiling)
 
 
 def compilation_s() -> float:
     """Return the seconds for which this process has compiled or loaded code so far."""
-    return _Compiling.total_s
-
-
-_register: Any = numba.core.event.register
-_register("numba:compile", _Compiling())
+    return _compiling.total_s

@@ -50,6 +50,13 @@ def test_child_that_dies_says_how(function, arguments, limit_s, how):
         child.call(function, *arguments, limit_s=limit_s)
 
 
+def test_call_that_a_child_does_not_read_ends_in_time(tmp_path, monkeypatch):
+    (tmp_path / "stuck.py").write_text("import time\ntime.sleep(600)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with Child("stuck") as child, pytest.raises(ChildDiedError, match="time limit"):
+        child.call(np.negative, np.zeros(3_000_000), limit_s=0.2, grace_s=0.2)
+
+
 def test_child_runs_nothing_that_lies_in_the_current_folder(tmp_path):
     for name in ("json", "pickle", "enum", "numpy"):
         (tmp_path / f"{name}.py").write_text("open('ran', 'w').close()\n")

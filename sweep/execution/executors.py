@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, Self
 
-from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
-from sweep.evaluation.machine_faults import exception_line, machine_faults_raised
+from sweep.errors import StoreReplacedError
+from sweep.evaluation.machine_faults import exception_line, machine_fault, machine_faults_raised
 from sweep.execution import BLOCK_TASK
 from sweep.execution.block_task import compute_blocks
-from sweep.execution.waves import Waiting, Work
-from sweep.isolation import child_process
-from sweep.isolation.child_process import POLL_S, Child, Interrupts
+from sweep.execution.waves import Work
+from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts, explained
 from sweep.messages import notice
 from sweep.store.blocks import Receipt
 
@@ -44,16 +43,37 @@ class Failed:
         In a line.
     machine_fault
         Whether a machine is at fault, and not the work.
-    tries
-        How often it is tried in all, if this comes again.
+    died
+        Whether the worker's process ended: the block is computed in isolation when it is begun
+        again.
     worker
         The address of the worker that failed, if it is known.
     """
 
     reason: str
     machine_fault: bool = False
-    tries: int = 1
+    died: bool = False
     worker: str = ""
+
+
+def attempted(
+    compute: Callable[..., list[Receipt]], arguments: tuple[Any, ...], worker: str = ""
+) -> list[Receipt] | Failed:
+    """Return the receipts of blocks, which a worker computes, or why there are none.
+
+    Raises
+    ------
+    StoreReplacedError
+        If the store was moved, deleted or replaced.
+    """
+    try:
+        return compute(*arguments)
+    except StoreReplacedError:
+        raise
+    except Exception as error:
+        fault = machine_fault(error)
+        return Failed(exception_line(error) if fault is None else str(fault), fault is not None,
+                      worker=worker)
 
 
 class Executor(ABC):
@@ -68,15 +88,15 @@ class Executor(ABC):
     threads: int
 
     def map(
-        self, waiting: Waiting, task: Callable[[Work], tuple[Any, ...]], limit_s: float,
+        self, works: Iterable[Work], task: Callable[[Work], tuple[Any, ...]], limit_s: float,
         interrupts: Interrupts,
     ) -> Generator[tuple[Work, list[Receipt] | Failed]]:
-        """Compute what waits; yield each piece of work with its receipts, or why there are none.
+        """Compute blocks; yield each piece of work with its receipts, or why there are none.
 
         Parameters
         ----------
-        waiting
-            The blocks that wait; more may wait after a yielded block is committed.
+        works
+            The blocks.
         task
             Gives the arguments of :func:`compute_blocks` for work.
         limit_s
@@ -91,10 +111,9 @@ class Executor(ABC):
         StoreReplacedError
             If the store was moved, deleted or replaced.
         """
-        finished: SimpleQueue[Any] = SimpleQueue()
+        left, finished = iter(works), SimpleQueue[Any]()
         # Submitted blocks, and how they failed before.
         out: dict[Any, tuple[Work, list[Failed]]] = {}
-
         last, told_s = time.monotonic(), SILENCE_S
 
         def begin(work: Work, failures: list[Failed]) -> None:
@@ -104,7 +123,7 @@ class Executor(ABC):
 
         try:
             while True:
-                while len(out) < self.room() and (work := waiting.next()) is not None:
+                while len(out) < self.room() and (work := next(left, None)) is not None:
                     begin(work, [])
                 if not out:
                     return
@@ -120,11 +139,14 @@ class Executor(ABC):
                     continue
                 last, told_s = time.monotonic(), SILENCE_S
                 work, failures = out.pop(future)
-                result = self.result(future, failures)
-                if isinstance(result, Failed) and len(failures) + 1 < result.tries:
-                    begin(work, [*failures, result])
-                else:
-                    yield work, result
+                result = self.result(future)
+                if isinstance(result, Failed):
+                    failures = [*failures, result]
+                    again = result.died or (result.machine_fault and self.elsewhere(failures))
+                    if again and len(failures) < MAX_ATTEMPTS:
+                        begin(work, failures)
+                        continue
+                yield work, result
         finally:
             self.cancel(out)
 
@@ -137,8 +159,12 @@ class Executor(ABC):
         """Call :func:`compute_blocks`, rather not where it failed; return a future."""
 
     @abstractmethod
-    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
+    def result(self, future: Any) -> list[Receipt] | Failed:
         """Return the receipts of a future that is done, or why there are none."""
+
+    @abstractmethod
+    def elsewhere(self, failures: list[Failed]) -> bool:
+        """Return whether a block that machines failed may be tried again."""
 
     @abstractmethod
     def workers(self) -> str:
@@ -174,14 +200,12 @@ class Children(Executor):
 
     def __init__(self, child: Child, count: int, *, at_once: bool) -> None:
         self.threads = count if at_once else 1
-        self._count = count
-        self._children = [child]
-        self._idle: SimpleQueue[Child] = SimpleQueue()
+        self._count, self._children = count, [child]
+        self._idle = SimpleQueue[Child]()
         self._idle.put(child)
         self._pool = ThreadPoolExecutor(count)
-        self._grow_at = time.monotonic() + SMALL_RUN_LIMIT_S
-        if at_once:
-            self._grow()
+        self._grow_at = time.monotonic() + (0.0 if at_once else SMALL_RUN_LIMIT_S)
+        self.room()
 
     def __enter__(self) -> Self:
         return self
@@ -194,22 +218,20 @@ class Children(Executor):
         for child in self._children:  # one may have been begun again meanwhile
             child.close()
 
-    def _grow(self) -> None:
-        """Start the other processes; with a line, go on with fewer if the system allows no more."""
-        while len(self._children) < self._count:
+    def room(self) -> int:
+        """Return the number of processes; start those that are due.
+
+        With a line, fewer go on if the system allows no more.
+        """
+        while len(self._children) < self._count and time.monotonic() >= self._grow_at:
             try:
                 self._children.append(Child(BLOCK_TASK))
             except OSError as error:
                 notice(f"{len(self._children)} of {self._count} processes could be started: "
                        f"{exception_line(error)}")
                 self._count = len(self._children)
-                return
-            self._idle.put(self._children[-1])
-
-    def room(self) -> int:
-        """Return the number of processes."""
-        if time.monotonic() > self._grow_at:
-            self._grow()
+            else:
+                self._idle.put(self._children[-1])
         return len(self._children)
 
     def workers(self) -> str:
@@ -221,36 +243,30 @@ class Children(Executor):
         del failures
         return self._pool.submit(self._call, arguments)
 
-    def _call(self, arguments: tuple[Any, ...]) -> list[Receipt]:
+    def _call(self, arguments: tuple[Any, ...]) -> list[Receipt] | Failed:
         child = self._idle.get()
         try:
             # The block keeps its own time limit; this one is for what surrounds it.
-            return child.call(compute_blocks, *arguments, limit_s=2 * arguments[-1])
-        except (child_process.ChildDiedError, MachineFaultError):
-            with machine_faults_raised():
-                child.restart()
-            raise
+            result = child.call(
+                attempted, compute_blocks, arguments, limit_s=2 * arguments[-1])
+        except ChildDiedError as error:
+            result = Failed(
+                f"its process ended: {explained(error)}", error.from_outside, died=True)
+        try:
+            if isinstance(result, Failed):
+                with machine_faults_raised():
+                    child.restart()
         finally:
             self._idle.put(child)
+        return result
 
-    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
-        """Return the receipts; after a death, or a first fault, the block is begun again."""
-        del failures
-        try:
-            receipts: list[Receipt] = future.result()
-        except StoreReplacedError:
-            raise
-        except child_process.ChildDiedError as error:
-            # The block is computed in isolation when it is begun again.
-            how = child_process.explained(error)
-            return Failed(f"its process ended: {how}", error.from_outside, MAX_ATTEMPTS)
-        except MachineFaultError as error:
-            return Failed(str(error), machine_fault=True, tries=2)
-        except child_process.ChildRaisedError as error:
-            return Failed(child_process.last_line(error))
-        except SweepError as error:
-            return Failed(f"{type(error).__name__}: {error}")
-        return receipts
+    def result(self, future: Any) -> list[Receipt] | Failed:
+        """Return the receipts, or why there are none."""
+        return attempted(future.result, ())
+
+    def elsewhere(self, failures: list[Failed]) -> bool:
+        """Return whether this machine failed for the first time."""
+        return len(failures) == 1
 
     def cancel(self, out: Collection[Any]) -> None:
         """End the processes if they still compute."""

@@ -11,17 +11,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 from urllib.parse import urlsplit
 
 import dask
-from distributed import Client, KilledWorker, LocalCluster, Security, get_worker
+from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
 from distributed.core import rpc
 
-from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplacedError
-from sweep.evaluation.machine_faults import exception_line, machine_fault
+from sweep.errors import ArgumentError, RunError, StoreReplacedError
+from sweep.evaluation.machine_faults import exception_line
 from sweep.execution.block_task import compute_blocks, other_here
-from sweep.execution.executors import MAX_ATTEMPTS, Executor, Failed
+from sweep.execution.executors import Executor, Failed, attempted
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
 from sweep.messages import notice
@@ -78,15 +78,16 @@ def connected(
         If the cluster cannot be used: it does not answer or refuses, has no workers, or a worker
         has other versions; each within a bounded time.
     """
+    argument = "client" if scheduler is None else "scheduler"
+    name = scheduler or _name(client)
+    own: Any = client
     with contextlib.ExitStack() as stack:
-        if scheduler is not None:
-            argument, name = "scheduler", scheduler
+        if scheduler is None:
+            _check_client(client, name)
+        else:
             stack.enter_context(silenced_dask_loggers())
             own = stack.enter_context(_local_cluster(workers or default_workers())) \
                 if scheduler == LOCAL else _checked_address(scheduler)
-        else:
-            argument, name = "client", _name(client)
-            own = _checked_client(client, name)
         if not isinstance(own, Client):
             try:
                 own = stack.enter_context(Client(own, timeout=ANSWER_S, set_as_default=False))
@@ -151,8 +152,8 @@ async def _kind_of_server(address: str) -> str:
         return str((await server.identity())["type"])
 
 
-def _checked_client(client: Client | Cluster | None, name: str) -> Client | Cluster:
-    """Return the caller's client or cluster object, if it can be used."""
+def _check_client(client: Client | Cluster | None, name: str) -> None:
+    """Raise ArgumentError if the caller's client or cluster object cannot be used."""
     if not isinstance(client, (Client, Cluster)):
         raise ArgumentError(
             "client", client,
@@ -165,7 +166,6 @@ def _checked_client(client: Client | Cluster | None, name: str) -> Client | Clus
     state = getattr(state, "name", state)
     if state in ("closing", "closed", "failed"):
         raise ArgumentError("client", name, f"it is {state}")
-    return client
 
 
 def _name(client: object) -> str:
@@ -208,11 +208,10 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
             worker: client.submit(this_process, pipeline, begun, workers=[worker], pure=False)
             for worker in client.nthreads()
         }
-        identities: dict[str, Worker] = {}
-        deadline = time.monotonic() + WORKERS_S
-        for worker, answer in asked.items():
-            with contextlib.suppress(TimeoutError):
-                identities[worker] = answer.result(timeout=max(deadline - time.monotonic(), 0.1))
+        with contextlib.suppress(TimeoutError), client.as_current():
+            wait(list(asked.values()), timeout=WORKERS_S)
+        identities: dict[str, Worker] = {
+            worker: answer.result() for worker, answer in asked.items() if answer.done()}
     except TimeoutError:
         raise ArgumentError(
             argument, name, f"no workers within {WORKERS_S:.0f} s; start some") from None
@@ -329,51 +328,48 @@ class OnCluster(Executor):
 
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
-        others = self._others({each.worker for each in failures}) if failures else []
+        others = self._others(failures) if failures else []
         return self._client.submit(
             on_worker, compute_blocks, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
             workers=others or None, allow_other_workers=bool(others),
         )
 
-    def _others(self, failed_on: Collection[str]) -> list[str]:
+    def _others(self, failures: list[Failed]) -> list[str]:
+        failed_on = {each.worker for each in failures}
         left = [worker for worker in self._states if worker not in failed_on]
         hosts = {urlsplit(worker).hostname for worker in failed_on}
         return [each for each in left if urlsplit(each).hostname not in hosts] or left
 
-    def result(self, future: Any, failures: list[Failed]) -> list[Receipt] | Failed:
-        """Return the receipts; what died, or a machine failed, is given to other workers."""
-        worker, result = "", None
+    def elsewhere(self, failures: list[Failed]) -> bool:
+        """Return whether there are workers that did not fail; name the one that did, once."""
+        worker = failures[-1].worker
+        if worker not in self._told:
+            self._told.add(worker)
+            notice(f"worker {worker}: {failures[-1].reason}; others compute its blocks")
+        return bool(self._others(failures))
+
+    def result(self, future: Any) -> list[Receipt] | Failed:
+        """Return the receipts, or why there are none."""
+        status = future.status
         try:
-            if future.status == "finished":
-                worker, result = future.result()  # it comes through the scheduler
-            elif future.status == "error":
-                result = future.exception()
-            elif future.status != "lost" or self._client.status != "running":
-                raise RunError(AWAY)
-            # Else its worker died with its receipt.
+            if status == "finished":
+                return cast("list[Receipt] | Failed", future.result())  # through the scheduler
+            error = future.exception() if status == "error" else None
         except OSError:
             raise RunError(AWAY) from None
         finally:
             future.release()
-        if isinstance(result, StoreReplacedError):
-            raise result
-        if result is None or isinstance(result, KilledWorker):
-            # A block that ends its process is computed in isolation when it is begun again, but
-            # it may have been queued behind one, or its workers were killed from outside.
-            return Failed(
-                "its workers died again and again; their logs may tell why; if memory ran out, "
-                f"{ADVICE}", machine_fault=True, tries=MAX_ATTEMPTS)
-        if isinstance(result, BaseException):
-            fault = machine_fault(result)
-            if fault is None:
-                return Failed(f"{type(result).__name__}: {result}")
-            if worker not in self._told:
-                self._told.add(worker)
-                notice(f"worker {worker or 'unknown'}: {fault}; others compute its blocks")
-            left = self._others({*(each.worker for each in failures), worker})
-            return Failed(str(fault), True, MAX_ATTEMPTS if left else 1, worker)
-        receipts: list[Receipt] = result
-        return receipts
+        if isinstance(error, StoreReplacedError):
+            raise error
+        if error is not None and not isinstance(error, KilledWorker):
+            return Failed(exception_line(error))
+        if error is None and (status != "lost" or self._client.status != "running"):
+            raise RunError(AWAY)
+        # A block that ends its process is computed in isolation when it is begun again, but it may
+        # have been queued behind one, or its workers were killed from outside; or died with its
+        # receipt.
+        return Failed("its workers died again and again; their logs may tell why; if memory ran "
+                      f"out, {ADVICE}", machine_fault=True, died=True)
 
     def cancel(self, out: Collection[Any]) -> None:
         """Take back the blocks that are still submitted; a caller's cluster outlives the run."""
@@ -384,9 +380,6 @@ class OnCluster(Executor):
 
 def on_worker(
     compute: Callable[..., list[Receipt]], arguments: tuple[Any, ...]
-) -> tuple[str, list[Receipt] | MachineFaultError]:
-    """Compute blocks on a worker; return its address, and receipts or its machine's fault."""
-    try:
-        return get_worker().address, compute(*arguments)
-    except MachineFaultError as fault:
-        return get_worker().address, fault
+) -> list[Receipt] | Failed:
+    """Compute blocks on a worker; return their receipts, or why there are none."""
+    return attempted(compute, arguments, get_worker().address)

@@ -8,8 +8,9 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sweep.errors import (
@@ -24,7 +25,7 @@ from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.status import Summary, close, drop_failed, failed_blocks, summary_of
-from sweep.execution.waves import Waiting, Work, condition_count, waiting_blocks
+from sweep.execution.waves import InWaves, Work, condition_count
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, Interrupts, default_workers
@@ -176,7 +177,7 @@ def execute(
 
 def recompute(
     store: RunStore,
-    numbers: Iterable[int],
+    numbers: Collection[int],
     *,
     workers: int | None = None,
     time_limit_s: float | None = None,
@@ -196,7 +197,7 @@ def recompute(
         Children(child, workers or default_workers(), at_once=workers is not None) as executor,
         _continuable_errors(),
     ):
-        compute(store, waiting_blocks(store, numbers), executor, (), limit_s, interrupts)
+        compute(store, numbers, executor, (), limit_s, interrupts)
 
 
 def _check_arguments(
@@ -271,10 +272,8 @@ def _compute_and_close(
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
-        done = _committed_whole(store)
-        left = (number for number in range(len(store.blocks)) if number not in done)
-        computed = compute(store, waiting_blocks(store, left, done), executor, sources,
-                           time_limit_s, interrupts, progress)
+        left = sorted(set(range(len(store.blocks))) - _committed_whole(store))
+        computed = compute(store, left, executor, sources, time_limit_s, interrupts, progress)
         _check_same_rule(store)
         if not store.finished:  # by another process that wrote it, too
             close(store)
@@ -286,10 +285,10 @@ MAX_FAILED_BLOCKS = 10
 
 
 def compute(
-    store: RunStore, waiting: Waiting, executor: Executor, sources: Sequence[str],
+    store: RunStore, numbers: Collection[int], executor: Executor, sources: Sequence[str],
     time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None = None,
 ) -> Mapping[str, int]:
-    """Compute the blocks that wait.
+    """Compute blocks that are not committed, by their numbers.
 
     Returns
     -------
@@ -305,60 +304,55 @@ def compute(
         If the receipt of a block that was committed before is damaged.
     """
     url, pipeline = absolute_url(store.url), store.pipeline
+    waves = None if pipeline.stopping is None else InWaves(store, set(numbers))
+    conditions = condition_count(pipeline)
     computed: Counter[str] = Counter()
-    committed_so_far: Counter[str] = Counter()
-    failed: list[tuple[str, bool]] = []
+    so_far: Counter[str] = Counter()
+    failed: list[Failed] = []
 
     def task(work: Work) -> tuple[Any, ...]:
         some = [store.blocks[number] for number in work.numbers]
         return (url, store.run_id, some, work.decision, sources, time_limit_s)
 
-    def count(receipt: Receipt) -> None:
-        detected = sum(receipt.detection[DetectionStatus.detected :][:1])
-        committed_so_far.update(
-            scenes=receipt.scenes, needed=receipt.scenes_needed, detected=detected)
+    def report(receipts: Iterable[Receipt] = ()) -> None:
+        for receipt in receipts:
+            so_far.update(scenes=receipt.scenes, needed=receipt.scenes_needed,
+                          detected=sum(receipt.detection[DetectionStatus.detected :][:1]))
+        if progress is not None:
+            progress(Progress(
+                so_far["scenes"], pipeline.size(Stage.scene), so_far["detected"],
+                *(() if waves is None else (
+                    so_far["needed"], int(waves.settled_share * conditions), conditions))))
 
-    def report() -> None:
-        if progress is None:
-            return
-        waves = {}
-        if waiting.settled_share is not None:
-            conditions = condition_count(pipeline)
-            waves = {"needed": committed_so_far["needed"], "conditions": conditions,
-                     "settled": int(waiting.settled_share * conditions)}
-        progress(Progress(committed_so_far["scenes"], pipeline.size(Stage.scene),
-                          committed_so_far["detected"], **waves))
-
-    for _, receipt in blocks.receipts(store, waiting.current):
-        count(receipt)
-    report()
-    with contextlib.closing(executor.map(waiting, task, time_limit_s, interrupts)) as results:
-        for work, result in results:
-            if isinstance(result, Failed):
-                block = store.blocks[work.numbers[0]]
-                failed.append((f"block {block}: {result.reason}", result.machine_fault))
-                if len(failed) >= MAX_FAILED_BLOCKS:
-                    break
-                continue
-            for number, receipt in zip(work.numbers, result, strict=True):
-                waiting.committed(number, receipt)
-                computed.update({"blocks": 1, **receipt.computed})
-                count(receipt)
-                report()
-    _raise_failed(store.url, failed)
+    done = blocks.committed(store).difference(numbers) if waves is None else waves.current
+    report(receipt for _, receipt in blocks.receipts(store, done))
+    for works in waves or [(Work((number,)) for number in numbers)]:
+        with contextlib.closing(executor.map(works, task, time_limit_s, interrupts)) as results:
+            for work, result in results:
+                if isinstance(result, Failed):
+                    block = store.blocks[work.numbers[0]]
+                    failed.append(replace(result, reason=f"block {block}: {result.reason}"))
+                    if len(failed) >= MAX_FAILED_BLOCKS:
+                        break
+                    continue
+                for number, receipt in zip(work.numbers, result, strict=True):
+                    if waves is not None:
+                        waves.committed(number, receipt)
+                    computed.update({"blocks": 1, **receipt.computed})
+                    report([receipt])
+        _raise_failed(store.url, failed)
+    if waves is not None:
+        report()
     return computed
 
 
-def _raise_failed(url: str, failed: Sequence[tuple[str, bool]]) -> None:
-    """Raise RunError for blocks that failed, each with its reason and whether a machine did.
-
-    It has one line if faults of machines are all there is.
-    """
-    if failed and all(machine_fault for _, machine_fault in failed):
+def _raise_failed(url: str, failed: Sequence[Failed]) -> None:
+    """Raise RunError for blocks that failed; in one line if machines were at fault in all."""
+    if failed and all(each.machine_fault for each in failed):
         more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
-        raise RunError(f"{url}: {failed[0][0]}{more}")
+        raise RunError(f"{url}: {failed[0].reason}{more}")
     if failed:
-        listed = "\n".join(f"  {reason}" for reason, _ in failed)
+        listed = "\n".join(f"  {each.reason}" for each in failed)
         raise RunError(f"{url}: {len(failed)} blocks failed\n{listed}")
 
 

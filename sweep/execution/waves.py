@@ -1,12 +1,11 @@
-"""Which blocks can be computed now: all, or those whose earlier waves are committed."""
+"""Blocks in waves: each wave is computed on the committed results of those before."""
 
 from __future__ import annotations
 
 import json
 import math
 import zlib
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,28 +32,6 @@ class Work:
     decision: Decision | None = None
 
 
-class AnyOrder:
-    """Blocks that do not depend on each other, in the order of their numbers.
-
-    ``done``: those that are committed before.
-    """
-
-    #: There are no conditions that could be settled.
-    settled_share = None
-
-    def __init__(self, numbers: Iterable[int], done: AbstractSet[int] = frozenset()) -> None:
-        self._numbers = iter(numbers)
-        self.current = done
-
-    def next(self) -> Work | None:
-        """Return the next block."""
-        number = next(self._numbers, None)
-        return None if number is None else Work((number,))
-
-    def committed(self, number: int, receipt: Receipt) -> None:
-        """Nothing follows from it."""
-
-
 class _Known(NamedTuple):
     """The kept part of a committed block's receipt; ``content`` is a digest of what rules read."""
 
@@ -65,7 +42,7 @@ class _Known(NamedTuple):
 
 
 class InWaves:
-    """Blocks in waves: a group's next wave waits for all blocks of the one before.
+    """The blocks of each wave, which are computed before those of the next.
 
     A block is computed again if it was committed on another basis: under another rule, or on
     results that were computed again since.
@@ -76,6 +53,7 @@ class InWaves:
         The store of a pipeline whose sampling stops; its committed blocks are read.
     only
         The blocks that may be computed, if they are not committed (default: all).
+
     """
 
     def __init__(self, store: RunStore, only: AbstractSet[int] | None = None) -> None:
@@ -85,54 +63,36 @@ class InWaves:
         self._read = sorted({"detection", *sampling.variables})
         self._only = only
         self._known: dict[int, _Known] = {}
-        self._ready: deque[Work] = deque()
-        # Of each group that was begun, the wave's blocks that are not committed yet, and what
-        # goes on when all are.
-        self._groups: dict[int, tuple[set[int], Iterator[list[Work]]]] = {}
-        self._settled_shares: dict[int, float] = {}
-        #: Numbers of the blocks that were committed on the basis that they have now.
+        self._settled_shares = np.zeros(self._waves.groups)
+        #: Numbers of the blocks that are committed on the basis that they have now.
         self.current: set[int] = set()
         for number, receipt in receipts(store, committed(store)):
-            self._note(number, receipt)
-        begun = {self._waves.group(number) for number in self._known}
-        for group in sorted(begun):
-            self._begin(group)
-        self._fresh = (group for group in range(self._waves.groups) if group not in begun)
+            self.committed(number, receipt)
+        self._groups = [self._of_group(group) for group in range(self._waves.groups)]
+        self._next = self._next_wave()
 
     @property
     def settled_share(self) -> float:
         """The share of the conditions that need no more trials, or have them all."""
-        return sum(self._settled_shares.values()) / self._waves.groups
+        return float(self._settled_shares.mean())
 
-    def next(self) -> Work | None:
-        """Return the blocks that can be computed now."""
-        while not self._ready:
-            group = next(self._fresh, None)
-            if group is None:
-                return None
-            self._begin(group)
-        return self._ready.popleft()
+    def __iter__(self) -> Iterator[list[Work]]:
+        """Yield what each wave has to compute; go on when that is committed."""
+        while self._next:
+            yield self._next
+            self._next = self._next_wave()
 
     def committed(self, number: int, receipt: Receipt) -> None:
-        """Note a committed block; the last one of a wave makes the next wave ready."""
-        self._note(number, receipt)
-        pending, works = self._groups[self._waves.group(number)]
-        pending.discard(number)
-        if not pending:
-            self._ready.extend(next(works, ()))
-
-    def _note(self, number: int, receipt: Receipt) -> None:
+        """Note a committed block."""
         content = json.dumps([number, *(receipt.checksums.get(name, 0) for name in self._read)])
         self._known[number] = _Known(
             receipt.basis, zlib.crc32(content.encode()), receipt.scenes_needed, receipt.scenes)
 
-    def _begin(self, group: int) -> None:
-        pending: set[int] = set()
-        self._groups[group] = pending, (works := self._works(group, pending))
-        self._ready.extend(next(works, ()))
+    def _next_wave(self) -> list[Work]:
+        return [work for group in self._groups for work in next(group, ())]
 
-    def _works(self, group: int, pending: set[int]) -> Iterator[list[Work]]:
-        """Yield the work of each wave of a group; go on once nothing of it is ``pending``.
+    def _of_group(self, group: int) -> Iterator[list[Work]]:
+        """Yield the work of each wave of a group.
 
         In a wave, these are the blocks that are not committed on what follows from the wave
         before. Once nothing was needed in a wave, all that is left is one wave.
@@ -141,24 +101,26 @@ class InWaves:
         bases: tuple[int, ...] = ()  # for each wave from 1 on what it follows from
         digest = zlib.crc32(digest_of(self._rule).encode())
         while True:
-            stop = last if settled else wave
-            numbers = list(self._waves.numbers(group, wave, stop))
+            numbers = list(self._waves.numbers(group, wave, last if settled else wave))
             basis = bases[-1] if bases else None
-            pending.update(number for number in numbers if number not in self._known
-                           or self._known[number].basis != basis)
-            self.current.update(set(numbers) - pending)
+            decision = Decision(self._rule, wave, bases, settled) if bases else None
+            pending = [number for number in numbers
+                       if number not in self._known or self._known[number].basis != basis]
+            self.current.update(set(numbers).difference(pending))
             if pending:
-                allowed = [number for number in numbers if number in pending and (
-                    self._only is None or number in self._only or number in self._known)]
-                decision = Decision(self._rule, wave, bases, settled) if bases else None
+                allowed = [number for number in pending if self._only is None
+                           or number in self._only or number in self._known]
                 size = SETTLED_AT_ONCE if settled else 1
                 yield [Work(tuple(allowed[at : at + size]), decision)
                        for at in range(0, len(allowed), size)]
-                continue
+                if len(allowed) < len(pending):
+                    return
+                self.current.update(pending)
             found = [self._known.pop(number) for number in numbers]
             needed, scenes = sum(each.needed for each in found), sum(each.scenes for each in found)
-            self._settled_shares[group] = 1.0 if stop == last else 1.0 - needed / scenes
-            if stop == last:
+            ends = settled or wave == last
+            self._settled_shares[group] = 1.0 if ends else 1.0 - needed / scenes
+            if ends:
                 return
             digest = zlib.crc32(json.dumps([digest, *(each.content for each in found)]).encode())
             bases = (*bases, digest)
@@ -166,36 +128,8 @@ class InWaves:
             wave += 1
 
 
-#: The blocks that wait to be computed.
-Waiting = AnyOrder | InWaves
-
-
-def waiting_blocks(
-    store: RunStore, numbers: Iterable[int], done: AbstractSet[int] = frozenset()
-) -> Waiting:
-    """Return some blocks of a store in the order in which they can be computed.
-
-    ``done``: the blocks that are committed.
-    """
-    if store.pipeline.stopping is None:
-        return AnyOrder(numbers, done)
-    return InWaves(store, set(numbers))
-
-
-def _rule_of(store: RunStore) -> StoppingRule:
-    if store.pipeline.stopping is None:
-        raise TypeError(store.url)
-    return store.pipeline.stopping
-
-
 # --------------------------------------------------------------------------------------------------
 # Conditions of a run in waves, and those that are not settled at its end.
-
-def _conditions(pipeline: Pipeline) -> list[bool]:
-    """Return which of the condition axes make conditions; cells along the others are pooled."""
-    per = getattr(pipeline.stopping, "per", None)
-    return [per is None or axis.name in per for axis in condition_axes(pipeline)]
-
 
 def condition_count(pipeline: Pipeline) -> int:
     """Return the number of conditions."""
@@ -216,3 +150,15 @@ def unsettled_count(store: RunStore) -> int:
             waves.span(store.blocks[first]), Decision(rule, last, tuple(range(last))))
         count += int(np.asarray(mask.any(axis=pooled)).sum())
     return count
+
+
+def _conditions(pipeline: Pipeline) -> list[bool]:
+    """Return which of the condition axes make conditions; cells along the others are pooled."""
+    per = getattr(pipeline.stopping, "per", None)
+    return [per is None or axis.name in per for axis in condition_axes(pipeline)]
+
+
+def _rule_of(store: RunStore) -> StoppingRule:
+    if store.pipeline.stopping is None:
+        raise TypeError(store.url)
+    return store.pipeline.stopping

@@ -33,7 +33,6 @@ from sweep.execution import on_cluster
 from sweep.execution.forecast import block_work_s
 from sweep.execution.runner import compute
 from sweep.execution.status import status
-from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import SINGLE_THREADED, Interrupts
 from sweep.store.blocks import Receipt, committed, receipt_key, receipts
@@ -142,7 +141,7 @@ def simulated(count, waves, folder):
         processes = {"scheduler": psutil.Process(cluster.scheduler.pid), "client": psutil.Process()}
         spent = {name: cpu_s(process) for name, process in processes.items()}
         begun = time.perf_counter()
-        compute(store, AnyOrder(range(len(store.blocks))), on_cluster.OnCluster(client), (),
+        compute(store, range(len(store.blocks)), on_cluster.OnCluster(client), (),
                 block_s, interrupts, lambda _: None)
         wall = time.perf_counter() - begun
         busy_s = sum(one.wall_s for _, one in receipts(store, range(len(store.blocks))))

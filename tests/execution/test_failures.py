@@ -31,7 +31,6 @@ from sweep.execution.status import (
     poses_per_second,
     status,
 )
-from sweep.execution.waves import AnyOrder
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
@@ -232,9 +231,8 @@ def undisturbed(tmp_path_factory):
 def run_on(client, url):
     """Run the pipeline in blocks of one scene; return how many scenes failed."""
     store = create_store(str(url), FAULTY, (1,))
-    waiting = AnyOrder(range(len(store.blocks)))
     with writing(store.url, store.storage), Interrupts() as interrupts:
-        compute(store, waiting, OnCluster(client), (), 600.0, interrupts)
+        compute(store, range(len(store.blocks)), OnCluster(client), (), 600.0, interrupts)
         close(store)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]

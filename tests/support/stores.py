@@ -1,5 +1,6 @@
 """Stores computed in this process, their bits, and damage that their checksums do not show."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -49,13 +50,15 @@ def by_hand(url, pipeline, extents=None, numbers=None):
 
 def in_waves(store, most=None):
     """Compute blocks of a store in this process by its pipeline's rule; return how many."""
-    waiting, count = InWaves(store), 0
-    while (work := waiting.next()) is not None and (most is None or count < most):
+    waves, count = InWaves(store), 0
+    for work in itertools.chain.from_iterable(waves):
+        if most is not None and count >= most:
+            break
         found = compute_blocks(
             store.url, store.run_id, [store.blocks[number] for number in work.numbers],
             work.decision)
         for number, receipt in zip(work.numbers, found, strict=True):
-            waiting.committed(number, receipt)
+            waves.committed(number, receipt)
             count += 1
     return count
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.tables import header, row
 from sweep.analysis.intervals import wilson
-from sweep.conformance.check import trial_pipeline, trial_scenes
+from sweep.conformance.check import trial_images, trial_pipeline, trial_scenes
 from sweep.isolation.child_process import Child, ChildDiedError
 from sweep.measure.detectors import make_detector
 
@@ -39,13 +39,14 @@ def searched(name, scenes, noise):
     """Return errors (scenes, 4, 2) px, NaN if missed, and seconds (scenes,)."""
     cv2.setNumThreads(1)
     detector, dictionary, chosen = METHODS[name]
-    shown = trial_scenes(
-        trial_pipeline(detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", scenes)
-    )
-    find = make_detector(shown.setting)
-    find(shown.images[0], dictionary, 640)  # what is made once is made
+    pipeline = trial_pipeline(
+        "detector", detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", count=scenes)
+    batch = trial_scenes(pipeline)
+    shown, images = batch.scenes, trial_images(batch)
+    find = make_detector(pipeline.experiment.detectors[0])
+    find(images[0], dictionary, 640)  # what is made once is made
     errors, seconds = np.full((scenes, 4, 2), np.nan), np.full(scenes, np.nan)
-    for k, image in enumerate(shown.images):
+    for k, image in enumerate(images):
         begun = time.perf_counter()
         corners, ids, _ = find(image, dictionary, 640)
         seconds[k] = time.perf_counter() - begun

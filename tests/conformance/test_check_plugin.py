@@ -8,8 +8,9 @@ import pytest
 
 from support.here import Here
 from sweep.cli import main
-from sweep.conformance.check import check_plugin, conventions, order_faults
+from sweep.conformance.check import check_plugin, judged_corners
 from sweep.errors import ArgumentError, PipelineError
+from sweep.plugins import DetectorPlugin
 
 DETECTOR = """
 import os, time
@@ -105,7 +106,7 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
 @pytest.mark.system
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
     (DETECTOR, "image.shape[0] > 8 or os._exit(3)", "has no memory", "exit status 3"),
-    (DETECTOR, "time.sleep(60)", "returns markers", "did not return"),
+    (DETECTOR, "time.sleep(60)", "returns markers", "time limit of 2 s"),
     (SOLVER, "os.abort()", "returns poses", "SIGABRT"),
 ])
 def test_a_crash_or_an_endless_call_ends_the_checks(source, body, check, named, checked):
@@ -138,9 +139,6 @@ def test_the_command_checks_a_solver(capsys):
     assert len(said["findings"]) == 6
 
 
-DECLARED = (0, 1, 2, 3)
-
-
 def truth(count=32):
     """Squares that are turned, and the point reflection of each about (319.5, 239.5)."""
     rng = np.random.default_rng(8)
@@ -151,12 +149,15 @@ def truth(count=32):
     return np.concatenate([corners, 2 * np.array([319.5, 239.5]) - corners])
 
 
-def faults_of(change, ids=lambda number: number, *, declared=DECLARED, center=0.0, noise=0.2):
+def told_of(change, ids=lambda number: number, **declared):
     corners, marker_id = truth(), np.arange(32) % 16 + 5
-    rng = np.random.default_rng(3)
-    returned = change(corners + rng.normal(0, noise, corners.shape))
-    found = [[(int(ids(number)), quad)] for number, quad in zip(marker_id, returned, strict=True)]
-    return order_faults(conventions(found, marker_id, corners), declared, center)
+    returned = change(corners + np.random.default_rng(3).normal(0, 0.2, corners.shape))
+    found = [(np.array([ids(number)]), quad[None])
+             for number, quad in zip(marker_id, returned, strict=True)]
+    verdict, line, _ = judged_corners(
+        found, marker_id, corners, DetectorPlugin(make=print, **declared))
+    assert verdict == "fault"
+    return line
 
 
 def turned(corners):
@@ -166,10 +167,10 @@ def turned(corners):
 @pytest.mark.parametrize(("change", "given", "told"), [
     (lambda c: c + 0.5, {}, "corners are offset by (0.5"),
     (lambda c: c + 0.5, {}, "declare pixel_center = 0.5"),
-    (lambda c: c - 0.5, {"center": 0.5}, "declare pixel_center = 0"),
+    (lambda c: c - 0.5, {"pixel_center": 0.5}, "declare pixel_center = 0"),
     (lambda c: c + np.array([0.2, -0.1]), {}, "no pixel_center is the reason"),
     (turned, {}, "turned by one: declare corner_order = (1, 2, 3, 0)"),
-    (turned, {"declared": (1, 0, 3, 2)}, "turned by one: declare corner_order = (0, 3, 2, 1)"),
+    (turned, {"corner_order": (1, 0, 3, 2)}, "turned by one: declare corner_order = (0, 3, 2, 1)"),
     (lambda c: np.roll(c, 2, axis=1), {},
      "turned by two (180°): declare corner_order = (2, 3, 0, 1)"),
     (lambda c: c[:, [1, 0, 3, 2]], {},
@@ -183,4 +184,4 @@ def turned(corners):
      "IDs are wrong in 8 of 32 scenes: 700 for marker 8"),
 ])
 def test_a_wrong_convention_is_told_with_what_to_declare(change, given, told):
-    assert told in "\n".join(faults_of(change, **given))
+    assert told in told_of(change, **given)

@@ -48,6 +48,12 @@ def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in cut)
 
 
+def exception_line(error: BaseException) -> str:
+    """Return an exception as one line: its type, and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
 def notice(line: str) -> None:
     """Write a line to stderr about what goes on, without control characters; errors follow apart.
 

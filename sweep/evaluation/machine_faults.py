@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from sweep.errors import MachineFaultError, SweepError
-from sweep.messages import plain
+from sweep.messages import exception_line, plain
 
 # --------------------------------------------------------------------------------------------------
 # Exceptions that a scene's data cannot cause: faults of the machine, which are never results.
@@ -81,12 +81,6 @@ def machine_faults_raised() -> Iterator[None]:
     except Exception as error:
         raise_machine_fault(error)
         raise
-
-
-def exception_line(error: BaseException) -> str:
-    """Return an exception as one line: its type, and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _is_fault(error: BaseException) -> bool:

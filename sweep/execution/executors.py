@@ -11,12 +11,12 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 
 from sweep.errors import StoreReplacedError
-from sweep.evaluation.machine_faults import exception_line, machine_fault, machine_faults_raised
+from sweep.evaluation.machine_faults import machine_fault, machine_faults_raised
 from sweep.execution import BLOCK_TASK
 from sweep.execution.block_task import compute_blocks
 from sweep.execution.waves import Work
 from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts, explained
-from sweep.messages import notice
+from sweep.messages import exception_line, notice
 from sweep.store.blocks import Receipt
 
 # --------------------------------------------------------------------------------------------------

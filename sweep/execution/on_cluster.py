@@ -19,12 +19,11 @@ from distributed import Client, KilledWorker, LocalCluster, Security, get_worker
 from distributed.core import rpc
 
 from sweep.errors import ArgumentError, RunError, StoreReplacedError
-from sweep.evaluation.machine_faults import exception_line
 from sweep.execution.block_task import compute_blocks, other_here
 from sweep.execution.executors import Executor, Failed, attempted
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
-from sweep.messages import notice
+from sweep.messages import exception_line, notice
 from sweep.processor import differing_processors, processor
 from sweep.store.blocks import Receipt
 from sweep.store.provenance import fingerprint

@@ -21,7 +21,7 @@ from sweep.model.marker import Marker
 from sweep.model.pose import Pose, WorldPose
 from sweep.model.scene import Scene
 from sweep.plugins.declared import DeclaredPlugin, declare
-from sweep.plugins.loading import installed_names
+from sweep.plugins.loading import offered
 
 # --------------------------------------------------------------------------------------------------
 # Every parameter of every section, gathered from where it is declared.
@@ -158,7 +158,7 @@ def _named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
                 try:
                     parameter.check(name)
                 except ValueError:
-                    if few or ":" in name or name in installed_names(kind):
+                    if few or ":" in name or name in [entry.name for entry in offered(kind)]:
                         yield kind, name, f"{path}.{parameter.name}"
     for name in _words(document.get(EFFECTS_KEY), single=False):
         yield "effect", name, EFFECTS_KEY

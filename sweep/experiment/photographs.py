@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import Declared, check_table, declared_fields
-from sweep.errors import PluginError, SweepError
+from sweep.errors import PluginError
 from sweep.experiment.document import file_text, read_document, refusing
 from sweep.measure.surroundings import BoardMarker, clear_modules, with_neighbours
 from sweep.messages import plain, refusal, shown
@@ -156,24 +156,16 @@ class PhotographRecord:
 
 def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
     width_px, height_px = arrays["size"].tolist()
-    record = PhotographRecord(
+    return PhotographRecord(
         tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
         Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"], arrays["rotation"],
         arrays["translation"], arrays["std"], arrays["source"], str(arrays["board"]))
-    try:
-        record.on_board(record.marker_id)
-    except (SweepError, AttributeError, KeyError, TypeError, ValueError):
-        raise ValueError("damaged: board") from None
-    return record
 
 
 #: Files of records.
-PHOTOGRAPH_RECORDS = ArrayFile("a record of photographs that `sweep photos` writes", 2, {
-    "paths": ("U", ("P",)), "digests": ("U", ("P",)), "part": ("U", ()),
-    "marker_id": ("i8", ("M",)), "rotation": ("f8", ("P", "M", 3, 3)),
-    "translation": ("f8", ("P", "M", 3)), "std": ("f8", ("P", "M", POSE)),
-    "source": ("u1", ("P", "M")), "board": ("U", ()), "size": ("i8", (2,)),
-}, _made)
+PHOTOGRAPH_RECORDS = ArrayFile("a record of photographs that `sweep photos` writes", 2, (
+    "paths", "digests", "part", "marker_id", "rotation", "translation", "std", "source", "board",
+    "size"), _made)
 
 
 #: Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing

@@ -20,7 +20,6 @@ from sweep.model.marker import opencv_dictionary
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.declared import PluginSetting
 from sweep.plugins.loading import call, made, real_numbers
-from sweep.plugins.recording import is_recording
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -457,17 +456,7 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     """
     if isinstance(setting, DetectorSetting):
         return Detector(setting).find
-    if is_recording(setting.plugin.name):
-        return _find_nothing
-    record: DetectorPlugin = setting.record()
-    return PluggedDetector(setting.plugin.name, record, setting.instance()).find
-
-
-def _find_nothing(
-    image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG001
-) -> DetectorOutput:
-    """Return no marker: recorded detections are read, whatever the image."""
-    return [], None, []
+    return PluggedDetector(setting.plugin.name, setting.record(), setting.instance()).find
 
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:

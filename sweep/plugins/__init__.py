@@ -79,10 +79,16 @@ class Plugin:
     """
 
     kind: ClassVar[str]
+    function: ClassVar[str]  # the field that a class or function may stand for, without a record
     settings: type[Any] | None = None
     meaning: str = ""
     distribution: str | Sequence[str] = ()
     install: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be called."""
+        if not callable(getattr(self, self.function)):
+            raise TypeError(f"{self.function}: expected a class or function")
 
     @property
     def distributions(self) -> tuple[str, ...]:
@@ -119,6 +125,7 @@ class DetectorPlugin(Plugin):
     """
 
     kind: ClassVar[str] = "detector"
+    function: ClassVar[str] = "make"
     make: Callable[[Any, str], Callable[[Any], Any]]
     pixel_center: float = 0.0
     corner_order: tuple[int, int, int, int] = (0, 1, 2, 3)
@@ -128,14 +135,13 @@ class DetectorPlugin(Plugin):
 
     def __post_init__(self) -> None:
         """Refuse conventions that cannot be."""
+        super().__post_init__()
         if sorted(self.corner_order) != [0, 1, 2, 3]:
             raise ValueError(
                 f"corner_order = {self.corner_order!r}: expected the numbers 0 to 3, each once"
             )
         if not -1 <= self.pixel_center <= 1:
             raise ValueError(f"pixel_center = {self.pixel_center!r}: expected 0 or 0.5")
-        if not callable(self.make):
-            raise TypeError("make: expected a class or function of settings and family")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,14 +162,10 @@ class EstimatorPlugin(Plugin):
     """
 
     kind: ClassVar[str] = "estimator"
+    function: ClassVar[str] = "make"
     make: Callable[[Any], Callable[[Any], Any]]
     needs_images: bool = False
     of_boards: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be called."""
-        if not callable(self.make):
-            raise TypeError("make: expected a class or function of settings")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +190,7 @@ class EffectPlugin(Plugin):
     """
 
     kind: ClassVar[str] = "effect"
+    function: ClassVar[str] = "apply"
     apply: Callable[[Any, Any], Any]
     step: str = "light"
     random: bool = False
@@ -195,6 +198,7 @@ class EffectPlugin(Plugin):
 
     def __post_init__(self) -> None:
         """Refuse what no effect has."""
+        super().__post_init__()
         for name, choices in (
             ("step", ("light", "signal")), ("widens", ("nothing", "noise", "uneven light")),
         ):
@@ -202,8 +206,8 @@ class EffectPlugin(Plugin):
                 raise ValueError(
                     f"{name} = {getattr(self, name)!r}: expected one of {', '.join(choices)}"
                 )
-        if self.settings is None or not callable(self.apply):
-            raise TypeError("expected settings, of which the first is the switch, and apply")
+        if self.settings is None:
+            raise TypeError("expected settings, of which the first is the switch")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,16 +223,9 @@ class RendererPlugin(Plugin):
     """
 
     kind: ClassVar[str] = "renderer"
+    function: ClassVar[str] = "render"
     render: Callable[[Any], Any]
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be called."""
-        if not callable(self.render):
-            raise TypeError("render: expected a function of a view")
-
-
-#: Kind of plug-in -> the field that a class or function may stand for, in place of a record.
-FACTORY = {"detector": "make", "estimator": "make", "renderer": "render"}
 
 #: Kind of plug-in -> its record.
 RECORDS: dict[str, type[Plugin]] = {

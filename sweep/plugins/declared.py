@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import importlib.metadata
-import math
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sweep.declaration import Declared, converted, plain_types
+from sweep.declaration import Declared, declared_fields
 from sweep.errors import ArgumentError, PluginError
-from sweep.messages import nearest
+from sweep.messages import exception_line, nearest
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
-from sweep.plugins.loading import call, file_of, group_of, load, read_source, versions_of
-from sweep.plugins.recording import RecordedDetector
+from sweep.plugins.loading import call, file_of, load, offered, owner, versions_of
 
 # --------------------------------------------------------------------------------------------------
 # A plug-in as pipelines and stores know it: all that can be said of it without importing it.
@@ -25,32 +20,8 @@ from sweep.plugins.recording import RecordedDetector
 #: Types that a setting may have.
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
 
-
-@dataclass(frozen=True, slots=True)
-class Setting(Declared):
-    """One setting of a plug-in."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as a store records it."""
-        declared = {
-            field.name: value for field in dataclasses.fields(Declared)[3:]
-            if (value := getattr(self, field.name)) != field.default
-            and not (isinstance(value, float) and math.isinf(value))
-        }
-        return {"name": self.name, "types": [kind.__name__ for kind in self.types],
-                "default": self.default, **declared}
-
-    @staticmethod
-    def from_json(record: Mapping[str, Any]) -> Setting:
-        """Return the setting of a record; KeyError, TypeError or ValueError if it is none."""
-        declared: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in record.items() if key not in ("name", "types", "default")
-        }
-        name, kinds = record["name"], tuple(TYPES[kind] for kind in record["types"])
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ValueError(name)
-        return Setting(name, kinds, record["default"], **declared)
+#: Key of the plug-ins in a store's metadata.
+RECORDED = "plugins"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +54,7 @@ class DeclaredPlugin:
     versions: tuple[tuple[str, str], ...] = ()
     file: str = ""
     digest: str = ""
-    settings: tuple[Setting, ...] = ()
+    settings: tuple[Declared, ...] = ()
     dictionaries: tuple[str, ...] = ()
     threads: int = 1
     needs_images: bool = False
@@ -101,42 +72,41 @@ class DeclaredPlugin:
             If it is not the plug-in that was declared; in one line.
         """
         try:
-            record = load(self.kind, self.name, folder, self.digest)
+            record, digest = load(self.kind, self.name, folder)
+            if digest != self.digest:
+                raise PluginError(
+                    f"{self.file} as it was when the run began: it was changed in {folder}")
             versions = versions_of(self.kind, self.name, record)
+            if versions != self.versions:
+                raise PluginError(f"{_listed(self.versions)}, not {_listed(versions)}")
         except PluginError as error:
             raise PluginError(f"{self.kind} {self.name}: expected {error}") from error
-        if versions != self.versions:
-            raise PluginError(
-                f"{self.kind} {self.name}: expected {_listed(self.versions)}, "
-                f"not {_listed(versions)}"
-            )
         return record
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a store records it."""
-        return {
-            "kind": self.kind, "name": self.name, "meaning": self.meaning,
-            "versions": dict(self.versions), "file": self.file, "digest": self.digest,
-            "settings": [setting.to_json() for setting in self.settings],
-            "dictionaries": list(self.dictionaries),
-            **{name: value for name, kind in TRAITS.items()
-               if (value := getattr(self, name)) != kind()},
-        }
+        settings = [
+            {field.name: value for field in dataclasses.fields(setting)
+             if (value := getattr(setting, field.name)) != field.default}
+            | {"types": [kind.__name__ for kind in setting.types]}
+            for setting in self.settings
+        ]
+        return dataclasses.asdict(self) | {"versions": dict(self.versions), "settings": settings}
 
     @staticmethod
     def from_json(record: Mapping[str, Any]) -> DeclaredPlugin:
-        """Return the plug-in of a record; KeyError, TypeError or ValueError if it is none."""
-        texts = {key: record[key] for key in ("kind", "name", "meaning", "file", "digest")}
-        versions = tuple(sorted(record["versions"].items()))
-        dictionaries = tuple(record["dictionaries"])
-        traits = {name: kind(record[name]) for name, kind in TRAITS.items() if name in record}
-        words = [*texts.values(), *dictionaries, *(word for pair in versions for word in pair)]
-        if not all(isinstance(word, str) for word in words) or texts["kind"] not in RECORDS:
-            raise TypeError(record["name"])
-        return DeclaredPlugin(
-            **texts, **traits, versions=versions, dictionaries=dictionaries,
-            settings=tuple(Setting.from_json(setting) for setting in record["settings"]),
-        )
+        """Return the plug-in of a record; AttributeError, KeyError or TypeError if it is none."""
+        settings: list[dict[str, Any]] = [
+            {key: tuple(value) if isinstance(value, list) else value
+             for key, value in setting.items()}
+            | {"types": tuple(TYPES[kind] for kind in setting["types"])}
+            for setting in record["settings"]
+        ]
+        return DeclaredPlugin(**{
+            **record, "versions": tuple(sorted(record["versions"].items())),
+            "settings": tuple(Declared(**setting) for setting in settings),
+            "dictionaries": tuple(record["dictionaries"]),
+        })
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,12 +153,12 @@ def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
     return tuple(DeclaredPlugin.from_json(record) for record in metadata.get(RECORDED, ()))
 
 
-#: Key of the plug-ins in a store's metadata.
-RECORDED = "plugins"
-
-
 def _listed(versions: tuple[tuple[str, str], ...]) -> str:
     return ", ".join(f"{name} {version}" for name, version in versions) or "none"
+
+
+#: Fields of records that are known without importing them.
+TRAITS = ("threads", "needs_images", "of_boards", "random", "widens", "step")
 
 
 def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
@@ -199,62 +169,36 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
     PluginError
         In one line, what was expected instead.
     """
-    file = file_of(name)
-    record = load(kind, name, folder)
-    digest = ""
-    if isinstance(record, RecordedDetector):
-        digest = record.digest
-    elif file is not None:
-        digest = hashlib.sha256(read_source(file, folder)).hexdigest()
-    dictionaries: tuple[str, ...] = ()
-    if isinstance(record, DetectorPlugin) and record.families is not None:
-        dictionaries = tuple(record.families)
+    record, digest = load(kind, name, folder)
+    families = record.families if isinstance(record, DetectorPlugin) else None
     return DeclaredPlugin(
-        kind, name, record.meaning, versions_of(kind, name, record), file or "", digest,
-        tuple(_settings(record)), dictionaries,
+        kind, name, record.meaning, versions_of(kind, name, record), file_of(name) or "", digest,
+        _settings(record), tuple(families or ()),
         **{name: getattr(record, name) for name in TRAITS if hasattr(record, name)},
     )
 
 
-#: Fields of records that are known without importing them.
-TRAITS: dict[str, type] = {
-    "threads": int, "needs_images": bool, "of_boards": bool, "random": bool, "widens": str,
-    "step": str,
-}
-
-
-def _settings(record: Plugin) -> Iterator[Setting]:
-    """Yield the settings that a plug-in's dataclass declares."""
+def _settings(record: Plugin) -> tuple[Declared, ...]:
+    """Return the settings that a plug-in's dataclass declares."""
     if record.settings is None:
-        return
-    if not dataclasses.is_dataclass(record.settings):
-        raise PluginError("settings that are a dataclass")
+        return ()
+    types = [name for name in TYPES if name != "str" or record.kind not in ("effect", "renderer")]
+    declared: list[Declared] = []
     try:
-        hints = typing.get_type_hints(record.settings)
+        declared += declared_fields(record.settings).values()
+        wrong = [each.name for each in declared if each.default is dataclasses.MISSING
+                 or each.reads or not {kind.__name__ for kind in each.types} <= set(types)]
     except Exception as error:
-        raise PluginError(f"settings whose annotations can be read: {error}") from None
-    if record.kind == "effect" and not dataclasses.fields(record.settings):
+        wrong = [exception_line(error)]
+    if wrong:
+        raise PluginError(
+            f"settings of a {record.kind} as a dataclass with `name: type = parameter(default, "
+            f"meaning)`, of the types {', '.join(types)}; not so: {', '.join(wrong)}")
+    if record.kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")
-    for field in dataclasses.fields(record.settings):
-        declaration = field.metadata.get("declaration")
-        kinds = plain_types(hints[field.name])
-        if (
-            not isinstance(declaration, Declared) or declaration.reads is not None
-            or not set(kinds) <= set(TYPES.values())
-        ):
-            raise PluginError(
-                f"the setting {field.name} as `name: type = parameter(default, meaning)` with "
-                f"one of the types {', '.join(TYPES)}"
-            )
-        if record.kind in ("effect", "renderer") and str in kinds:
-            raise PluginError(f"numbers as settings of {record.kind}s; {field.name} is a text")
-        default = field.default
-        if default is dataclasses.MISSING:
-            raise PluginError(f"a default of the setting {field.name}")
-        if default is not None and type(default) is int and kinds == (float,):
-            default = float(default)
-        yield converted(dataclasses.replace(
-            declaration, name=field.name, types=kinds, default=default), Setting)
+    return tuple(
+        dataclasses.replace(each, default=float(each.default))
+        if each.types == (float,) and type(each.default) is int else each for each in declared)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -262,14 +206,8 @@ def _settings(record: Plugin) -> Iterator[Setting]:
 
 def installed() -> list[dict[str, str]]:
     """Return kind, name and distribution of each installed plug-in; none is imported."""
-    return [
-        {"kind": kind, "name": name, "distribution": distribution}
-        for kind in RECORDS
-        for name, distribution in sorted({
-            (entry.name, entry.dist.name if entry.dist else "")
-            for entry in importlib.metadata.entry_points(group=group_of(kind))
-        })
-    ]
+    return [{"kind": kind, "name": entry.name, "distribution": owner(entry)}
+            for kind in RECORDS for entry in offered(kind)]
 
 
 def described(name: str, folder: str = ".") -> list[DeclaredPlugin]:

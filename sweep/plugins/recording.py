@@ -7,16 +7,15 @@ exported.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import PluginError
-from sweep.plugins import Plugin
+from sweep.plugins import DetectorPlugin, Markers
 from sweep.plugins.array_file import ArrayFile
 from sweep.typing import Floats
 
@@ -72,39 +71,20 @@ class Recording:
         return slice(first, int(np.searchsorted(self.image, key, "right")))
 
 
-def _made(arrays: Mapping[str, NDArray[Any]]) -> Recording:
-    for name in ("exported", "image"):
-        if (arrays[name][1:] < arrays[name][:-1]).any():
-            raise ValueError(f"damaged: {name}")
-    return Recording(**{name: arrays[name] for name in RECORDINGS.arrays})
-
+NAMES = tuple(field.name for field in dataclasses.fields(Recording))
 
 #: Files of recordings.
-RECORDINGS = ArrayFile("detections that `sweep score` recorded", 1, {
-    "exported": ("u8", ("E",)), "image": ("u8", ("M",)), "marker_id": ("i8", ("M",)),
-    "corners": ("f8", ("M", 4, 2)), "rotation": ("f8", ("M", 3, 3)),
-    "translation": ("f8", ("M", 3)),
-}, _made)
+RECORDINGS = ArrayFile(
+    "detections that `sweep score` recorded", 1, NAMES,
+    lambda arrays: Recording(*(arrays[name] for name in NAMES)),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RecordedDetector(Plugin):
-    """A detector whose detections are read from a file; no image is searched.
+class RecordedDetector(DetectorPlugin):
+    """A detector whose detections are those of a recording, whatever the image."""
 
-    Attributes
-    ----------
-    recording
-        The detections.
-    digest
-        SHA-256 of their file.
-    margin_px
-        No pixel changes a detection.
-    """
-
-    kind: ClassVar[str] = "detector"
     recording: Recording
-    digest: str
-    margin_px: int = 0
 
 
 def is_recording(name: str) -> bool:
@@ -116,15 +96,16 @@ def is_recording(name: str) -> bool:
     return name.endswith(SUFFIX)
 
 
-def recorded_detector(name: str, folder: str) -> RecordedDetector:
-    """Return the detector of a file of recorded detections; it is read once in each process.
+def recorded_detector(path: Path) -> tuple[RecordedDetector, str]:
+    """Return the detector of a file of recorded detections, and the file's SHA-256.
 
     Raises
     ------
     PluginError
         If it cannot be read, or is none; in words that follow "expected".
     """
-    recording, digest = RECORDINGS.read(Path(folder) / name)
+    recording, digest = RECORDINGS.read(path)
     return RecordedDetector(
-        meaning="detections that another program made", recording=recording, digest=digest,
-    )
+        make=lambda settings, family: lambda image: Markers((), ()),  # noqa: ARG005
+        margin_px=0, meaning="detections that another program made", recording=recording,
+    ), digest

@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from sweep import library
 from sweep.cli.command import (
@@ -225,10 +225,11 @@ def export(
     "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside":
         "in other conventions, and beside the experiment's own detector"})
 def score(
-    folder: str, files: Sequence[str], *, names: Sequence[str] = (), pixel_center: str = "0",
-    corner_order: str = "TL TR BR BL", frame: str = "right up out", doubled: str = "refuse",
-    beside: bool = False, settings: Sequence[str] = (), store: str | None = None,
-    overwrite: bool = False, workers: int | None = None,
+    folder: str, files: Sequence[str], *, names: Sequence[str] = (), pixel_center: float = 0.0,
+    corner_order: str = "TL TR BR BL", frame: str = "right up out",
+    doubled: Literal["refuse", "nearest"] = "refuse", beside: bool = False,
+    settings: Sequence[str] = (), store: str | None = None, overwrite: bool = False,
+    workers: int | None = None,
 ) -> Findings:
     """Score what another program detected in an export's images.
 
@@ -246,7 +247,7 @@ def score(
         Order of the corners, as OpenCV draws the marker (default: TL TR BR BL).
     frame : --frame XYZ
         Directions of the marker's x, y, z for a viewer (default: right up out).
-    doubled : --doubled HOW
+    doubled
         What an ID counts that is twice in an image: refuse (default), or nearest.
     beside
         Also search the images with the experiment's own detector.
@@ -255,12 +256,11 @@ def score(
     """
     scored = library.score.prepare(
         folder, files, names=names,
-        conventions=library.answers.Conventions.of(pixel_center, corner_order, frame),
+        conventions=library.answers.Conventions(pixel_center, corner_order, frame),
         doubled=doubled, beside=beside, settings=settings)
-    with scored.withdrawn_if_refused():
-        summary = executed(
-            scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
-            overwrite=overwrite)
+    summary = executed(
+        scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
+        overwrite=overwrite)
     return summarised(
         summary, f"{summary.poses:,} poses, {summary.detected_line}", answers=scored.lines)
 

@@ -2,88 +2,68 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
+import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import tomlkit
 
-from sweep.errors import ArgumentError, OtherExperimentError, PipelineError, StoreError, SweepError
+from sweep.errors import ArgumentError, StoreError
+from sweep.exchange import export
 from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
-from sweep.exchange.export import EXPERIMENT, image_batch, image_batches, read_mark, write_errors
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.polygon import side_lengths
 from sweep.plugins.recording import OF_TARGET, RECORDINGS, REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
+from sweep.store.locations import translate_errors
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
 # Faults of the conventions of answers, where the truth fits other ones better.
 
-#: Markers that are compared with the truth.
-SAMPLE = 500
-
 MIN_MARKERS = 5
 
 
-def hints(
-    pipeline: Pipeline, answers: Answers, numbers: Integers, origins: Integers,
-    conventions: Conventions,
-) -> list[str]:
+def hints(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]:
     """Return a line for each convention that the truth contradicts in most of the markers.
 
     Parameters
     ----------
-    pipeline
-        The export's.
-    answers
-        In what are said to be our conventions.
-    numbers, origins
-        Number of the scene, and (…, 2) first pixel in the frame, of each image.
+    corners, truth
+        (n, 4, 2) px, in what are said to be our conventions; NaN where a marker is not known.
     conventions
         Those that were said.
     """
-    chosen = np.unique(np.linspace(0, max(len(answers.image) - 1, 0), SAMPLE).astype(np.int64))
-    chosen = chosen[: len(answers.image)]
-    if not len(chosen):
+    known = np.isfinite(corners - truth).all(axis=(1, 2))
+    corners, truth = corners[known], truth[known]
+    if len(truth) < MIN_MARKERS:
         return []
-    image = answers.image[chosen]
-    targets = image_batch(pipeline, numbers[image]).targets
-    same = answers.marker_id[chosen, None] == targets.marker_id
-    known = same.any(axis=1) & np.isfinite(answers.corners[chosen]).all(axis=(1, 2))
-    if known.sum() < MIN_MARKERS:
-        return []
-    truth = targets.corners_px[known, same[known].argmax(axis=1)] - origins[image[known]][:, None]
-    return _of_corners(answers.corners[chosen][known], truth, conventions)
-
-
-def _of_corners(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]:
-    """Return the lines of corners (n, 4, 2) beside the truth."""
     side = side_lengths(truth).mean(axis=1)
-    orders = list(itertools.permutations(range(4)))
-    distance = np.array([
-        np.median(np.linalg.norm(corners[:, order] - truth, axis=2).mean(axis=1) / side)
+    orders = [list(order) for order in itertools.permutations(range(4))]
+    distance = [
+        float(np.median(np.linalg.norm(corners[:, order] - truth, axis=2).mean(axis=1) / side))
         for order in orders
-    ])
+    ]
     best = int(np.argmin(distance))
     lines = []
-    if orders[best] != (0, 1, 2, 3) and distance[best] < 0.2 < distance[0]:
+    if best and distance[best] < 0.2 < distance[0]:
         # corner k of the truth is corner order[k] of the answers, which they call ...
         theirs = [""] * 4
         for k, j in enumerate(orders[best]):
-            theirs[conventions.corner_order.index(CORNERS[j])] = CORNERS[k]
+            theirs[conventions.corners.index(CORNERS[j])] = CORNERS[k]
         lines.append(
             f'the corners come in the order {" ".join(theirs)}: pass --corner-order '
             f'"{" ".join(theirs)}"'
         )
-        corners = corners[:, list(orders[best])]
+        corners = corners[:, orders[best]]
     offset = np.median((corners - truth).mean(axis=1), axis=0)
     if (np.abs(np.abs(offset) - 0.5) < 0.1).all() and offset[0] * offset[1] > 0:
         center = conventions.pixel_center + round(2 * float(offset[0])) / 2
@@ -96,8 +76,6 @@ def _of_corners(corners: Floats, truth: Floats, conventions: Conventions) -> lis
 
 # --------------------------------------------------------------------------------------------------
 # Scoring of others' answers: the experiment of an export with recorded detections as detector.
-
-DOUBLED = ("refuse", "nearest")
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,79}")
 
@@ -114,34 +92,75 @@ class Scored:
         The name that its store gets.
     lines
         Lines on the content of the answers, and on likely faults of their conventions.
-    written
-        Recordings that were not there before.
     """
 
     pipeline: Pipeline
     name: str
     lines: list[str]
-    written: tuple[Path, ...] = ()
-
-    @contextlib.contextmanager
-    def withdrawn_if_refused(self) -> Iterator[None]:
-        """Remove the recordings that were written if the body refuses to score them."""
-        try:
-            yield
-        except (OtherExperimentError, ArgumentError, PipelineError):
-            _remove(self.written)
-            raise
 
 
 @dataclass(frozen=True, slots=True)
 class _Images:
-    """The images of an export: their names with an index, and keys and origins by that index."""
+    """The I images of an export.
+
+    Attributes
+    ----------
+    pipeline
+        The export's.
+    index
+        Name, without a suffix -> index.
+    keys, origins
+        (I,) keys, and (I, 2) first pixels in the frame.
+    corners
+        True corners in the image, a row each, by the image's index and the marker's ID.
+    """
 
     pipeline: Pipeline
     index: dict[str, int]
-    numbers: Integers
     keys: np.ndarray[Any, np.dtype[np.uint64]]
     origins: Integers
+    corners: pd.DataFrame
+
+    @staticmethod
+    def of(folder: Path) -> _Images:
+        """Return those of a folder: StoreError if no export was finished there."""
+        shown = plain(folder, 300)
+        if export.read_mark(folder) is None:
+            raise StoreError(
+                f"{shown}: not an export; make one with `sweep export PIPELINE {shown}`")
+        pipeline = Pipeline.from_toml(folder / export.EXPERIMENT / "pipeline.toml")
+        origin = ["origin_x_px", "origin_y_px"]
+        try:
+            table = pd.read_csv(
+                folder / "truth.csv", usecols=["image", "id", *origin, *export.CORNERS],
+                dtype=dict.fromkeys(export.CORNERS, np.float64))
+            image, names = pd.factorize(table["image"])
+            indices = pipeline.experiment.all_scenes.indices(
+                np.array([name.partition("-")[0] for name in names], dtype=np.intp))
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{shown}: truth.csv cannot be read ({plain(error)}); the same "
+                             "`sweep export` writes it") from None
+        corners = table.set_index([image, "id"])[[*export.CORNERS]]
+        return _Images(
+            pipeline, {Path(name).stem: k for k, name in enumerate(names)},
+            pipeline.experiment.image_keys(indices),
+            table.groupby(image)[origin].first().to_numpy(np.int64),
+            corners[~corners.index.duplicated()])
+
+    def truth(self, answers: Answers) -> Floats:
+        """Return the true corners (M, 4, 2) of answers; NaN of markers that are not there."""
+        at = pd.MultiIndex.from_arrays([answers.image, answers.marker_id])
+        return np.reshape(self.corners.reindex(at), (-1, 4, 2))
+
+    def recording(self, answers: Answers) -> Recording:
+        """Return answers as recorded detections: sorted by image, in pixels of the frame."""
+        order = np.argsort(self.keys[answers.image], kind="stable")
+        image = answers.image[order]
+        return Recording(
+            np.unique(self.keys), self.keys[image], answers.marker_id[order],
+            answers.corners[order] + self.origins[image][:, None], answers.rotation[order],
+            answers.translation[order],
+        )
 
 
 def prepare(
@@ -167,7 +186,7 @@ def prepare(
     conventions
         Settings of the experiment (default: the export's).
     doubled
-        "refuse" where an image has an ID twice, or "nearest".
+        "refuse" where an image has an ID twice, or "nearest": the one nearest to the truth counts.
     beside
         Whether the experiment's own detector searches the same images beside them.
     settings
@@ -178,164 +197,79 @@ def prepare(
     ArgumentError, PipelineError
         If the files cannot be read as answers; a line for each fault.
     StoreError
-        If there is no export, or the recordings cannot be written.
+        If there is no finished export, or the recordings cannot be written.
     """
-    target = Path(folder)
-    mark = read_mark(target)
-    if mark is None:
-        raise StoreError(
-            f"{plain(target, 300)}: not an export; make one with `sweep export PIPELINE "
-            f"{plain(target, 300)}`"
-        )
+    conventions = conventions or Conventions()
     labels = _labels(files, names)
-    if doubled not in DOUBLED:
-        raise ArgumentError("doubled", doubled, f"expected one of {', '.join(DOUBLED)}")
-    images = _images(target, windowed=mark.get("images") == "windows")
-    home = target / EXPERIMENT
-    recordings, lines = [], []
-    poses = True
-    corners = False
-    for path, label in zip(files, labels, strict=True):
-        source = Path(path)
-        answers = read_answers(source, images.index, conventions or Conventions(), doubled)
-        with_pose = bool(np.isfinite(answers.translation).any())
-        poses &= with_pose
-        corners |= bool(np.isfinite(answers.corners).any())
-        lines += _summary(label, answers, len(images.index), with_pose)
-        lines += [
-            f"{label}: {line}"
-            for line in hints(images.pipeline, answers, images.numbers, images.origins,
-                              conventions or Conventions())
-        ]
-        content = RECORDINGS.content(_recording(answers, images))
-        recordings.append((home / f"{label}{SUFFIX}", content))
-    written = tuple(path for path, _ in recordings if not path.exists())
-    detectors = [f"{label}{SUFFIX}" for label in labels]
-    solver = "recorded" if poses and not beside else ""
-    try:
-        for path, content in recordings:
-            _write_recording(path, content)
-        pipeline = _pipeline(home, labels[0], detectors, beside, solver, settings)
-    except SweepError:
-        _remove(written)
-        raise
-    if poses and corners and not any("solver" in each for each in settings):
-        lines.append(
-            "the poses are scored; --set solver=ippe_square scores those of the corners, "
-            "--set 'solver=[\"recorded\", \"ippe_square\"]' both"
-        )
-    return Scored(pipeline, "-".join(labels), lines, written)
-
-
-def _remove(paths: Iterable[Path]) -> None:
-    for path in paths:
-        with contextlib.suppress(OSError):
-            path.unlink()
+    images = _Images.of(Path(folder))
+    answers = [read_answers(Path(path), images.index, conventions, doubled) for path in files]
+    lines = []
+    for label, each in zip(labels, answers, strict=True):
+        lines += [f"{label}: {line}" for line in (
+            _summary(each, len(images.index)),
+            *hints(each.corners, images.truth(each), conventions))]
+    home = Path(folder) / export.EXPERIMENT
+    with translate_errors(plain(home, 300), "written"):
+        for label, each in zip(labels, answers, strict=True):
+            path, content = home / f"{label}{SUFFIX}", RECORDINGS.content(images.recording(each))
+            if path.exists() and path.read_bytes() != content:
+                raise StoreError(
+                    f"{plain(path, 300)}: holds other detections, which a store may refer to; "
+                    "choose another --name, or delete it"
+                )
+            write_whole(path, content)
+    posed = all(np.isfinite(each.translation).any() for each in answers)
+    return Scored(
+        _pipeline(images.pipeline, home, labels, beside, posed, settings), "-".join(labels), lines)
 
 
 def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:
     """Return a name for each file; ArgumentError if two are the same, or one cannot be."""
-    if not files:
-        raise ArgumentError("files", "none", "expected at least one")
-    if names and len(names) != len(files):
-        raise ArgumentError(
-            "name", ", ".join(names), f"expected one for each of the {len(files)} files"
-        )
     labels = list(names) or [
         re.sub(r"[^A-Za-z0-9._+-]", "-", Path(path).stem).lstrip("-._") or "answers"
         for path in files
     ]
-    for label in labels:
-        if not _NAME.fullmatch(label):
-            raise ArgumentError(
-                "name", repr(label), "expected letters, digits, and . _ + - between them"
-            )
-    if len(set(labels)) < len(labels):
-        raise ArgumentError("name", ", ".join(labels), "expected another name for each file")
+    if len({*labels}) != len(files) or not all(map(_NAME.fullmatch, labels)):
+        raise ArgumentError(
+            "name", ", ".join(labels), f"expected another name for each file, {len(files)} in all, "
+            "of letters, digits, and . _ + - between them")
     return labels
 
 
-def _images(folder: Path, *, windowed: bool) -> _Images:
-    """Return the images of an export, from its pipeline."""
-    pipeline = Pipeline.from_toml(folder / EXPERIMENT / "pipeline.toml")
-    index: dict[str, int] = {}
-    numbers, keys, origins = [], [], []
-    for batch in image_batches(pipeline, windowed=windowed):
-        names = batch.names
-        for row in np.flatnonzero(batch.visible).tolist():
-            index[names[row]] = len(index)
-        numbers.append(batch.numbers[batch.visible])
-        keys.append(batch.keys[batch.visible])
-        origins.append(batch.windows[batch.visible, :2])
-    return _Images(
-        pipeline, index, np.concatenate(numbers), np.concatenate(keys), np.concatenate(origins)
-    )
-
-
-def _recording(answers: Answers, images: _Images) -> Recording:
-    """Return answers as recorded detections: sorted by image, in pixels of the frame."""
-    order = np.argsort(images.keys[answers.image], kind="stable")
-    image = answers.image[order]
-    return Recording(
-        np.unique(images.keys), images.keys[image], answers.marker_id[order],
-        answers.corners[order] + images.origins[image][:, None], answers.rotation[order],
-        answers.translation[order],
-    )
-
-
-def _write_recording(path: Path, content: bytes) -> None:
-    """Write a recording; StoreError if other detections have its name, which a store may use."""
-    with write_errors(path.parent):
-        if path.exists() and path.read_bytes() != content:
-            raise StoreError(
-                f"{plain(path, 300)}: holds other detections, which a store may refer to; choose "
-                "another --name, or delete it"
-            )
-        write_whole(path, content)
-
-
-def _summary(label: str, answers: Answers, images: int, with_pose: bool) -> list[str]:
-    """Return lines on the content of answers."""
+def _summary(answers: Answers, images: int) -> str:
+    """Return a line on the content of answers."""
     decoded = int((answers.marker_id >= 0).sum())
     of_targets = int((answers.marker_id == OF_TARGET).sum())
     if not decoded + of_targets:
-        return [f"{label}: no marker: each of {images:,} images counts as searched in vain"]
+        return f"no marker: each of {images:,} images counts as searched in vain"
+    poses = f" and {of_targets:,} poses of targets" if of_targets else (
+        ", with poses" if np.isfinite(answers.translation).any() else "")
     rejected = len(answers.marker_id) - decoded - of_targets
-    apart = f" and {of_targets:,} poses of targets" if of_targets else ""
     more = f", {rejected:,} candidates not decoded" if rejected else ""
     found = len(np.unique(answers.image[answers.marker_id != REJECTED]))
-    poses = apart or (", with poses" if with_pose else "")
-    return [f"{label}: {decoded:,} markers{poses} in {found:,} of {images:,} images{more}"]
+    return f"{decoded:,} markers{poses} in {found:,} of {images:,} images{more}"
 
 
 def _pipeline(
-    home: Path, name: str, detectors: Sequence[str], beside: bool, solver: str,
+    exported: Pipeline, home: Path, labels: Sequence[str], beside: bool, posed: bool,
     settings: Sequence[str],
 ) -> Pipeline:
     """Return the export's pipeline with recorded detections in the place of its detector."""
-    path = home / "pipeline.toml"
-    exported = Pipeline.from_toml(path)
+    detectors = [f"{label}{SUFFIX}" for label in labels]
     document = tomlkit.parse(exported.text)
-    axes: Any = document.get("axes", {})
-    values: list[str] = list(detectors)
+    replaced = [exported.axis_of("detector")]
     if beside:
-        values = [*map(str, exported.values_of("detector")), *values]
+        detectors = [*map(str, exported.values_of("detector")), *detectors]
     else:
         document.pop("detector", None)
-        for axis in exported.axes_of(Stage.detection):
-            axes.pop(axis.name, None)
-    for table in ("detector", "axes"):
-        if table in document:
-            document[table].pop("detector", None)
-    if len(values) == 1:
-        document.setdefault("detector", tomlkit.table())["detector"] = values[0]
-    else:
-        document.setdefault("axes", tomlkit.table())["detector"] = values
-    if solver:
-        document.setdefault("estimator", tomlkit.table())["solver"] = solver
-        along = exported.axis_of("solver")
-        if along is not None:
-            axes.pop(along.name, None)
+        replaced += exported.axes_of(Stage.detection)
+    ours = [f"detector={json.dumps(detectors if len(detectors) > 1 else detectors[0])}"]
+    if posed and not beside:
+        replaced.append(exported.axis_of("solver"))
+        ours.append('solver="recorded"')
+    axes: Any = document.get("axes", {})
+    for name in {axis.name for axis in replaced if axis is not None} & axes.keys():
+        del axes[name]
     return Pipeline.from_text(
-        tomlkit.dumps(document), settings, name=name, source=str(path), folder=home
-    )
+        tomlkit.dumps(document), [*ours, *settings], name=labels[0],
+        source=str(home / "pipeline.toml"), folder=home)

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, StoreError
-from sweep.exchange.export import write_errors
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, FindFunction, make_detector
@@ -25,6 +24,7 @@ from sweep.model.board import Board
 from sweep.model.image_file import IMAGE_SUFFIXES, Part, decode_grey, read_image
 from sweep.photographs.pose_fit import Lens, Poses
 from sweep.store.files import write_whole
+from sweep.store.locations import translate_errors
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -390,7 +390,7 @@ def write_record(
         PHOTOGRAPH_RECORDS.content(_content(folder, part, markers, poses, home))
         for folder, part, poses in zip(found, parts, truth, strict=True)
     ]
-    with write_errors(home):
+    with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
         for record, content in zip(names, contents, strict=True):
             path = home / record

@@ -130,7 +130,7 @@ def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
         theirs.append(other)
     path = write(tmp_path / "theirs.csv", theirs)
     ready = prepare(exported, [path],
-                    conventions=Conventions.of("0.5", "TR TL BL BR", "right up out"))
+                    conventions=Conventions(0.5, "TR TL BL BR", "right up out"))
     results = results_of(ready.pipeline)
     for name in ("corner_error_px", "estimate", "translation_error_m", "flipped"):
         np.testing.assert_array_equal(ran[name], results[name], err_msg=name)
@@ -163,7 +163,7 @@ def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
             zip((*names, "tx", "ty", "tz"), map(repr, pose), strict=True))})
     path = write(tmp_path / "poses.csv", rows)
     ready = prepare(exported, [path], names=[f"poses-{form}"],
-                    conventions=Conventions.of("0", "TL TR BR BL", "right,down,in"))
+                    conventions=Conventions(0.0, "TL TR BR BL", "right,down,in"))
     results = results_of(ready.pipeline)
     assert ready.pipeline.fixed["solver"] == "recorded"
     assert (results["estimate"] == EstimateStatus.solved).all()
@@ -261,10 +261,10 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
     other = write(tmp_path / "other.csv", rows_of(good)[:3])
     with pytest.raises(StoreError, match="holds other detections, which a store may refer to"):
         prepare(exported, [other], names=["held"])
-    for wrong in (("one", "TL TR BR BL", "right up out"), ("0", "TL TL BR BL", "right up out"),
-                  ("0", "TL TR BR BL", "right up in")):
+    for wrong in ((7.0, "TL TR BR BL", "right up out"), (0.0, "TL TL BR BL", "right up out"),
+                  (0.0, "TL TR BR BL", "right up in")):
         with pytest.raises(ArgumentError, match="expected"):
-            Conventions.of(*wrong)
+            Conventions(*wrong)
 
 
 CAMERA = np.array([[180, 0, 99.5], [0, 180, 79.5], [0, 0, 1.0]])

@@ -378,7 +378,7 @@ def photos(
     >>> dict(shots.detection.sizes)  # photographs, and markers of the board
     {'trial': 3, 'marker_id': 10}
     """
-    home, name = library.folder.record_home(store)
+    home, name = library.prepare.record_home(store)
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
         name=name, overwrite=options.get("overwrite", False),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sweep.experiment import parameters, pipeline, sampling
     from sweep.fitting import folders
     from sweep.integrity import reproduction, verification
-    from sweep.photographs import folder, prepare, twins
+    from sweep.photographs import prepare, twins
     from sweep.plugins import declared
     from sweep.report import (
         comparison_tables,

@@ -64,7 +64,7 @@ def photos(
         As for `run`.
     """
     SESSION.stopped = "stopped before anything was computed"
-    home, name = library.folder.record_home(store)
+    home, name = library.prepare.record_home(store)
     prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
         name=name, overwrite=overwrite)

@@ -25,8 +25,9 @@ from sweep.messages import nearest, plain, refusal
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey, read_regular
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
+from sweep.photographs.cameras import camera_of_file, lens_of
 from sweep.photographs.folder import detect_markers
-from sweep.photographs.truth import camera_of_file, cameras_of, lens_of
+from sweep.photographs.pose_fit import cameras_of
 from sweep.typing import Floats, Integers
 
 # Columns of numbers; further ones are refused, empty cells are unknown.

@@ -31,10 +31,9 @@ from sweep.fitting.photograph_fit import (
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, is_saturated, photograph_views
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
+from sweep.measure.solver import marker_frame
 from sweep.model.board import Board
-from sweep.model.coverage import POSE
 from sweep.photographs.pose_fit import fit_pose
-from sweep.photographs.truth import marker_frames
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -806,7 +805,7 @@ def _beside_board(
     pixels = np.array([
         state.marker.corners_px + state.shifts + state.marker.frame_px for state in fit.states
     ])
-    axes, centre = marker_frames(board)[numbers[0]]
+    _, (axes, centre) = marker_frame(board.corners_m[numbers[0]])
     rotation = scenes.rotation[rows[0]] @ axes.T
     camera = taken.lens(rows[0])
     pose = fit_pose(
@@ -816,7 +815,7 @@ def _beside_board(
     if pose is None:
         return None
     explained = camera.derivatives(points.reshape(-1, 3), pose.rotation, pose.translation)[1]
-    return -pose.residuals.reshape(-1, 4, 2), np.asarray(explained.reshape(-1, POSE))
+    return -pose.residuals.reshape(-1, 4, 2), explained
 
 
 def _lines(camera: CameraFit, terms: Sequence[Term]) -> list[str]:

@@ -28,8 +28,7 @@ from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_s
 from sweep.measure.surroundings import BoardMarker, clear_modules
 from sweep.messages import notice, plain
 from sweep.model.board import Board
-from sweep.photographs.folder import name_of, setting_name
-from sweep.photographs.prepare import prepare
+from sweep.photographs.prepare import name_of, prepare, setting_name
 from sweep.photographs.twins import twin_pipeline
 from sweep.store.files import write_whole
 from sweep.store.lifecycle import open_dataset

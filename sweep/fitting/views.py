@@ -18,8 +18,7 @@ from sweep.model.image_file import photograph_image
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.model.scene import Scenes, build_scenes
-from sweep.photographs.pose_fit import Lens
-from sweep.photographs.truth import cameras_of
+from sweep.photographs.pose_fit import Lens, cameras_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from sweep.measure.flags import TruthSource
+from sweep.measure.solver import GuardedPoints
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector
-from sweep.typing import Floats, Integers, Masks
-
-# --------------------------------------------------------------------------------------------------
-# The pose of a rigid target from many points: least squares, with its covariance.
+from sweep.photographs.board_view import FoundCorners
+from sweep.typing import Floats, Masks
 
 MAX_STEPS = 20
 
@@ -26,8 +24,8 @@ OUTLIER = 4.0
 
 MIN_OUTLIER_PX = 0.5
 
-#: Standard deviation over the median absolute value, of a normal variable of mean 0.
-MAD_TO_STD = 1.4826
+#: Corners of a board, without the marker's own, from which its pose is taken for known.
+MIN_CORNERS = 6
 
 
 class Lens(NamedTuple):
@@ -48,46 +46,39 @@ class Lens(NamedTuple):
 
     def derivatives(
         self, points: Floats, rotation: Floats, translation: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return images (n, 2) and their derivatives (n, 2, 6) by the pose.
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return images (n, 2) with derivatives by the pose (2 n, 6) and by the camera (2 n, c).
 
         The pose changes by a rotation vector in the camera's frame, about the target's origin,
         and by a translation. The derivative by a point in the camera's frame is OpenCV's by the
-        translation.
+        translation. The camera's numbers are fx, fy, cx, cy and the coefficients.
         """
         turned = points @ rotation.T
         image, jacobian = cv2.projectPoints(
             np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
             self.distortion if len(self.distortion) else None,
         )
-        by_point = np.asarray(jacobian, dtype=np.float64)[:, 3:6].reshape(-1, 2, 3)
+        slopes = np.asarray(jacobian, dtype=np.float64)
+        by_point = slopes[:, 3:6].reshape(-1, 2, 3)
         by_turn = np.cross(turned[:, None, :], by_point)
-        images = np.asarray(image, dtype=np.float64).reshape(-1, 2)
-        return images, np.concatenate([by_turn, by_point], axis=2)
-
-    def camera_derivatives(
-        self, points: Floats, rotation: Floats, translation: Floats
-    ) -> Floats:
-        """Return the derivatives (2 n, c) of images (n, 2) by fx, fy, cx, cy and coefficients."""
-        _, jacobian = cv2.projectPoints(
-            np.ascontiguousarray(points @ rotation.T + translation), np.zeros(3), np.zeros(3),
-            self.matrix, self.distortion if len(self.distortion) else None,
+        return (
+            np.asarray(image, dtype=np.float64).reshape(-1, 2),
+            np.concatenate([by_turn, by_point], axis=2).reshape(-1, 6),
+            slopes[:, 6 : 10 + len(self.distortion)],
         )
-        return np.asarray(jacobian, dtype=np.float64)[:, 6 : 10 + len(self.distortion)]
-
-    def by_camera(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
-        """Return the change (6, c) of a fitted pose by the camera's numbers.
-
-        The pose is the least-squares one from the images of points (n, 3): it gives way to an
-        error of the camera as far as it can.
-        """
-        design = self.derivatives(points, rotation, translation)[1].reshape(-1, 6)
-        numbers = self.camera_derivatives(points, rotation, translation)
-        return -np.asarray(np.linalg.lstsq(design, numbers, rcond=None)[0], dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedPose:
+def cameras_of(lens: Lens, count: int) -> Cameras:
+    """Return ``count`` equal cameras as solvers take them."""
+    matrix, packed = lens.matrix, pack(tuple(lens.distortion.tolist()))
+    view = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    return Cameras(
+        np.repeat(view[None], count, axis=0), np.repeat(packed[None], count, axis=0),
+        np.full(count, bool(packed[:14].any())),
+    )
+
+
+class FittedPose(NamedTuple):
     """A fitted pose.
 
     Attributes
@@ -156,82 +147,37 @@ def fit_pose(
 def _gauss_newton(
     lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
+    """Return rotation, translation and covariance; None if the steps diverge."""
     for _ in range(MAX_STEPS):
-        image, derivatives = lens.derivatives(points, rotation, translation)
+        image, design, _ = lens.derivatives(points, rotation, translation)
         residual = (pixels - image).ravel()
-        design = derivatives.reshape(-1, 6)
-        try:
-            step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
-        except np.linalg.LinAlgError:
+        if not (np.isfinite(design).all() and np.isfinite(residual).all()):
             return None
-        if not np.isfinite(step).all():
-            return None
+        step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
         rotation = rotation_of_vector(step[None, :3])[0] @ rotation
         translation = translation + step[3:]
         if not translation[2] > 0:
             return None
-        scale = float(np.linalg.norm(translation))
-        if np.linalg.norm(step[:3]) < CONVERGED and np.linalg.norm(step[3:]) < CONVERGED * scale:
-            break
-    else:
+        shift = np.linalg.norm(step[3:]) / np.linalg.norm(translation)
+        if np.linalg.norm(step[:3]) < CONVERGED and shift < CONVERGED:
+            normal = design.T @ design
+            if np.linalg.cond(normal) > 1e18:
+                return None
+            variance = float(residual @ residual) / max(len(residual) - 6, 1)
+            return rotation, translation, np.asarray(variance * np.linalg.inv(normal), np.float64)
+    return None
+
+
+def fitted_board(lens: Lens, found: FoundCorners) -> FittedPose | None:
+    """Return a board's pose; None with too few corners."""
+    if len(found.points) < MIN_CORNERS:
         return None
-    freedom = max(len(residual) - 6, 1)
-    variance = float(residual @ residual) / freedom
-    normal = design.T @ design
-    if np.linalg.cond(normal) > 1e18:
-        return None
-    return rotation, translation, np.asarray(variance * np.linalg.inv(normal), np.float64)
-
-
-# --------------------------------------------------------------------------------------------------
-# Poses of markers in photographs, as they are gathered.
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Poses:
-    """Poses of M markers in P photographs: NaN where a marker is not there, or its pose unknown.
-
-    Attributes
-    ----------
-    rotation, translation
-        (P, M, 3, 3) and (P, M, 3) m, marker to camera.
-    std
-        (P, M, 6) standard deviations: rotation vector (rad) and position (m), camera frame.
-    source
-        (P, M) :class:`~sweep.measure.flags.TruthSource`.
-    """
-
-    rotation: Floats
-    translation: Floats
-    std: Floats
-    source: NDArray[np.uint8]
-
-    @staticmethod
-    def none(photographs: int, markers: int) -> Poses:
-        """Return no pose of any marker."""
-        grid = (photographs, markers)
-        return Poses(
-            np.full((*grid, 3, 3), np.nan), np.full((*grid, 3), np.nan),
-            np.full((*grid, 6), np.nan), np.zeros(grid, dtype=np.uint8),
-        )
-
-    def put(
-        self, photograph: int, marker: int, rotation: Floats, translation: Floats, std: Floats,
-        source: TruthSource,
-    ) -> None:
-        """Take a pose."""
-        self.rotation[photograph, marker] = rotation
-        self.translation[photograph, marker] = translation
-        self.std[photograph, marker] = std
-        self.source[photograph, marker] = source
-
-    def take(self, markers: Integers) -> Poses:
-        """Return the poses of some markers, by their indices."""
-        return Poses(
-            self.rotation[:, markers], self.translation[:, markers], self.std[:, markers],
-            self.source[:, markers],
-        )
-
-    @property
-    def known(self) -> Masks:
-        """Which poses there are, (P, M)."""
-        return np.asarray(np.isfinite(self.translation).all(axis=2))
+    guard = GuardedPoints.of(found.points, found.pixels, cameras_of(lens, 1))
+    fits = [
+        fit_pose(lens, found.points, found.pixels, *start)
+        for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE) for start in guard.poses(method)
+    ]
+    good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
+    return min(
+        good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None
+    )

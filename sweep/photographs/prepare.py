@@ -2,50 +2,49 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, StoreError
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.experiment.photographs import board_document, board_of
+from sweep.experiment.photographs import (
+    PHOTOGRAPH_RECORDS,
+    SUFFIX,
+    PhotographRecord,
+    board_document,
+    board_of,
+)
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
 from sweep.model.board import Board
 from sweep.model.image_file import Part
-from sweep.photographs.board_check import calibrate, check_board, check_resolution
+from sweep.photographs.board_view import FoundCorners, check_board, find_corners
+from sweep.photographs.cameras import (
+    KnownCamera,
+    calibrate,
+    camera_of_file,
+    check_resolution,
+    known_camera,
+    stereo_of_file,
+)
 from sweep.photographs.folder import (
     Folder,
-    FoundCorners,
-    KnownCamera,
-    Prepared,
-    WantedMarkers,
+    SeenMarkers,
     detect_markers,
-    find_corners,
-    name_of,
     named,
     read_folder,
     reference_detector,
-    setting_name,
-    write_record,
 )
-from sweep.photographs.pose_fit import Poses
-from sweep.photographs.truth import (
-    SeenMarkers,
-    board_poses,
-    camera_of_file,
-    known_camera,
-    own_poses,
-    partner_poses,
-    poses_of_file,
-    stereo_of_file,
-)
+from sweep.photographs.truth import Poses, board_poses, own_poses, partner_poses, poses_of_file
+from sweep.store.files import write_whole
+from sweep.store.locations import translate_errors
 from sweep.typing import Floats
 
 PathName = str | os.PathLike[str]
@@ -54,6 +53,47 @@ PathName = str | os.PathLike[str]
 CALIBRATE = "calibrate"
 
 
+class Prepared(NamedTuple):
+    """Photographs that are ready to be measured.
+
+    Attributes
+    ----------
+    pipeline
+        The experiment.
+    lines
+        Photographs found, left out and converted, a line each.
+    photographs, markers
+        How many there are: markers whose pose is known.
+    """
+
+    pipeline: Pipeline
+    lines: tuple[str, ...]
+    photographs: int
+    markers: int
+
+
+class WantedMarkers(NamedTuple):
+    """The markers that are looked for: dictionary, increasing IDs (M,) and sides (M,) in m.
+
+    ``board`` is the document of the board's file as JSON; empty without one.
+    """
+
+    dictionary: str
+    ids: tuple[int, ...]
+    sizes_m: Floats
+    board: str = ""
+
+
+class Side(NamedTuple):
+    """The photographs of one camera, and the true poses of their markers."""
+
+    folder: Folder
+    part: Part
+    camera: KnownCamera
+    truth: Poses
+
+
+@single_threaded()  # OpenCV's calibration is the same to the bit only then
 def prepare(
     folders: Sequence[PathName],
     camera: PathName | None = None,
@@ -96,20 +136,8 @@ def prepare(
         Says in lines what to change.
     """
     _check_arguments(folders, camera, poses, stereo)
-    with single_threaded():  # OpenCV's calibration is the same to the bit only then
-        return _prepare(
-            folders, camera, board, poses, stereo, list(settings), Path(home), name,
-            overwrite=overwrite, one_camera=one_camera,
-        )
-
-
-def _prepare(
-    folders: Sequence[PathName], camera: PathName | None, board: PathName | None,
-    poses: PathName | None, stereo: PathName | None, settings: list[str], home: Path,
-    name: str, *, overwrite: bool, one_camera: bool,
-) -> Prepared:
-    document = None if board is None else board_document(Path(board))
-    target = None if document is None else board_of(document, plain(board))
+    document = {} if board is None else board_document(Path(board))
+    target = None if board is None else board_of(document, plain(board))
     side_by_side = stereo is not None and len(folders) == 1
     parts = [Part.left, Part.right] if side_by_side else [Part.whole] * len(folders)
     where = list(folders) * 2 if side_by_side else folders
@@ -117,50 +145,68 @@ def _prepare(
     lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
     if stereo is not None:
         _check_pairs(found)
-    find, first = reference_detector(), found[0]
-    dictionary = _dictionary(target, settings)
-    detected = [
-        [detect_markers(find, each.image, dictionary) for each in folder.photographs]
-        for folder in found
-    ]
-    markers = _markers(target, settings, [ids for side in detected for ids, _ in side])
-    if target is not None and board is not None:
-        markers = dataclasses.replace(markers, board=json.dumps(document, sort_keys=True))
-        check_board(Path(board), target, [each for side in detected for each in side], find,
-                    first.photographs)
-    seen = [[_seen(markers, *each) for each in side] for side in detected]
-    corners = [] if target is None else [
-        find_corners(each.image, target, *one)
-        for each, one in zip(first.photographs, detected[0], strict=True)
+    markers, seen = _detected(target, document, board, settings, found)
+    first, corners = found[0], [] if target is None else [
+        find_corners(each.image, target, one)
+        for each, one in zip(found[0].photographs, seen[0], strict=True)
     ]
     if stereo is not None:
         rig, calibrations = stereo_of_file(str(stereo), first.size)
         cameras = [known_camera(each) for each in calibrations]
         truth = [
-            partner_poses(each, first.size, markers.sizes_m, own, partner)
-            for each, own, partner in (
-                (rig, seen[0], seen[1]), (rig.swapped(), seen[1], seen[0]),
-            )
+            partner_poses(each, first.size, markers.ids, markers.sizes_m, seen[k], seen[1 - k])
+            for k, each in enumerate((rig, rig.swapped()))
         ]
-        if one_camera:
-            found, parts, cameras, truth = found[:1], parts[:1], cameras[:1], truth[:1]
     else:
         cameras = [_camera(first, camera, corners)]
         lines += [each.line for each in cameras if each.line]
     if poses is not None:
-        given, said = poses_of_file(Path(poses), first, markers, cameras[0].lens, seen[0])
+        given, said = poses_of_file(
+            Path(poses), first, markers.ids, markers.sizes_m, cameras[0].lens, seen[0]
+        )
         truth, lines = [given], lines + said
     elif target is not None and (stereo is None or one_camera):
-        by_board, said = _poses_of_board(first, cameras[0], str(camera), target, corners)
+        by_board, said = _poses_of_board(first, cameras[0], camera, target, corners)
         truth, lines = [by_board], lines + said
     elif stereo is None:
-        truth = [own_poses(cameras[0].lens, markers.sizes_m, seen[0])]
-    lines += _summary(found, truth)
-    return write_record(
-        found, parts, cameras, markers, truth, settings, home,
-        name or name_of(Path(folders[0])), lines, overwrite=overwrite,
+        truth = [own_poses(cameras[0].lens, markers.ids, markers.sizes_m, seen[0])]
+    sides = [
+        Side(*each) for each in zip(found, parts, cameras, truth, strict=not one_camera)
+    ][: 1 if one_camera else None]
+    lines += _summary(sides)
+    pipeline = _write_record(
+        sides, markers, settings, Path(home), name or name_of(Path(folders[0])),
+        overwrite=overwrite,
     )
+    known = sum(int(each.truth.known.sum()) for each in sides)
+    return Prepared(pipeline, tuple(lines), len(first.photographs), known)
 
+
+def record_home(store: PathName | None) -> tuple[str, str]:
+    """Return the folder and the name of the record of a store: beside it, if that is a path.
+
+    >>> record_home("results/desk.zarr"), record_home("s3://bucket/desk.zarr"), record_home(None)
+    (('results', 'desk'), ('runs', 'desk'), ('runs', ''))
+    """
+    if store is None:
+        return "runs", ""
+    url = os.fspath(store).rstrip("/")
+    folder, _, last = url.rpartition("/")
+    return ("runs" if "://" in url else folder or "."), last.removesuffix(".zarr")
+
+
+def setting_name(setting: str) -> str:
+    """Return the parameter that a setting "section.key=value" or "key=value" is of."""
+    return setting.partition("=")[0].strip().rpartition(".")[2]
+
+
+def name_of(folder: Path) -> str:
+    """Return the name that a folder gives its store."""
+    return re.sub(r"[^A-Za-z0-9._+-]", "-", folder.resolve().name).strip("-._") or "photographs"
+
+
+# --------------------------------------------------------------------------------------------------
+# What is given, and what the photographs show.
 
 def _check_arguments(
     folders: Sequence[PathName], camera: PathName | None, poses: object, stereo: object
@@ -177,21 +223,17 @@ def _check_arguments(
         )
     most = 1 if stereo is None else 2
     if not 1 <= len(folders) <= most:
-        raise ArgumentError(
-            "folders", ", ".join(map(str, folders)),
-            "expected one folder" + ("" if most == 1 else ", or those of the left and the right "
-                                     "camera"),
-        )
+        expected = "one folder" + (", or those of the left and the right camera" if stereo else "")
+        raise ArgumentError("folders", ", ".join(map(str, folders)), f"expected {expected}")
 
 
 def _check_pairs(found: Sequence[Folder]) -> None:
     """Demand photographs of the same names and sizes of both cameras."""
-    names = [[each.path.name for each in folder.photographs] for folder in found]
-    odd = sorted(set(names[0]) ^ set(names[1]))
-    if odd:
+    left, right = ({each.path.name for each in folder.photographs} for folder in found)
+    if left != right:
         raise ArgumentError(
-            "folders", plain(odd[0]), "expected the same names of both cameras' photographs; it is "
-            "in one folder alone",
+            "folders", plain(min(left ^ right)), "expected the same names of both cameras' "
+            "photographs; it is in one folder alone",
         )
     if found[0].size != found[1].size:
         raise ArgumentError(
@@ -200,54 +242,45 @@ def _check_pairs(found: Sequence[Folder]) -> None:
         )
 
 
-def _dictionary(board: Board | None, settings: Sequence[str]) -> str:
-    return board.dictionary if board is not None else str(_settled(settings).fixed["dictionary"])
+def _detected(
+    board: Board | None, document: dict[str, Any], path: PathName | None, settings: Sequence[str],
+    found: Sequence[Folder],
+) -> tuple[WantedMarkers, list[list[SeenMarkers]]]:
+    """Return the markers that are looked for, and those seen in each photograph of each camera.
 
-
-def _settled(settings: Sequence[str]) -> Pipeline:
-    """Return a pipeline with settings, for the values that they give."""
-    return Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set")
-
-
-def _markers(
-    board: Board | None, settings: Sequence[str], found: Sequence[np.ndarray[Any, Any]]
-) -> WantedMarkers:
+    Refuses settings that say what the board says, and a board that is not in the photographs.
+    """
     given = {setting_name(each) for each in settings}
-    if board is not None:
-        twice = given & {"dictionary", "size_m", "marker_id"}
-        if twice:
-            raise ArgumentError(
-                "settings", min(twice), "expected none beside a board, which says it"
-            )
-        sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
-        order = np.argsort(board.marker_ids)
-        ids = tuple(board.marker_ids[k] for k in order.tolist())
-        return WantedMarkers(board.dictionary, ids, np.round(sides[order], 12))
-    if not {"dictionary", "size_m"} <= given:
+    if board is not None and (twice := given & {"dictionary", "size_m", "marker_id"}):
+        raise ArgumentError("settings", min(twice), "expected none beside a board, which says it")
+    if board is None and not {"dictionary", "size_m"} <= given:
         raise ArgumentError(
             "board", "none", "expected the file of a board, or `--set dictionary=...` and "
             "`--set size_m=...` of single markers",
         )
-    settled = _settled(settings)
-    every = sorted({each for ids in found for each in ids.tolist()})
-    ids = tuple(every)
+    fixed: dict[str, Any] = {} if board is not None else dict(
+        Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set").fixed
+    )
+    dictionary = str(fixed["dictionary"]) if board is None else board.dictionary
+    find = reference_detector()
+    seen = [
+        [detect_markers(find, each.image, dictionary) for each in folder.photographs]
+        for folder in found
+    ]
+    every = [each for side in seen for each in side]
+    if board is not None:
+        check_board(Path(str(path)), board, every, find, found[0].photographs)
+        sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
+        order, content = np.argsort(board.marker_ids), json.dumps(document, sort_keys=True)
+        ids = tuple(board.marker_ids[k] for k in order.tolist())
+        return WantedMarkers(dictionary, ids, np.round(sides[order], 12), content), seen
+    ids = tuple(sorted({each for one in every for each in one.ids.tolist()}))
     if not ids:
         raise ArgumentError(
-            "settings", f"dictionary={settled.fixed['dictionary']}",
+            "settings", f"dictionary={dictionary}",
             "no photograph shows a marker of it; give the dictionary of the markers",
         )
-    return WantedMarkers(
-        str(settled.fixed["dictionary"]), ids, np.full(len(ids), float(settled.fixed["size_m"]))
-    )
-
-
-def _seen(markers: WantedMarkers, ids: Any, quads: Floats) -> SeenMarkers:
-    """Return the detected markers that are looked for."""
-    index = {each: k for k, each in enumerate(markers.ids)}
-    known = np.array([each in index for each in ids.tolist()], dtype=bool)
-    return SeenMarkers(
-        np.array([index[each] for each in ids[known].tolist()], dtype=np.int64), quads[known]
-    )
+    return WantedMarkers(dictionary, ids, np.full(len(ids), float(fixed["size_m"]))), seen
 
 
 def _camera(
@@ -264,44 +297,38 @@ def _camera(
 
 
 def _poses_of_board(
-    folder: Folder, camera: KnownCamera, written: str, board: Board,
+    folder: Folder, camera: KnownCamera, written: PathName | None, board: Board,
     corners: Sequence[FoundCorners],
 ) -> tuple[Poses, list[str]]:
     """Return the poses of a board's markers in the order of their IDs, and a line on them."""
-    result = board_poses(board, camera.lens, folder.size, corners, camera.covariance)
-    fits = [each for each in result.boards if each is not None]
-    lines = []
-    if fits:
-        rms = float(np.median([each.rms_px for each in fits]))
-        if written not in (CALIBRATE, "None"):
-            check_resolution(written, camera.lens, folder.size, corners, rms)
-        lines.append(
-            f"board: {rms:.2f} px RMS of its corners in the median photograph"
-            + ("" if np.isnan(result.halves_ratio) else
-               "; the poses of halves of its corners differ by "
-               f"{result.halves_ratio:.2g} of what their residuals predict")
-        )
-    return result.poses.take(np.argsort(board.marker_ids)), lines
+    poses, boards, halves = board_poses(board, camera, folder.size, corners)
+    if not boards:
+        return poses, []
+    rms = float(np.median([each.rms_px for each in boards]))
+    if written is not None and str(written) != CALIBRATE:
+        check_resolution(str(written), camera.lens, folder.size, corners, rms)
+    line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
+    return poses, [line if np.isnan(halves) else (
+        f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "
+        "residuals predict"
+    )]
 
 
-def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
+def _summary(sides: Sequence[Side]) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
-    lines = []
+    truth = [each.truth for each in sides]
     known = np.concatenate([each.known for each in truth])
+    with_pose = np.array([each.known.any(axis=1) for each in truth])
+    photographs = [each.folder.photographs for each in sides]
     if not known.any():
         raise ArgumentError(
-            "folders", plain(found[0].photographs[0].path.parent, 300),
+            "folders", plain(photographs[0][0].path.parent, 300),
             "no photograph shows a whole marker whose pose is known",
         )
-    empty = [
-        each.path.name for folder, poses in zip(found, truth, strict=True)
-        for each, some in zip(
-            folder.photographs, np.asarray(poses.known.any(axis=1)).tolist(), strict=True
-        ) if not some
-    ]
-    if empty:
-        lines.append(f"no pose of a marker is known in {named(empty)}: not counted")
-    if np.any([each.known.any(axis=1) for each in truth], axis=0).sum() == 1:
+    empty = [photographs[side][k].path.name for side, k in np.argwhere(~with_pose).tolist()]
+    count = int(with_pose.any(axis=0).sum())
+    lines = [f"no pose of a marker is known in {named(empty)}: not counted"] if empty else []
+    if count == 1:
         lines.append(
             "one photograph: errors and rates have no intervals, which several photographs give"
         )
@@ -315,9 +342,75 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
             f"; median standard deviations {np.nanmedian(turn):.2g}° and "
             f"{100 * np.nanmedian(std[:, 5] / distance):.2g} % of the range"
         )
-    count = int(np.any([each.known.any(axis=1) for each in truth], axis=0).sum())
-    lines.append(
-        f"{int(known.sum()):,} markers in {count:,} "
-        f"{'photographs' if len(truth) == 1 else 'pairs of photographs'}; truth: {source}{spread}"
+    what = "photographs" if len(truth) == 1 else "pairs of photographs"
+    return [*lines, f"{int(known.sum()):,} markers in {count:,} {what}; truth: {source}{spread}"]
+
+
+# --------------------------------------------------------------------------------------------------
+# The record of photographs beside their store, and the pipeline that names it.
+
+def _write_record(
+    sides: Sequence[Side], markers: WantedMarkers, settings: Sequence[str], home: Path, name: str,
+    *, overwrite: bool,
+) -> Pipeline:
+    """Write the records, and return the experiment."""
+    names = [f"{name}{SUFFIX}"] if len(sides) == 1 else [
+        f"{name}-{side}{SUFFIX}" for side in ("left", "right")
+    ]
+    with translate_errors(plain(home, 300), "written"):
+        home.mkdir(parents=True, exist_ok=True)
+        for record, side in zip(names, sides, strict=True):
+            shots, poses = side.folder.photographs, side.truth
+            content = PHOTOGRAPH_RECORDS.content(PhotographRecord(
+                tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in shots),
+                tuple(each.digest for each in shots), side.part, *side.folder.size,
+                np.array(markers.ids, dtype=np.int64), poses.rotation, poses.translation,
+                poses.std, poses.source, markers.board,
+            ))
+            path = home / record
+            used = (home / f"{name}.zarr").exists() and path.exists()
+            if used and path.read_bytes() != content and not overwrite:
+                raise StoreError(
+                    f"{plain(path, 300)}: holds other photographs or poses, which a store may "
+                    "refer to; choose another store, or overwrite it"
+                )
+            write_whole(path, content)
+    return Pipeline.from_dict(
+        _document(sides, markers, names),
+        [each for each in settings if setting_name(each) not in ("dictionary", "size_m")],
+        name=name, source="photographs", folder=home,
     )
-    return lines
+
+
+def _document(
+    sides: Sequence[Side], markers: WantedMarkers, names: Sequence[str]
+) -> dict[str, Any]:
+    """Return the pipeline's document; ``names`` are those of the records."""
+    (width, height), shots = sides[0].folder.size, sides[0].folder.photographs
+    fx, fy, cx, cy = ("fx_px", (0, 0)), ("fy_px", (1, 1)), ("cx_px", (0, 2)), ("cy_px", (1, 2))
+    numbers = [
+        {key: float(each.camera.lens.matrix[place]) for key, place in (fx, fy, cx, cy)}
+        | {"distortion": each.camera.lens.distortion.tolist()} for each in sides
+    ]
+    camera: dict[str, Any] = {"width_px": width, "height_px": height}
+    scene, axes = dict[str, Any](), dict[str, Any](trial=len(shots))
+    if len(sides) == 1:
+        camera |= numbers[0]
+        if sides[0].camera.sd:
+            camera["calibration_sd"] = list(sides[0].camera.sd)
+        scene["photographs"] = names[0]
+    else:
+        columns = {key: [each[key] for each in numbers] for key in numbers[0]}
+        axes["stereo_camera"] = {"zip": {"photographs": list(names), **columns}}
+    marker: dict[str, Any] = {"dictionary": markers.dictionary}
+    if len(set(markers.sizes_m.tolist())) == 1:
+        marker["size_m"] = float(markers.sizes_m[0])
+        axes["marker_id"] = list(markers.ids)
+    else:
+        axes["marker"] = {
+            "zip": {"marker_id": list(markers.ids), "size_m": markers.sizes_m.tolist()}
+        }
+    return {
+        "title": f"Photographs of {plain(shots[0].path.parent.name, 150)}", "camera": camera,
+        "marker": marker, "scene": scene, "axes": axes,
+    }

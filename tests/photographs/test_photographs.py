@@ -24,11 +24,11 @@ from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
-from sweep.photographs.board_check import calibrate
-from sweep.photographs.folder import FoundCorners
+from sweep.photographs.board_view import FoundCorners
+from sweep.photographs.cameras import calibrate, camera_of_file, known_camera
 from sweep.photographs.pose_fit import Lens, fit_pose
 from sweep.photographs.prepare import prepare
-from sweep.photographs.truth import camera_of_file, known_camera, unshared_variance
+from sweep.photographs.truth import unshared_variance
 from sweep.photographs.twins import twin_pipeline
 
 

@@ -10,7 +10,7 @@ import sweep
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.pose import rotation_of_vector
-from sweep.photographs.truth import stereo_of_file
+from sweep.photographs.cameras import stereo_of_file
 
 FOLDER = os.environ.get("SWEEP_PHOTOS", "")
 

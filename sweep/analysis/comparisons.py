@@ -297,13 +297,13 @@ def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
 
     def ratio(ending: str, also: str, used: Callable[[Pair], Masks]) -> PairStatistic:
         return RootMeanSquareRatio(
-            f"{quantity.name}_rmse{ending}_ratio", f"second RMS {words} over the first{also}", "1",
-            squares, used, level)
+            f"{quantity.name}_rmse{ending}_ratio", f"second RMS {words} over the first{also}",
+            squares, used, level=level)
 
     return [
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
-             quantity.units, lambda pair: np.diff(np.sqrt(squares(pair))),
-             lambda pair: pair.both_solved, level),
+             lambda pair: np.diff(np.sqrt(squares(pair))), lambda pair: pair.both_solved,
+             units=quantity.units, level=level),
         ratio("", "", lambda pair: pair.both_solved),
         *([ratio("_unflipped", ", flipped in neither",
                  lambda pair: pair.first.unflipped & pair.second.unflipped)]
@@ -413,21 +413,21 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
              counts=(("compared", "poses that were looked for with both renderers"),
                      ("differing", "poses detected with one of both renderers only"))),
         RootMeanSquare(
-            "corner_shift_rms_px", f"RMS of a corner's coordinate {whose}", "px",
+            "corner_shift_rms_px", f"RMS of a corner's coordinate {whose}",
             lambda pair: _corner_shift(pair, corners),
-            lambda pair: pair.compared & pair.first.detected & pair.second.detected)]
+            lambda pair: pair.compared & pair.first.detected & pair.second.detected, units="px")]
     of_poses: list[PairStatistic] = [
         Mean("range_bias_percent",
-             f"mean depth error {whose}, of the true depth, both solved", "percent",
+             f"mean depth error {whose}, of the true depth, both solved",
              lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
-             lambda pair: pair.both_solved),
+             lambda pair: pair.both_solved, units=_DEPTH.units),
         RootMeanSquare(
             "rotation_shift_deg",
-            f"RMS of the rotation error {whose}, both solved and not flipped", ROTATION.units,
+            f"RMS of the rotation error {whose}, both solved and not flipped",
             lambda pair: norm_squared(np.degrees(np.subtract(
                 pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
                 dtype=np.float64)))[..., None],
-            lambda pair: pair.first.unflipped & pair.second.unflipped)]
+            lambda pair: pair.first.unflipped & pair.second.unflipped, units=ROTATION.units)]
     detections = aggregate(
         results, pairs(*DETECTION_INPUTS, corners), kept("detection"), of_detections, Pair)
     return detections.drop_vars("draws").assign(
@@ -522,7 +522,7 @@ def regressions(
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
     means: list[PairStatistic] = [
-        Mean(each.named("first"), "", each.units, functools.partial(_first_error, each),
+        Mean(each.named("first"), "", functools.partial(_first_error, each),
              lambda pair: pair.both_solved) for each in quantities]
     table = paired_table(old, new, kept, None, quantities, level, means)
     if int(table["different_scenes"].sum()):

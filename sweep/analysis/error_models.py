@@ -744,7 +744,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     inputs |= {
         HALF: (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS),
         FOCAL_SIZE: focal_size}
-    columns = Columns(arranged(results, inputs, kept)[1], SightErrors)
+    columns = Columns(arranged(results, inputs, kept)[0], SightErrors)
     found = distinct_values(columns)
     poses = math.prod(
         size for name, size in results["true_tvec_m"].sizes.items() if name != "xyz")

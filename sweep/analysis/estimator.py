@@ -15,9 +15,9 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum, IntEnum
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -138,36 +138,33 @@ class Columns(Generic[ViewT]):
             self._views[number] = view
         return self._views[number]
 
+    def joined(
+        self, function: Callable[[ViewT, slice], Sequence[NDArray[Any]]]
+    ) -> list[NDArray[Any]]:
+        """Return arrays (groups, cells, draws, ...) of all blocks.
+
+        ``function`` gives the arrays of a block's view and its groups.
+        """
+        first = function(self._view_of(0), self._blocks[0][0])
+        out = [np.empty((*self.shape[:3], *each.shape[3:]), each.dtype) for each in first]
+
+        def fill(view: ViewT, cut: tuple[slice, ...]) -> None:
+            for array, values in zip(out, function(view, cut[0]), strict=True):
+                array[cut] = values
+
+        self.map(fill)
+        return out
+
     def by_draw(
-        self, function: Callable[[ViewT, slice], tuple[NDArray[Any], ...]]
-    ) -> tuple[NDArray[Any], ...]:
+        self, function: Callable[[ViewT, slice], Sequence[NDArray[Any]]]
+    ) -> list[NDArray[Any]]:
         """Return the sums over settings (groups, cells, draws, ...) of arrays of poses.
 
         ``function`` gives arrays (groups, cells, draws, settings, ...) of a block's view and its
         groups. Sums of masks are counts, int32; all others are float64.
         """
-        out: list[NDArray[Any]] = []
-
-        def fill(view: ViewT, cut: tuple[slice, ...]) -> None:
-            for array, values in zip(out, function(view, cut[0]), strict=True):
-                array[cut] = sum_of_settings(values)
-
-        for values in function(self._view_of(0), self._blocks[0][0]):
-            kind = np.int32 if values.dtype.kind == "b" else np.float64
-            out.append(np.empty((*self.shape[:3], *values.shape[4:]), kind))
-        self.map(fill)
-        return tuple(out)
-
-    def column(self, function: Callable[[ViewT], NDArray[Any]]) -> NDArray[np.float32]:
-        """Return a number of each pose in single precision, as errors are stored."""
-        out = np.empty(self.shape, np.float32)
-
-        def fill(view: ViewT, cut: tuple[slice, ...]) -> None:
-            with np.errstate(over="ignore"):  # above 3.4e38: infinite
-                out[cut] = function(view)
-
-        self.map(fill)
-        return out
+        return self.joined(
+            lambda view, groups: [sum_of_settings(each) for each in function(view, groups)])
 
 
 def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
@@ -181,11 +178,9 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
     dtype = np.dtype(np.int32 if array.dtype.kind == "b" else np.float64)
     if not 0 < array.shape[3] < MAX_SLICES:
         return np.asarray(array.sum(axis=3, dtype=dtype))
-    total = array[:, :, :, 0].astype(dtype)
     with np.errstate(all="ignore"):  # of infinite errors of both signs it is NaN
-        for k in range(1, array.shape[3]):
-            total += array[:, :, :, k]
-    return total
+        return np.asarray(functools.reduce(
+            np.add, (array[:, :, :, k] for k in range(array.shape[3])), np.zeros((), dtype)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -531,6 +526,7 @@ class Output(NamedTuple):
     units: str
     dtype: str = "f8"
     flags: type[IntEnum] | None = None
+    dims: tuple[str, ...] = ()
 
     def attributes(self) -> dict[str, Any]:
         """Return its attributes."""
@@ -547,12 +543,29 @@ def with_interval(name: str, meaning: str, units: str) -> list[Output]:
     return [Output(f"{name}{end}", words + meaning, units) for end, words in INTERVAL.items()]
 
 
+@dataclass(frozen=True)
 class Statistic(ABC, Generic[ViewT]):
-    """A statistic of poses; generic over the view of them."""
+    """A statistic of poses; generic over the view of them.
+
+    Attributes
+    ----------
+    name, meaning, units
+        Of the variable of its value.
+    level
+        Probability with which the interval is to hold the value.
+    unseen_factor
+        Of upper ends of mean squares, as in `with_unseen_tail`.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
+    """
 
     name: str
     meaning: str
-    units: str
+    _: KW_ONLY
+    units: str = "1"
+    level: float = LEVEL
+    unseen_factor: float = UNSEEN_FACTOR
+    inputs: tuple[str, ...] = ()
 
     def outputs(self) -> Sequence[Output]:
         """Return the variables that it gives: by default a value and its interval."""
@@ -562,21 +575,13 @@ class Statistic(ABC, Generic[ViewT]):
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return `outputs`, each (groups,), of poses whose draws are of a design."""
 
-    def variables(self, columns: Columns[ViewT], design: Design) -> Variables:
-        """Return the same arrays by their names."""
-        names = (output.name for output in self.outputs())
-        return dict(zip(names, self.arrays(columns, design), strict=True))
-
 
 def guarded(statistic: Statistic[ViewT]) -> Statistic[ViewT]:
     """Return a statistic with the interval by which something is decided.
 
     Upper ends of means of squares then hold rare errors that are larger than all that was seen.
     """
-    if not hasattr(statistic, "unseen_factor"):
-        return statistic
-    return cast("Statistic[ViewT]", replace(
-        cast("Any", statistic), unseen_factor=GUARDED_UNSEEN_FACTOR))
+    return replace(statistic, unseen_factor=GUARDED_UNSEEN_FACTOR)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -590,8 +595,6 @@ class Count(Statistic[ViewT]):
     ``drawn``.
     """
 
-    name: str
-    meaning: str
     of: Callable[[ViewT], Masks]
     draws: str = ""
     drawn: str = ""
@@ -605,7 +608,7 @@ class Count(Statistic[ViewT]):
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:  # noqa: ARG002
         """Return the counts."""
-        sample = Sample(*columns.by_draw(lambda poses, _: (self.of(poses),)))
+        sample = Sample(*columns.by_draw(lambda poses, _: [self.of(poses)]))
         return [sample.n, sample.draws, sample.drawn] if self.draws else [sample.n]
 
 
@@ -619,11 +622,8 @@ class Rate(Statistic[ViewT]):
     successes are rounded outwards to whole draws. It is a little wide if the cells' rates differ.
     """
 
-    name: str
-    meaning: str
     successes: Callable[[ViewT], Masks]
     used: Callable[[ViewT], Masks]
-    level: float = LEVEL
     #: Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted.
     counts: Sequence[tuple[str, str]] = ()
     with_jeffreys: bool = False
@@ -631,38 +631,51 @@ class Rate(Statistic[ViewT]):
 
     def outputs(self) -> Sequence[Output]:
         """Return the rate, its interval, and the counts that are asked for."""
-        draws = Output("draws", "random draws that the interval is of", "1", "i8")
+        counted = [*self.counts, ("draws", "random draws that the interval is of")]
         return [
-            *(Output(name, meaning, "1", "i8") for name, meaning in self.counts),
-            *([draws] if self.counts else []),
-            *with_interval(self.name, self.meaning, "1"),
+            *(Output(*each, "1", "i8") for each in counted if self.counts),
+            *super().outputs(),
             *(with_interval(f"{self.name}_jeffreys", f"{self.meaning} (Jeffreys)", "1")[1:]
               if self.with_jeffreys else []),
         ]
 
-    def by_draw(self, columns: Columns[ViewT]) -> tuple[Integers, Integers]:
-        """Return the numbers of successes and of poses that count, (groups, cells, draws) each."""
-        def masks(poses: ViewT, _: slice) -> tuple[Masks, Masks]:
+    def worth(
+        self, columns: Columns[ViewT], design: Design, level: float
+    ) -> tuple[Sample, Integers, Integers]:
+        """Return the poses that count, the successes and the draws, (groups,), that they are worth.
+
+        ``level`` is that of the interval.
+        """
+        def masks(poses: ViewT, _: slice) -> list[Masks]:
             used = self.used(poses)
-            return self.successes(poses) & used, used
+            return [self.successes(poses) & used, used]
 
         hits, used = columns.by_draw(masks)
-        return hits, used
+        return Sample(used), Sample(hits).n, whole(design.worth(hits, used, level))
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the counts, the rate and its intervals."""
-        hits_by_draw, used = self.by_draw(columns)
-        level, sample = design.level(self.level), Sample(used)
-        n, hits = sample.n, Sample(hits_by_draw).n
-        draws = whole(design.worth(hits_by_draw, used, level))
-        fewest, most = scaled_to_draws(hits, n, draws)
+        level = design.level(self.level)
+        sample, hits, draws = self.worth(columns, design, level)
         kinds = [clopper_pearson if self.exact or design.stopped else wilson]
         ends = [np.where(sample.drawn, end, np.nan)
                 for interval in kinds + [jeffreys] * self.with_jeffreys
-                for end in (interval(fewest, draws, level)[0], interval(most, draws, level)[1])]
-        counts = [n, hits][: len(self.counts)] + [draws] * bool(self.counts)
+                for end in outward(interval, hits, sample.n, draws, level)]
+        counts = [sample.n, hits][: len(self.counts)] + [draws] * bool(self.counts)
         with np.errstate(invalid="ignore"):
-            return [*counts, hits / n, *ends]
+            return [*counts, hits / sample.n, *ends]
+
+
+def outward(
+    interval: Callable[..., tuple[Floats, Floats]], hits: Integers, n: Integers, draws: Integers,
+    level: float,
+) -> tuple[Floats, Floats]:
+    """Return the interval of ``hits`` of ``n`` poses that are worth ``draws``.
+
+    The hits are rounded to whole draws, for each end to its side.
+    """
+    fewest, most = scaled_to_draws(hits, n, draws)
+    return interval(fewest, draws, level)[0], interval(most, draws, level)[1]
 
 
 def newcombe_and_mcnemar(
@@ -679,12 +692,8 @@ def newcombe_and_mcnemar(
     n = both + first + second + neither
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = draws / np.maximum(n, 1)
-        rates, lows, highs = [], [], []
-        for hits in (both + second, both + first):
-            rates.append(hits / n)
-            fewest, most = scaled_to_draws(hits, n, draws)
-            lows.append(wilson(fewest, draws, level)[0])
-            highs.append(wilson(most, draws, level)[1])
+        rates = [(both + one) / n for one in (second, first)]
+        ends = [outward(wilson, both + one, n, draws, level) for one in (second, first)]
         margins = ((both + first) * (second + neither)).astype(np.float64) * (
             (both + second) * (first + neither))
         cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
@@ -698,8 +707,8 @@ def newcombe_and_mcnemar(
             return np.sqrt(np.maximum(squares, 0.0))
 
         difference = rates[0] - rates[1]
-        low = difference - reach(rates[0] - lows[0], highs[1] - rates[1])
-        high = difference + reach(highs[0] - rates[0], rates[1] - lows[1])
+        low = difference - reach(rates[0] - ends[0][0], ends[1][1] - rates[1])
+        high = difference + reach(ends[0][1] - rates[0], rates[1] - ends[1][0])
         _, fewer = scaled_to_draws(np.minimum(first, second), n, draws)
         discordant = np.maximum(scaled_to_draws(first + second, n, draws)[0], fewer)
         p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
@@ -751,12 +760,8 @@ class Mean(Statistic[ViewT]):
     Values that are NaN do not count.
     """
 
-    name: str
-    meaning: str
-    units: str
     values: Callable[[ViewT], Floats]
     used: Callable[[ViewT], Masks]
-    level: float = LEVEL
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the mean and its interval."""
@@ -774,7 +779,7 @@ class Mean(Statistic[ViewT]):
 
         ``centre`` is (groups, components). ``largest``: with the largest value of each draw.
         """
-        def parts(poses: ViewT, groups: slice) -> tuple[NDArray[Any], ...]:
+        def parts(poses: ViewT, groups: slice) -> Sequence[NDArray[Any]]:
             values = self.values(poses)
             missing = functools.reduce(
                 np.logical_or, (np.isnan(values[..., k]) for k in range(values.shape[-1])))
@@ -782,11 +787,11 @@ class Mean(Statistic[ViewT]):
             if centre is not None:
                 values = component_sum(
                     np.square(values - centre[groups, None, None, None]))[..., None]
-            sums = np.where(used[..., None], values, 0.0), used, poses.draws[..., None]
-            if not largest:
-                return sums
-            return *sums, np.where(used, values[..., 0], -np.inf).max(
-                axis=3, initial=-np.inf)[..., None]
+            sums = [np.where(used[..., None], values, 0.0), used, poses.draws[..., None]]
+            if largest:
+                sums.append(np.where(used, values[..., 0], -np.inf).max(
+                    axis=3, initial=-np.inf)[..., None])
+            return sums
 
         values, used, run, *largest_values = columns.by_draw(parts)
         return Sums(values, used, run > 0, *largest_values)
@@ -825,15 +830,12 @@ class RootMeanSquareRatio(Mean[ViewT]):
             return ratio, ratio / factor, ratio * factor
 
 
-@dataclass(frozen=True)
 class PositiveMean(Mean[ViewT]):
     """The mean of squares, or of other values that are not negative.
 
     Its interval is Student's of the logarithm, and the upper end also holds rare large values that
     the draws did not show (`with_unseen_tail`).
     """
-
-    unseen_factor: float = UNSEEN_FACTOR
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the mean and its interval: what may be unseen widens it for a stop, too."""
@@ -918,45 +920,32 @@ class FlipMixture(Statistic[Poses]):
     10^6 draws 0.6: there are samples without flips of populations with such a mean square.
     """
 
-    name: str
-    meaning: str
-    units: str
     squares: Callable[[Poses], Floats]
+    #: The solved poses.
+    used: Callable[[Poses], Masks]
     #: The largest error that exists, in the unit of the errors.
     bound: float
-    #: The share of flips, p.
-    flips: Rate[Poses] = FLIPS
-    level: float = LEVEL
-    #: Of the ends of u and v, as `PositiveMean` has it.
-    unseen_factor: float = UNSEEN_FACTOR
-
-    def used(self, poses: Poses) -> Masks:
-        """Return the poses that count."""
-        return poses.solved
 
     def arrays(self, columns: Columns[Poses], design: Design) -> Sequence[NDArray[Any]]:
         """Return the root mean square and its interval."""
         level = design.level(self.level)
 
         def mean(used: Callable[[Poses], Masks]) -> PositiveMean[Poses]:
-            return PositiveMean(
-                "", "", self.units, self.squares, used, unseen_factor=self.unseen_factor)
+            return PositiveMean("", "", self.squares, used, unseen_factor=self.unseen_factor)
 
         square = mean(self.used).sums(columns).mean[:, 0]
         _, u_low, u_high = mean(lambda poses: poses.unflipped).interval(columns, design, level)
         _, v_low, v_high = mean(lambda poses: poses.flipped).interval(columns, design, level)
         lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
         highs = [np.fmin(high, self.bound**2) for high in (u_high, v_high)]
-        hits, used = self.flips.by_draw(columns)
-        sample, draws = Sample(used), whole(design.worth(hits, used, self.flips.level))
-        fewest, most = scaled_to_draws(Sample(hits).n, sample.n, draws)
-        shares = (clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1])
+        sample, hits, draws = FLIPS.worth(columns, design, LEVEL)
+        shares = outward(clopper_pearson, hits, sample.n, draws, level)
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
         # Sums are rounded: the value lies in its interval.
-        interval = (square, np.fmin(low, square), np.fmax(high, square))
-        ends = [np.where(sample.drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
-        return [np.sqrt(each) for each in ends]
+        ends = [np.where(sample.drawn, each, np.nan)
+                for each in (np.fmin(low, square), np.fmax(high, square))]
+        return [np.sqrt(each) for each in (square, *ends)]
 
 
 def _first_known(first: Floats, second: Floats) -> Floats:
@@ -1027,26 +1016,27 @@ def quantile_intervals(
     """
     sample, tail = Sample(used), (1.0 - level) / 2.0
     ascending = np.sort(errors.reshape(len(errors), math.prod(errors.shape[1:])), axis=1)
-    n, draws, drawn = sample.n, sample.draws, sample.drawn
+    n, drawn, draws = sample.n, sample.drawn, np.maximum(sample.draws, 1)
+    counts, place = np.unique(draws, return_inverse=True)
     values = np.full((len(n), len(percents), 3), np.nan)
     for at, percent in enumerate(percents):
-        ranks = np.zeros((len(n), 3), dtype=np.int64)
+        ranks, share = np.zeros((len(n), 3), dtype=np.int64), percent / 100.0
         ranks[:, 0] = -(-n * percent // 100)
         if design.unit is Unit.photograph:
             value = values_at(ascending, ranks[:, :1])
             below = sum_of_settings(errors <= value.reshape(-1, 1, 1, 1))
-            worth, share = design.worth(below, used, level), percent / 100.0
+            worth = design.worth(below, used, level)
             low = special.betaincinv(share * worth, (1.0 - share) * worth + 1.0, tail)
             high = special.betaincinv(share * worth + 1.0, (1.0 - share) * worth, 1.0 - tail)
             ranks[:, 1] = np.ceil(np.nan_to_num(low) * n - ROUNDING)
             ranks[:, 2] = np.floor(np.nan_to_num(high) * n + ROUNDING) + 1
         else:
-            for count in np.unique(draws[drawn]).tolist():
-                same = (draws == count) & drawn
-                first, last = interval_ranks(count, percent, level)
-                ranks[same, 1] = first * n[same] // count
-                # One beyond the last if there is no such draw.
-                ranks[same, 2] = -(-last * n[same] // count) if last <= count else n[same] + 1
+            # The ranks of draws, from 1, beyond each of which it lies with a tail at most; 0 and
+            # one beyond the last stand for ends that the sample does not have.
+            first, last = (stats.binom.ppf(end, counts, share).astype(np.int64)[place]
+                           for end in (tail, 1.0 - tail))
+            ranks[:, 1] = first * n // draws
+            ranks[:, 2] = np.where(last < draws, -(-(last + 1) * n // draws), n + 1)
         ranks[:, 1:] = np.where(drawn[:, None], ranks[:, 1:], 0)
         values[:, at] = values_at(ascending, ranks)
     return values
@@ -1057,18 +1047,14 @@ class Quantiles(Statistic[ViewT]):
     """The quantiles of `PERCENTS` of the errors of ``used`` poses; not ``solved`` is infinite.
 
     The values of a column are in memory at once, up to `MAX_VALUES` of a group, in single precision
-    as errors are stored. Intervals: `quantile_intervals`.
+    as errors are stored. Intervals: `quantile_intervals`. The name has {} in place of the
+    statistic, such as ``rotation_{}_deg``.
     """
 
-    #: With {} in place of the statistic, such as ``rotation_{}_deg``.
-    name: str
-    meaning: str
-    units: str
     errors: Callable[[ViewT], Floats]
     solved: Callable[[ViewT], Masks]
     used: Callable[[ViewT], Masks]
     with_reason: bool = False
-    level: float = LEVEL
 
     def outputs(self) -> Sequence[Output]:
         """Return the quantiles and their intervals."""
@@ -1084,18 +1070,21 @@ class Quantiles(Statistic[ViewT]):
 
     def column(self, columns: Columns[ViewT]) -> tuple[NDArray[np.float32], Integers]:
         """Return the errors (groups, cells, draws, settings), and how many count of each draw."""
-        def values(poses: ViewT) -> Floats:
+        def values(poses: ViewT, _: slice) -> list[NDArray[np.float32]]:
             errors = self.errors(poses)
             known = self.solved(poses) & ~np.isnan(errors)
-            return np.where(self.used(poses), np.where(known, errors, np.inf), np.nan)
+            errors = np.where(self.used(poses), np.where(known, errors, np.inf), np.nan)
+            with np.errstate(over="ignore"):  # above 3.4e38: infinite
+                return [errors.astype(np.float32)]
 
         if columns.poses > MAX_VALUES:
             raise DatasetError(
                 f"quantiles of {columns.poses:,} poses at once: expected at most {MAX_VALUES:,}; "
                 "divide them: keep an axis apart (per=), or take a part of the dataset (isel) for "
                 "each condition")
-        used, = columns.by_draw(lambda poses, _: (self.used(poses),))
-        return columns.column(values), used
+        used, = columns.by_draw(lambda poses, _: [self.used(poses)])
+        errors, = columns.joined(values)
+        return errors, used
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
         """Return the quantiles, their intervals, and why these may have no ends."""
@@ -1111,23 +1100,6 @@ class Quantiles(Statistic[ViewT]):
                     [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
                     IntervalOf.given))
         return found
-
-
-@functools.lru_cache(maxsize=4096)
-def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int]:
-    """Return the ranks, from 1, between which the quantile lies.
-
-    It lies beyond each with (1 - level) / 2 at most. 0 and n + 1 stand for ends that the sample
-    does not have.
-
-    Examples
-    --------
-    >>> interval_ranks(100, 50)
-    (40, 61)
-    """
-    tail = (1.0 - level) / 2.0
-    first, last = stats.binom.ppf([tail, 1.0 - tail], n, percent / 100.0)
-    return int(first), int(last) + 1
 
 
 def draws_to_see(share: float, level: float = LEVEL) -> int:
@@ -1152,54 +1124,12 @@ Bins = Mapping[str, Sequence[float]]
 #: Prefix of the name of a binned array, among a block's arrays.
 PREFIX = "bin "
 
-
-@dataclass(frozen=True)
-class Binning:
-    """The edges (n + 1,) of the bins [low, high) of each name."""
-
-    edges: Mapping[str, Floats]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of bins of each name."""
-        return tuple(len(edges) - 1 for edges in self.edges.values())
-
-    def masks(self, values: Mapping[str, Floats]) -> Iterator[Masks]:
-        """Yield which of the binned values (...), by name, are in each combination of bins."""
-        # Of values at the last edge and beyond, and of NaN, it is the number of bins.
-        numbers = [np.searchsorted(edges, values[name], side="right") - 1
-                   for name, edges in self.edges.items()]
-        for index in np.ndindex(*self.shape):
-            yield np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
-
-    def split(self, columns: Arrays) -> Iterator[Arrays]:
-        """Yield the columns of each combination: its cells, with the mask of the poses inside."""
-        if not self.edges:
-            yield columns
-            return
-        values = {name: columns.pop(f"{PREFIX}{name}") for name in self.edges}
-        for inside in self.masks(values):
-            cells = inside.any(axis=(0, 2, 3))
-            part = {**columns, INSIDE: inside}
-            yield part if cells.all() else {name: each[:, cells] for name, each in part.items()}
-
-    def coordinates(self, results: xr.Dataset) -> dict[str, Any]:
-        """Return the coordinates of the bins: middles, lower and upper edges."""
-        coordinates: dict[str, Any] = {}
-        for name, edges in self.edges.items():
-            attributes = dict(results[name].attrs)
-            # Of a bin without an end the middle is its other end.
-            finite = np.nan_to_num(edges, neginf=edges[1], posinf=edges[-2])
-            for label, values in ((name, (finite[:-1] + finite[1:]) / 2),
-                                  (f"{name}_low", edges[:-1]), (f"{name}_high", edges[1:])):
-                coordinates[label] = (name, values, attributes)
-        return coordinates
+#: Edges (n + 1,) of the bins [low, high), by the name of what is binned.
+Edges = Mapping[str, Floats]
 
 
-def read_bins(
-    results: xr.Dataset, kept: Sequence[str], bins: Bins
-) -> tuple[Binning, dict[str, xr.DataArray]]:
-    """Return the binning, and the arrays that are binned by their names in a block.
+def read_bins(results: xr.Dataset, kept: Sequence[str], bins: Bins) -> Edges:
+    """Return the edges of bins of a dataset's variables or coordinates.
 
     Raises
     ------
@@ -1210,20 +1140,16 @@ def read_bins(
     if not isinstance(bins, Mapping):
         raise ArgumentError("bins", bins, "expected names with edges, such as "
                             '{"marker_area_px": [0, 100, 1000]}')
-    edges, arrays = {}, {}
-    for name, given in bins.items():
+    for name in bins:
         if name not in results.variables or name in kept:
             possible = [str(other) for other, variable in results.variables.items()
                         if variable.dtype.kind == "f" and other not in kept]
             raise ArgumentError("bins", name, f"no such variable; there are {', '.join(possible)}")
-        array = results[name].reset_coords(drop=True)
-        if name in results.dims:  # an index, which has no chunks
-            array = xr.DataArray(array.to_numpy(), dims=name)
+        array = results[name]
         scalar = name in results.coords and not array.dims
         if array.dtype.kind not in "fiu" or scalar or any(dim in LABELS for dim in array.dims):
             raise ArgumentError("bins", name, "expected a variable of one number for each scene")
-        edges[name], arrays[f"{PREFIX}{name}"] = _increasing(name, given), array
-    return Binning(edges), arrays
+    return {name: _increasing(name, given) for name, given in bins.items()}
 
 
 def _increasing(name: str, given: Any) -> NDArray[np.float64]:
@@ -1235,6 +1161,33 @@ def _increasing(name: str, given: Any) -> NDArray[np.float64]:
     if edges.ndim != 1 or len(edges) < 2 or not (edges[1:] > edges[:-1]).all():
         raise ArgumentError("bins", name, "expected at least two increasing edges")
     return edges
+
+
+def in_bins(columns: Arrays, edges: Edges) -> Iterator[Arrays]:
+    """Yield the columns of each combination of bins: its cells, with the mask of those inside."""
+    if not edges:
+        yield columns
+        return
+    # Of values at the last edge and beyond, and of NaN, it is the number of bins.
+    numbers = [np.searchsorted(each, columns.pop(f"{PREFIX}{name}"), side="right") - 1
+               for name, each in edges.items()]
+    for index in np.ndindex(*(len(each) - 1 for each in edges.values())):
+        inside = np.logical_and.reduce([a == b for a, b in zip(numbers, index, strict=True)])
+        cells = inside.any(axis=(0, 2, 3))
+        part = {**columns, INSIDE: inside}
+        yield part if cells.all() else {name: each[:, cells] for name, each in part.items()}
+
+
+def bin_coordinates(results: xr.Dataset, edges: Edges) -> dict[str, Any]:
+    """Return the coordinates of bins: middles, lower and upper edges."""
+    coordinates: dict[str, Any] = {}
+    for name, each in edges.items():
+        # Of a bin without an end the middle is its other end.
+        finite = np.nan_to_num(each, neginf=each[1], posinf=each[-2])
+        for label, values in ((name, (finite[:-1] + finite[1:]) / 2),
+                              (f"{name}_low", each[:-1]), (f"{name}_high", each[1:])):
+            coordinates[label] = (name, values, dict(results[name].attrs))
+    return coordinates
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1279,10 +1232,11 @@ def aggregate(
     ArgumentError
         For bins that cannot be.
     """
-    binning, binned = read_bins(results, kept, bins or {})
-    layout, columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
-    found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups)
-    for part in binning.split(columns):
+    edges = read_bins(results, kept, bins or {})
+    binned = {f"{PREFIX}{name}": results[name] for name in edges}
+    columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
+    found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups, ...)
+    for part in in_bins(columns, edges):
         groups, *rest = next(iter(part.values())).shape[:4]
         step = max(MAX_SHARED // max(math.prod(rest), 1), 1)  # groups at a time
         # One at a time: each keeps what it has computed of its poses.
@@ -1291,87 +1245,66 @@ def aggregate(
         found.append([np.concatenate(arrays) for arrays in zip(*(
             [array for statistic in statistics for array in statistic.arrays(block, design)]
             for block in blocks), strict=True)])
-    shape = (*(layout.sizes[name] for name in layout.kept), *binning.shape)
+    shape = (*(results.sizes[name] for name in kept), *(len(each) - 1 for each in edges.values()))
     outputs = [output for statistic in statistics for output in statistic.outputs()]
     variables = {
-        output.name: ((*layout.kept, *binning.edges), np.stack(arrays, axis=-1).reshape(
-            shape).astype(output.dtype), output.attributes())
+        output.name: (
+            (*kept, *edges, *output.dims), np.stack(arrays, axis=1).reshape(
+                (*shape, *arrays[0].shape[1:])).astype(output.dtype), output.attributes())
         for output, arrays in zip(outputs, zip(*found, strict=True), strict=True)}
     coordinates = {name: value.variable for name, value in results.coords.items()
                    if set(value.dims) <= set(kept) and not is_fixed(value)}
-    return xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
-
-
-def arranged(
-    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str], *,
-    stopped: bool | None = None,
-) -> tuple[Layout, Arrays, Design]:
-    """Return the layout of a dataset's dimensions, its columns in it, and the draws' design."""
-    stopped = is_sampling_stopped(results) if stopped is None else stopped
-    if stopped and (common := common_trials(results, inputs, kept)) is not None:
-        inputs = {**inputs, COMMON: common}
-    layout = Layout.of(results, inputs, kept)
-    unit = Unit.replicate if layout.order is not None else (
-        Unit.photograph if of_photographs(results) else Unit.trial)
-    points = math.prod(layout.sizes[name] for name in layout.settings)
-    return layout, {name: layout.arranged(array) for name, array in inputs.items()}, Design(
-        unit, points, stopped)
+    return xr.Dataset(variables, coordinates).assign_coords(bin_coordinates(results, edges))
 
 
 # Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the
 # other dimensions of camera, marker and pose make cells, a fixed grid; all others that are pooled
 # (effects, levels, renderers, settings of detector and estimator, and names that are no
 # parameter's) see the same draws (`sweep.experiment.draws`), so that their values together count
-# as one draw.
+# as one draw. Replicates of Sobol' points stand in the place of draws.
 
-@dataclass(frozen=True)
-class Layout:
-    """The kind of each dimension: kept, of cells, of draws, or of settings.
+def arranged(
+    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str], *,
+    stopped: bool | None = None,
+) -> tuple[Arrays, Design]:
+    """Return a dataset's columns (groups, cells, draws, settings, ...), and the draws' design."""
+    stopped = is_sampling_stopped(results) if stopped is None else stopped
+    if stopped and (common := common_trials(results, inputs, kept)) is not None:
+        inputs = {**inputs, COMMON: common}
+    sizes = {name: results.sizes[name] for name in kept}
+    for array in inputs.values():
+        sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}
+    pooled = [name for name in sizes if name not in kept]
+    draws = [name for name in pooled if name == DRAWS]
+    cells = [name for name in pooled if name != DRAWS and is_grid_axis(name, results)]
+    settings = [name for name in pooled if name not in (*cells, *draws)]
+    axes = {"groups": kept, "cells": cells, "draws": draws, "settings": settings}
+    order = replicate_order(results, draws)
+    unit = Unit.replicate if order is not None else (
+        Unit.photograph if of_photographs(results) else Unit.trial)
+    points = math.prod(sizes[name] for name in settings)
+    return ({name: _column(array, axes, sizes, order) for name, array in inputs.items()},
+            Design(unit, points, stopped))
 
-    ``order`` are the indices of the trials by replicate, if they have such: then replicates stand
-    in the place of draws.
+
+def _column(
+    array: xr.DataArray, axes: Mapping[str, Sequence[str]], sizes: Mapping[str, int],
+    order: NDArray[np.intp] | None,
+) -> NDArray[Any]:
+    """Return the values of an array along axes that are of several dimensions each.
+
+    ``order`` are the indices of the trials by replicate, if they have such.
     """
-
-    sizes: Mapping[str, int]
-    kept: tuple[str, ...]
-    cells: tuple[str, ...]
-    draws: tuple[str, ...]
-    settings: tuple[str, ...]
-    order: NDArray[np.intp] | None = None
-
-    @classmethod
-    def of(
-        cls, results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]
-    ) -> Layout:
-        """Return the layout of the dimensions of some arrays of a dataset."""
-        sizes = {name: results.sizes[name] for name in kept}
-        for array in inputs.values():
-            sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}
-        pooled = [name for name in sizes if name not in kept]
-        draws = tuple(name for name in pooled if name == DRAWS)
-        cells = tuple(
-            name for name in pooled if name != DRAWS and is_grid_axis(name, results))
-        return cls(
-            sizes, tuple(kept), cells, draws,
-            tuple(name for name in pooled if name not in (*cells, *draws)),
-            replicate_order(results, draws))
-
-    def arranged(self, array: xr.DataArray) -> NDArray[Any]:
-        """Return the values of an array as (groups, cells, draws, settings, ...)."""
-        parts = (self.kept, self.cells, self.draws, self.settings)
-        named = [*itertools.chain(*parts)]
-        inner = [str(dim) for dim in array.dims if dim not in named]
-        # Of dimensions that make an axis together an array has all, or is repeated along all.
-        own = [part if set(part) & set(array.dims) else () for part in parts]
-        dims = [*itertools.chain(*own), *inner]
-        sizes = {**self.sizes, **{name: array.sizes[name] for name in inner}}
-        variable: Any = xr.Variable(array.dims, array.to_numpy())
-        values = variable.set_dims({name: sizes[name] for name in dims}).to_numpy()
-        rest = values.shape[len(dims) - len(inner):]
-        values = values.reshape((*(math.prod(sizes[name] for name in part) for part in own), *rest))
-        shape = [math.prod(sizes[name] for name in part) for part in parts]
-        values = np.broadcast_to(values, (*shape, *rest))
-        if self.order is None:
-            return values
-        points = shape[2] // REPLICATES * shape[3]  # a replicate's points stand together
-        return values[:, :, self.order].reshape((*shape[:2], REPLICATES, points, *rest))
+    # Of dimensions that make an axis together an array has all, or is repeated along all.
+    own = {axis: part for axis, part in axes.items() if set(part) & set(array.dims)}
+    variable: Any = xr.Variable(array.dims, array.to_numpy())
+    variable = variable.set_dims(
+        dict(variable.sizes) | {name: sizes[name] for part in own.values() for name in part})
+    variable = variable.stack(own)
+    shape = {axis: math.prod(sizes[name] for name in part) for axis, part in axes.items()}
+    values: NDArray[Any] = variable.set_dims(shape | {
+        dim: size for dim, size in variable.sizes.items() if dim not in axes}).to_numpy()
+    if order is None:
+        return values
+    points = shape["draws"] // REPLICATES * shape["settings"]  # of a replicate, together
+    return values[:, :, order].reshape((*values.shape[:2], REPLICATES, points, *values.shape[4:]))

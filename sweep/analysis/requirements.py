@@ -56,7 +56,7 @@ from sweep.analysis.poses import (
     pose_arrays,
     variables_read,
 )
-from sweep.analysis.summaries import NEES_MEAN, RATIOS, PoseStatistic, quantiles_of, registered
+from sweep.analysis.summaries import NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError, PipelineError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.sampling import RequirementText, read_requirement
@@ -204,9 +204,11 @@ def requirables() -> dict[str, Requirable]:
     return {each.name: each for record in records for each in _of_record(record, quantities)}
 
 
-def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Requirable]:
-    """Return the outputs of a record that have an interval."""
-    outputs = {output.name: output for output in record.statistic.outputs()}
+def _of_record(
+    statistic: Statistic[Poses], quantities: Sequence[Quantity]
+) -> list[Requirable]:
+    """Return the outputs of a statistic that have an interval."""
+    outputs = {output.name: output for output in statistic.outputs()}
     found = []
     for name, output in outputs.items():
         if f"{name}_low" not in outputs:
@@ -215,8 +217,8 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
             name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
         percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
         found.append(Requirable(
-            output, record.statistic, record.inputs,
-            1.0 if isinstance(record.statistic, Rate) else largest, percent))
+            output, statistic, statistic.inputs,
+            1.0 if isinstance(statistic, Rate) else largest, percent))
     return found
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis.dataset import (
     DRAWS,
+    Labelled,
     axes_of,
     configuration_axes,
     describes,
@@ -23,18 +24,15 @@ from sweep.analysis.dataset import (
 )
 from sweep.analysis.estimator import (
     INTERVAL,
-    OVER_ALL,
-    PREFIX,
-    Arrays,
-    Binning,
     Bins,
     Columns,
+    Count,
     Design,
-    Layout,
     Output,
     Rate,
-    Unit,
-    Variables,
+    Statistic,
+    aggregate,
+    arranged,
     quantile_intervals,
     read_bins,
     with_interval,
@@ -45,18 +43,22 @@ from sweep.analysis.intervals import (
     resampled_quantiles,
     unit_counts,
 )
-from sweep.analysis.poses import ERROR_INPUTS, INSIDE, QUANTITIES, Poses, pose_arrays
+from sweep.analysis.poses import (
+    ERROR_INPUTS,
+    INSIDE,
+    QUANTITIES,
+    REQUIRED_VARIABLES,
+    Poses,
+    pose_arrays,
+)
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import DatasetError
-from sweep.experiment.parameters import PARAMETERS, SIMULATED, Stage
+from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
 from sweep.messages import label, shown
-from sweep.typing import Floats, Integers, Masks
+from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
-# Two datasets as units of markers: photographs with theirs, and a simulation's scenes.
-#
-# Arrays are (configurations, 1, units, rows, ...), by the names of `Poses`: a unit is drawn with
-# all its markers.
+# Two datasets whose trials are units of markers: photographs, and a simulation's scenes.
 
 #: Shares of the photographs' markers between which the default bins lie.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -65,58 +67,52 @@ SIDE = "side_px"
 
 TRUTH_STD = "truth_std"
 
+#: Dimension of the trials of a twin that are of one photograph.
+REPEAT = "repeat"
+
 SEED = 21
 
 
-@dataclass(frozen=True)
-class PairedUnits:
+class Sides(NamedTuple):
     """Photographs and a simulation with the same configurations.
 
     Attributes
     ----------
-    sides
-        Their arrays; units of the same index belong together if they are ``paired``.
-    single
-        Whether each unit of theirs has one marker.
+    datasets
+        Both; a trial is a photograph, or a scene of the simulation. Trials of the same index belong
+        together if they are ``paired``.
+    kept
+        Axes of the configurations.
+    bins
+        Edges of the bins, by name.
     paired
         Whether the simulation is the photographs' twin.
-    coordinates
-        Coordinates of the configurations by the names of their dimensions.
-    binning, bin_coordinates
-        The edges of the bins, and the bins' coordinates.
-    values
-        Binned variables of both: name -> (units, rows).
+    single
+        Whether each unit of the simulation has one marker.
     """
 
-    sides: Sequence[Arrays]
-    single: Sequence[bool]
+    datasets: tuple[xr.Dataset, xr.Dataset]
+    kept: tuple[str, ...]
+    bins: Bins
     paired: bool
-    coordinates: Mapping[str, xr.Variable]
-    binning: Binning
-    bin_coordinates: Mapping[str, Any]
-    values: Sequence[Mapping[str, Floats]]
+    single: bool
 
-    @property
-    def configurations(self) -> tuple[str, ...]:
-        """Names of the configurations' dimensions."""
-        return tuple(self.coordinates)
-
-    def within(self, inside: Sequence[Masks]) -> list[Arrays]:
-        """Return the arrays of both with the masks (units, rows) of the markers that count."""
-        return [{**side, INSIDE: mask[None, None]}
-                for side, mask in zip(self.sides, inside, strict=True)]
-
-    def bins(self) -> Iterator[tuple[Masks, ...]]:
-        """Yield which markers (units, rows) of both lie in each combination of bins."""
-        shapes = [side["detection"].shape[2:4] for side in self.sides]
-        for masks in zip(*map(self.binning.masks, self.values), strict=True):
-            yield tuple(map(np.broadcast_to, masks, shapes))
+    def poses(self) -> list[Poses]:
+        """Return the poses within the bins of both, (configurations, 1, units, markers)."""
+        found = []
+        for side in self.datasets:
+            inside = xr.DataArray(True)
+            for name, edges in self.bins.items():
+                inside = inside & (side[name] >= edges[0]) & (side[name] < edges[-1])
+            inputs = pose_arrays(side, ERROR_INPUTS) | {INSIDE: inside}
+            found.append(Poses(arranged(side, inputs, self.kept, stopped=False)[0]))
+        return found
 
 
-def paired_units(
+def matched_sides(
     photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
-) -> PairedUnits:
-    """Return photographs and a simulation as units.
+) -> Sides:
+    """Return photographs and a simulation at their common configurations.
 
     Raises
     ------
@@ -130,39 +126,28 @@ def paired_units(
         )
     for side in (photographs, simulated):
         require_poses(side)
-    paired = is_twin(simulated)
-    first, second, names = _same_configurations(photographs, simulated, paired=paired)
-    if paired:
-        for name in axes_of(first, Stage.scene):
-            if name != DRAWS and name in second.dims:
-                first, second = _common(first, second, name)
+    paired, single = is_twin(simulated), not of_photographs(simulated)
+    first, second, kept = _same_configurations(photographs, simulated, paired=paired)
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
-    binning, _ = read_bins(first, names, bins)
-    single = [not of_photographs(side) for side in (first, second)]
-    arrays = []
-    for side, one in zip((first, second), single, strict=True):
-        columns = pose_arrays(side, ERROR_INPUTS) | {
-            f"{PREFIX}{name}": _binned(side, name) for name in binning.edges}
-        if paired and side is second and TRUTH_STD in side:
-            columns[TRUTH_STD] = side[TRUTH_STD]
-        scene = [name for name in axes_of(side, Stage.scene) if name not in names]
-        scene.sort(key=lambda name: name != DRAWS)
-        units, rows = (scene, []) if one else (scene[:1], scene[1:])
-        sizes = {name: side.sizes[name] for name in (*names, *scene)}
-        layout = Layout(sizes, names, (), tuple(units), tuple(rows))
-        arrays.append({name: layout.arranged(array) for name, array in columns.items()})
+    read_bins(first, kept, bins)
+    scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
+    std = second.get(TRUTH_STD)
+    first, second = (side[list(REQUIRED_VARIABLES)].assign({
+        name: _binned(side, name) for name in bins}).drop_attrs() for side in (first, second))
     if paired:
-        trials = _trials_of(first, second)
-        kept = np.flatnonzero((trials >= 0).any(axis=1))
-        arrays = [{name: array[:, :, kept] for name, array in arrays[0].items()},
-                  {name: _gathered(array, trials[kept]) for name, array in arrays[1].items()}]
-        _blur_truth(arrays[1])
-        single = [False, False]
-    values = [{name: side.pop(f"{PREFIX}{name}")[0, 0] for name in binning.edges}
-              for side in arrays]
-    return PairedUnits(arrays, single, paired, {name: first[name].variable for name in names},
-                       binning, binning.coordinates(first), values)
+        trials = _trials_of(photographs, simulated)
+        some = np.flatnonzero((trials >= 0).any(axis=1))
+        at = xr.DataArray(trials[some], dims=(DRAWS, REPEAT))
+        first, second = first.isel({DRAWS: some}), _gathered(second, at)
+        if std is not None:
+            second = _with_uncertain_truth(second, _gathered(std, at), kept)
+    elif single and scene:
+        # Each scene counts as a photograph.
+        second = second.drop_vars(DRAWS, errors="ignore").stack(
+            unit=sorted(scene, key=lambda name: name != DRAWS), create_index=False)
+        second = second.rename(unit=DRAWS).assign_coords({PHOTOGRAPHS: ""})
+    return Sides((first, second), kept, bins, paired, single)
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -180,31 +165,25 @@ def _same_configurations(
 ) -> tuple[xr.Dataset, xr.Dataset, tuple[str, ...]]:
     """Return both at their common settings, and the names of the axes of these.
 
-    Axes of the scene that twins alone have are kept, too.
+    Twins are also at their common values of the scene; axes of it that they alone have are kept.
     """
-    names = list(dict.fromkeys([*configuration_axes(first), *configuration_axes(second)]))
+    names = [*dict.fromkeys([*configuration_axes(first), *configuration_axes(second)])]
     for name in names:
-        ours, theirs = _with_axis(first, second, name), _with_axis(second, first, name)
-        first, second = _common(ours, theirs, name)
-        if not first.sizes[name]:
+        first, second = _with_axis(first, second, name), _with_axis(second, first, name)
+    scenes = [[name for name in axes_of(side, Stage.scene) if name != DRAWS and paired]
+              for side in (first, second)]
+    common = {*names, *scenes[0]} & {*names, *scenes[1]}
+    ours, theirs = xr.align(
+        first, second, join="inner", exclude={*first.dims, *second.dims} - common)
+    for name in names:
+        if not ours.sizes[name]:
             raise DatasetError(
-                f"no common {name}: {shown(ours[name].values.tolist())} and "
-                f"{shown(theirs[name].values.tolist())}; measure both with the same settings")
-    if paired:
-        own = [name for name in axes_of(second, Stage.scene)
-               if name not in axes_of(first, Stage.scene)]
-        for name in own:
-            first = first.drop_vars(name, errors="ignore").expand_dims({name: second[name].values})
-        names += own
-    return first, second, tuple(names)
-
-
-def _common(
-    first: xr.Dataset, second: xr.Dataset, name: str
-) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return both at the values of an axis that both have."""
-    common = [each for each in first[name].values if each in second[name].values]
-    return first.sel({name: common}), second.sel({name: common})
+                f"no common {name}: {shown(first[name].values.tolist())} and "
+                f"{shown(second[name].values.tolist())}; measure both with the same settings")
+    own = [name for name in scenes[1] if name not in scenes[0]]
+    ours = ours.drop_vars(own, errors="ignore").expand_dims(
+        {name: theirs[name].values for name in own})
+    return ours, theirs, (*names, *own)
 
 
 def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
@@ -239,31 +218,26 @@ def _trials_of(first: xr.Dataset, second: xr.Dataset) -> Integers:
     return np.array([some + [-1] * (most - len(some)) for some in trials])
 
 
-def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
-    """Add the truth's random error, as far as it is known, to errors of twins.
+def _gathered(results: Labelled, trials: xr.DataArray) -> Labelled:
+    """Return the trials (photographs, repeats) of a twin; of -1 all is NaN: not run."""
+    return results.drop_vars(DRAWS, errors="ignore").isel(
+        {DRAWS: trials.clip(0)}).where(trials >= 0)
+
+
+def _with_uncertain_truth(
+    results: xr.Dataset, std: xr.DataArray, kept: Sequence[str]
+) -> xr.Dataset:
+    """Return twins whose errors have the truth's random error in them, as far as it is known.
 
     The photographs' errors are differences to a truth that has such an error, the twins' to an
     exact one. A draw is of a marker, the same for all its configurations.
     """
-    std = arrays.pop(TRUTH_STD, None)
-    if std is None:
-        return
-    drawn = np.random.default_rng(SEED).normal(size=std.shape[1:]) * np.nan_to_num(std)
-    for name, part in (("rotation_error_rad", drawn[..., :3]),
-                       ("translation_error_m", drawn[..., 3:])):
-        arrays[name] = arrays[name] + part
-
-
-def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:
-    """Return an array of trials (c, 1, t, rows, ...) as one of photographs (c, 1, p, rows, ...).
-
-    ``trials`` is (p, repeats); of -1 nothing counts, and flags are 0.
-    """
-    taken = array[:, :, np.maximum(trials, 0)]
-    absent = (trials < 0).reshape(1, 1, *trials.shape, *(1,) * (array.ndim - 3))
-    filler = np.nan if array.dtype.kind == "f" else 0
-    taken = np.where(absent, np.asarray(filler, dtype=array.dtype), taken)
-    return taken.reshape(*taken.shape[:3], -1, *array.shape[4:])
+    one = std.isel({name: 0 for name in kept if name in std.dims}, drop=True)
+    drawn = one.copy(data=np.random.default_rng(SEED).normal(size=one.shape)) * std.fillna(0.0)
+    parts = {"rotation_error_rad": slice(3), "translation_error_m": slice(3, None)}
+    return results.assign({
+        name: results[name] + drawn.isel(pose_parameter=part).rename(pose_parameter="xyz")
+        .drop_vars("xyz", errors="ignore") for name, part in parts.items()})
 
 
 def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
@@ -294,36 +268,95 @@ SOURCES = ("photographs", "simulated")
 
 PERCENTS = {"median": 50, "p90": 90}
 
-#: A photograph, or a scene of a simulation, is the draw.
-BY_PHOTOGRAPH = Design(Unit.photograph)
+
+class ComparedRate(Rate[Poses]):
+    """A rate that is compared by its difference."""
+
+    ratio = False
+
+    def gap(self, first: xr.Dataset, second: xr.Dataset) -> tuple[xr.DataArray, ...]:
+        """Return the difference of two tables' rates, with its interval."""
+        (value, low, high), (other, other_low, other_high) = (
+            [table[f"{self.name}{end}"] for end in INTERVAL] for table in (first, second))
+        gap = other - value
+        return (gap, gap - np.hypot(other - other_low, high - value),
+                gap + np.hypot(other_high - other, value - low))
 
 
 @dataclass(frozen=True)
-class Compared:
-    """A compared statistic: a rate, or a quantile of the errors (...) of solved poses.
+class SolvedQuantile(Statistic[Poses]):
+    """A quantile of the errors (...) of solved poses, with the replicates of its bootstrap.
 
-    By its ratio, or else by its difference.
+    Attributes
+    ----------
+    percent
+        Of the errors, at or below it.
+    ratio
+        Whether it is compared by its ratio, or else by its difference.
+    single
+        Whether each unit has one marker at most.
     """
 
-    name: str
-    meaning: str
-    units: str
-    rate: Rate[Poses] = DETECTION_RATE
-    error: Callable[[Poses], Floats] = QUANTITIES[0].norm
+    error: Callable[[Poses], Floats]
     percent: int = 50
     ratio: bool = False
+    single: bool = False
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the quantile with its interval, its units, and the replicates."""
+        return [*super().outputs(), Output(f"{self.name}_units", "", "1", "i8"),
+                Output(f"{self.name}_replicates", "", self.units, dims=("replicate",))]
+
+    def arrays(self, columns: Columns[Poses], design: Design) -> Sequence[NDArray[Any]]:
+        """Return these; without an interval of fewer than `MIN_UNITS` units."""
+        def solved(poses: Poses, _: slice) -> list[Floats]:
+            errors = self.error(poses)
+            return [np.where(poses.solved & np.isfinite(errors), errors, np.nan)]
+
+        errors, = columns.joined(solved)  # without cells if there is nothing
+        errors = errors.reshape(len(errors), errors.shape[2], errors.shape[1] * errors.shape[3])
+        used = ~np.isnan(errors)
+        units = used.any(axis=2).sum(axis=1)
+        interval = quantile_intervals(
+            errors[:, None], used.sum(axis=2)[:, None], [self.percent], design)[:, 0]
+        interval[units < MIN_UNITS, 1:] = np.nan
+        counts = None if self.single else unit_counts(errors.shape[1])
+        replicates = [resampled_quantiles(*each, counts, self.percent / 100.0)
+                      for each in zip(errors, used, strict=True)]
+        return [*interval.T, units, np.array(replicates)]
+
+    def gap(self, first: xr.Dataset, second: xr.Dataset) -> tuple[xr.DataArray, ...]:
+        """Return the ratio or the difference of two tables' quantiles, with its interval."""
+        compared = np.divide if self.ratio else np.subtract
+        value, replicates = (compared(second[name], first[name])
+                             for name in (self.name, f"{self.name}_replicates"))
+        units = np.minimum(first[f"{self.name}_units"], second[f"{self.name}_units"])
+        return (value, *xr.apply_ufunc(
+            percentile_interval, replicates, units, input_core_dims=[["replicate"], []],
+            output_core_dims=[[], []], vectorize=True))
 
 
-RATES = tuple(Compared(rate.name, rate.meaning, "1", rate) for rate in (DETECTION_RATE, FLIP_RATE))
+RATES = tuple(ComparedRate(each.name, each.meaning, each.successes, each.used)
+              for each in (DETECTION_RATE, FLIP_RATE))
 
-#: Compared statistics, in the order of the table.
 QUANTILES = (
-    Compared("range_bias_percent", "median depth error of the true depth, solved", "percent",
-             error=lambda poses: poses.range_percent[..., 0]),
-    *(Compared(quantity.named(statistic),
-               f"{percent} % quantile of the absolute {quantity.words}, solved", quantity.units,
-               error=quantity.norm, percent=percent, ratio=True)
+    SolvedQuantile("range_bias_percent", "median depth error of the true depth, solved",
+                   lambda poses: poses.range_percent[..., 0], units="percent"),
+    *(SolvedQuantile(
+        quantity.named(statistic), f"{percent} % quantile of the absolute {quantity.words}, solved",
+        quantity.norm, percent, ratio=True, units=quantity.units)
       for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()),
+)
+
+#: All, in the order of the table.
+GAP_STATISTICS: tuple[ComparedRate | SolvedQuantile, ...] = (*RATES, *QUANTILES)
+
+COUNTS: tuple[Statistic[Poses], ...] = (
+    Count("looked_for", "markers that were run, visible and modelled",
+          lambda poses: poses.looked_for),
+    Count("solved", "solved poses", lambda poses: poses.solved),
+    Count("units", "photographs, or simulated scenes, with a marker",
+          lambda poses: np.asarray(poses.looked_for.any(axis=(1, 3), keepdims=True))),
 )
 
 
@@ -389,85 +422,23 @@ def simulation_gap(
     >>> gap["rotation_median_deg_gap"].values.tolist(), gap["solved"].values.tolist()
     ([1.0], [[13], [13]])
     """
-    pair = paired_units(photographs, simulated, bins)
-    gaps = [_gap(pair, mask) for mask in pair.bins()]
-    shape = (*map(len, pair.coordinates.values()), *pair.binning.shape)
-    dims = (*pair.configurations, *pair.binning.edges)
-    variables: dict[str, Any] = {}
-    for name, attributes in _attributes().items():
-        values = np.stack([gap[name] for gap in gaps], axis=-1)  # (..., configurations, bins)
-        own = ("source", *dims) if values.ndim == 3 else dims
-        variables[name] = (own, values.reshape((*values.shape[:-2], *shape)), attributes)
-    return xr.Dataset(
-        variables, {**pair.coordinates, **pair.bin_coordinates, "source": list(SOURCES)},
-        {"paired": int(pair.paired)})
-
-
-def _attributes() -> dict[str, dict[str, Any]]:
-    """Return the attributes of the variables by their names, in their order."""
-    outputs = [Output("looked_for", "markers that were run, visible and modelled", "1"),
-               Output("solved", "solved poses", "1"),
-               Output("units", "photographs, or simulated scenes, with a marker", "1")]
-    for each in (*RATES, *QUANTILES):
-        gap = "simulated over photographs" if each.ratio else "simulated minus photographs"
-        outputs += with_interval(each.name, each.meaning, each.units)
-        outputs += with_interval(f"{each.name}_gap", f"{gap}: {each.meaning}",
-                                 "1" if each.ratio else each.units)
-    return {output.name: output.attributes() for output in outputs}
-
-
-def _gap(pair: PairedUnits, inside: Sequence[Masks]) -> Variables:
-    """Return the variables of one bin: (sources, configurations) or (configurations,)."""
-    arrays = pair.within(inside)
-    sides = [Poses(each) for each in arrays]
-    table: Variables = {
-        name: np.stack([getattr(side, name).sum(axis=OVER_ALL) for side in sides])
-        for name in ("looked_for", "solved")
-    }
-    table["units"] = np.stack([side.looked_for.any(axis=(1, 3)).sum(axis=1) for side in sides])
-    for each in RATES:
-        table |= _rates(each.rate, arrays)
-    counts = [None if single else unit_counts(side.looked_for.shape[2])
-              for side, single in zip(sides, pair.single, strict=True)]
-    for each in QUANTILES:
-        table |= _quantiles(each, sides, counts[:1] * 2 if pair.paired else counts)
-    return table
-
-
-def _named(name: str, interval: Sequence[Any]) -> Variables:
-    """Return a value and the ends of its interval by their names."""
-    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
-
-
-def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> Variables:
-    """Return a rate of both, its difference, and their intervals."""
-    value, low, high = map(np.stack, zip(*(
-        rate.arrays(Columns(each, Poses), BY_PHOTOGRAPH) for each in arrays), strict=True))
-    gap = value[1] - value[0]
-    return _named(rate.name, (value, low, high)) | _named(
-        f"{rate.name}_gap", (gap, gap - np.hypot(value[1] - low[1], high[0] - value[0]),
-                             gap + np.hypot(high[1] - value[1], value[0] - low[0])))
-
-
-def _quantiles(each: Compared, sides: Sequence[Poses], counts: Sequence[Any]) -> Variables:
-    """Return a quantile of both, its gap, and their intervals; ``counts`` are of the bootstrap."""
-    intervals, replicates, units = [], [], []
-    for side, drawn in zip(sides, counts, strict=True):
-        errors = each.error(side)
-        used = side.solved & np.isfinite(errors)
-        units.append(used.any(axis=(1, 3)).sum(axis=1))
-        interval = quantile_intervals(
-            np.where(used, errors, np.nan), used.sum(axis=3), [each.percent], BY_PHOTOGRAPH)[:, 0]
-        interval[units[-1] < MIN_UNITS, 1:] = np.nan
-        intervals.append(interval)
-        replicates.append(np.stack([
-            resampled_quantiles(values[0], some[0], drawn, each.percent / 100.0)
-            for values, some in zip(errors, used, strict=True)]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        compare = np.divide if each.ratio else np.subtract
-        gaps, values = compare(replicates[1], replicates[0]), np.moveaxis(
-            np.array(intervals), -1, 0)
-        ends = np.array([percentile_interval(row, least)
-                         for row, least in zip(gaps, np.minimum(*units).tolist(), strict=True)])
-        return _named(each.name, [*values]) | _named(
-            f"{each.name}_gap", (compare(values[0][1], values[0][0]), ends[:, 0], ends[:, 1]))
+    sides = matched_sides(photographs, simulated, bins)
+    tables = [
+        aggregate(side, pose_arrays(side, ERROR_INPUTS), sides.kept, [
+            *COUNTS, *RATES, *(replace(each, single=single) for each in QUANTILES)],
+            Poses, sides.bins, stopped=False)
+        for side, single in zip(sides.datasets, (False, sides.single), strict=True)]
+    tables = [table.drop_vars([name for name, value in table.coords.items() if not value.dims])
+              for table in tables]
+    gaps: dict[str, xr.DataArray] = {}
+    for each in GAP_STATISTICS:
+        words = "simulated over photographs" if each.ratio else "simulated minus photographs"
+        outputs = with_interval(f"{each.name}_gap", f"{words}: {each.meaning}",
+                                "1" if each.ratio else each.units)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gaps |= {output.name: array.assign_attrs(output.attributes())
+                     for output, array in zip(outputs, each.gap(*tables), strict=True)}
+    both = xr.concat(tables, "source", coords="minimal", compat="override", join="override")
+    return both.drop_vars([
+        f"{each.name}_{more}" for each in QUANTILES for more in ("units", "replicates")],
+    ).assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(paired=int(sides.paired))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,6 @@ from sweep.analysis.poses import (
     DEPTH,
     DEPTH_BOUND,
     DETECTION_INPUTS,
-    ERROR_INPUTS,
     ESTIMATE_INPUTS,
     QUANTITIES,
     ROTATION_BOUND,
@@ -69,35 +68,19 @@ from sweep.typing import Floats, Masks
 # --------------------------------------------------------------------------------------------------
 # How often a marker is detected, where its poses are lost, and how often a pose is mirrored.
 
-@dataclass(frozen=True)
-class PoseStatistic:
-    """A statistic of poses.
-
-    Attributes
-    ----------
-    statistic
-        What to compute.
-    inputs
-        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
-    """
-
-    statistic: Any
-    inputs: tuple[str, ...]
-
-
 LOOKED_FOR = ("looked_for", "poses that were run, visible and modelled")
 SOLVED = ("solved", "solved poses")
 FLIPPED = ("flipped", "solved poses that are nearer to the mirror of the truth")
 
 DETECTION_RATE: Rate[Poses] = Rate(
     "detection_rate", "detected of looked_for", lambda poses: poses.detected,
-    lambda poses: poses.looked_for)
+    lambda poses: poses.looked_for, inputs=DETECTION_INPUTS)
 SOLVED_RATE: Rate[Poses] = Rate(
     "solved_rate", "solved of looked_for", lambda poses: poses.solved,
-    lambda poses: poses.looked_for)
+    lambda poses: poses.looked_for, inputs=ESTIMATE_INPUTS)
 FLIP_RATE: Rate[Poses] = Rate(
     "flip_rate", "nearer to the mirror of the truth, of solved", lambda poses: poses.flipped,
-    lambda poses: poses.solved)
+    lambda poses: poses.solved, inputs=ESTIMATE_INPUTS)
 
 
 @describes
@@ -153,7 +136,7 @@ def detection_rate(
     """
     rate = replace(
         DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "detected poses")), with_jeffreys=True)
-    return _table(results, per, bins, [PoseStatistic(rate, DETECTION_INPUTS)])
+    return _table(results, per, bins, [rate])
 
 
 @describes
@@ -193,7 +176,7 @@ def flip_rate(
     [0.0, 0.231]
     """
     rate = replace(FLIP_RATE, counts=(SOLVED, FLIPPED), with_jeffreys=True)
-    return _table(results, per, bins, [PoseStatistic(rate, ESTIMATE_INPUTS)])
+    return _table(results, per, bins, [rate])
 
 
 #: Outcomes of a pose: solved, or the step at which it was lost.
@@ -256,18 +239,14 @@ def failure_composition(
     kept = kept_dimensions(results, per)
     inputs = {name: array.compute()
               for name, array in pose_arrays(results, ESTIMATE_INPUTS).items()}
-    tables = []
+    tables, shares = [], [f"share{end}" for end in INTERVAL]
     for outcome in OUTCOMES:
         ends = functools.partial(ends_as, outcome)
-        counted = outcome in outcomes(counted=True)
-        share: Rate[Poses] = Rate(
-            "share", "share of the poses looked for", ends,
-            (lambda poses: poses.looked_for) if counted else ends,
-            counts=(("of", ""), ("count", "poses that ended so")))
-        table = aggregate(results, inputs, kept, [share], Poses, bins)
-        shares = [f"share{end}" for end in INTERVAL]
-        tables.append(table[["count", *shares]] if counted else
-                      table[["count"]].assign(table[shares] * np.nan))
+        statistics: list[Statistic[Poses]] = [
+            Count("count", "poses that ended so", ends),
+            Rate("share", "share of the poses looked for", ends, lambda poses: poses.looked_for)]
+        table = aggregate(results, inputs, kept, statistics, Poses, bins)
+        tables.append(table.assign(table[shares].where(outcome in outcomes(counted=True))))
     return stacked(tables, "outcome").assign_coords(
         outcome=("outcome", list(OUTCOMES), {"long_name": "what became of the pose"}))
 
@@ -277,9 +256,6 @@ def failure_composition(
 
 #: Chance that any ID at all is called weak, or strong, if all are alike.
 SIGNIFICANCE = 0.05
-
-#: Below it the gamma distribution is normal to 1e-6, and its functions lose digits.
-MIN_SKEWNESS = 1e-6
 
 
 @describes
@@ -352,9 +328,9 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
     expected, variance, third = xr.apply_ufunc(
         hypergeometric_moments, *strata, output_core_dims=[[]] * 3)
-    sums = {name: array.sum(cells).transpose(*kept) for name, array in (
-        ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
-        ("third", third))}
+    sums = xr.Dataset({
+        "n": n, "hits": hits, "expected": expected, "variance": variance, "third": third,
+    }).sum(cells).transpose(*kept)
     # The test is of independent draws.
     drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
     p_value = xr.apply_ufunc(
@@ -363,8 +339,9 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     adjusted = xr.apply_ufunc(holm, p_value)
     expected_rate = sums["expected"] / sums["n"]
     share = table["detection_rate"] / expected_rate
-    rank = xr.apply_ufunc(
-        _rank, share, input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]])
+    rank = xr.apply_ufunc(  # equal values share the lowest
+        stats.rankdata, share, kwargs={"method": "min", "axis": -1, "nan_policy": "omit"},
+        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]]).astype(np.float64)
     below = table["detection_rate"] < expected_rate
     meanings = {
         "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),
@@ -399,152 +376,91 @@ def hypergeometric_moments(
 def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
     """Return twice the smaller tail of a sum of counts beyond its deviation from the mean.
 
-    Of the gamma distribution with that variance and third central moment, shifted to mean 0; with
-    a continuity correction of 1/2. Without skewness it is the normal distribution.
+    Of Pearson's type III with that variance and third central moment, shifted to mean 0; with a
+    continuity correction of 1/2.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        # In units in which the skewness is not negative.
-        sign = np.where(third < 0, -1.0, 1.0)
-        skewness = np.abs(third) / variance**1.5
-        shape, scale = 4.0 / skewness**2, np.sqrt(variance) * skewness / 2.0
-        upper, lower = sign * deviation - 0.5, sign * deviation + 0.5
-        symmetric = skewness < MIN_SKEWNESS
-        above = np.where(
-            symmetric, special.ndtr(-upper / np.sqrt(variance)),
-            special.gammaincc(shape, np.maximum(upper, -shape * scale) / scale + shape))
-        below = np.where(
-            symmetric, special.ndtr(lower / np.sqrt(variance)),
-            special.gammainc(shape, np.maximum(lower, -shape * scale) / scale + shape))
-    p_value = np.minimum(1.0, 2.0 * np.minimum(above, below))
-    return np.where(variance > 0, p_value, 1.0)
+        shape = third / variance**1.5, 0.0, np.sqrt(variance)
+        tail = np.minimum(stats.pearson3.sf(deviation - 0.5, *shape),
+                          stats.pearson3.cdf(deviation + 0.5, *shape))
+    return np.where(variance > 0, np.minimum(1.0, 2.0 * tail), 1.0)
 
 
 def holm(p_values: Floats) -> Floats:
     """Return p-values corrected for the number of those that are not NaN."""
     flat = p_values.ravel()
     order = np.argsort(flat)  # NaN last
-    count = int((~np.isnan(flat)).sum())
-    factors = np.arange(count, 0, -1)
-    adjusted = np.full(flat.shape, np.nan)
-    stepped = np.maximum.accumulate(np.minimum(1.0, flat[order[:count]] * factors))
-    adjusted[order[:count]] = stepped
+    factors = np.count_nonzero(~np.isnan(flat)) - np.arange(flat.size)
+    adjusted = np.empty(flat.shape)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, flat[order] * factors))
     return adjusted.reshape(p_values.shape)
-
-
-def _rank(share: Floats) -> Floats:
-    """Return the ranks along the last axis, from 1; equal values share the lowest, NaN has NaN."""
-    ranks = stats.rankdata(np.nan_to_num(share, nan=np.inf), method="min", axis=-1)
-    return np.where(np.isnan(share), np.nan, ranks)
 
 
 # --------------------------------------------------------------------------------------------------
 # The statistics of `sweep.analysis.error_statistics`, a record each.
-#
-# A new record here is all that a new statistic needs: the table of `error_statistics`, the
-# attributes of its variables and the report's table of errors follow from it.
 
-@dataclass(frozen=True)
-class ErrorStatistic:
-    """A statistic of each kind of error.
+#: What a table calls a statistic of errors -> its part of the variables' names, ``rmse`` of
+#: ``rotation_rmse_deg``.
+ERROR_HEADINGS = {
+    "median (not solved: infinite)": "median", "95 % quantile (p95)": "p95",
+    "99 % quantile (p99)": "p99", "RMSE of the solved": "rmse",
+    "RMSE without flips": "rmse_unflipped", "bias without flips": "bias",
+    "standard deviation without flips": "sd",
+}
 
-    Attributes
-    ----------
-    headings
-        The statistic's part of its variables' names (``rmse`` of ``rotation_rmse_deg``), with
-        what a table calls it; one, or more that are computed together.
-    make
-        Returns the statistic of a kind of error; its variables have the names
-        ``quantity.named("rmse")``.
-    inputs
-        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`, beside
-        those that the kind of error reads.
-    of_signed
-        Whether it is computed of the errors along axes and about angles, `SIGNED`, too.
-    """
-
-    headings: Mapping[str, str]
-    make: Callable[[Quantity], Statistic[Poses]]
-    inputs: tuple[str, ...] = field(default=ERROR_INPUTS)
-    of_signed: bool = False
-
-
-def _bias(quantity: Quantity) -> Statistic[Poses]:
-    """Return the mean error: signed if the error is, else the mean vector's length."""
-    mean, of = (Mean, "mean") if quantity.signed else (MeanLength, "length of the mean")
-    return mean(quantity.named("bias"), f"{of} {quantity.words}, solved and not flipped",
-                quantity.units, quantity.vector, lambda poses: poses.unflipped)
-
-
-def _root_mean_square(quantity: Quantity) -> Statistic[Poses]:
-    """Return the RMSE of the solved: of a rotation flips make most, and it is bounded."""
-    labels = quantity.named("rmse"), f"RMS {quantity.words}, solved", quantity.units
-    if quantity.bound is not None:
-        return FlipMixture(*labels, quantity.squares, quantity.bound)
-    return RootMeanSquare(*labels, quantity.squares, lambda poses: poses.solved)
-
-
-#: Counts of the poses.
-POSE_STATISTICS: tuple[PoseStatistic, ...] = (
-    PoseStatistic(Count(*LOOKED_FOR, lambda poses: poses.looked_for), DETECTION_INPUTS),
-    PoseStatistic(Count(*SOLVED, lambda poses: poses.solved), ESTIMATE_INPUTS),
-    PoseStatistic(DETECTION_RATE, DETECTION_INPUTS), PoseStatistic(SOLVED_RATE, ESTIMATE_INPUTS),
-    PoseStatistic(FLIP_RATE, ESTIMATE_INPUTS),
+#: Counts and rates of the poses.
+POSE_STATISTICS: tuple[Statistic[Poses], ...] = (
+    Count(*LOOKED_FOR, lambda poses: poses.looked_for, inputs=DETECTION_INPUTS),
+    Count(*SOLVED, lambda poses: poses.solved, inputs=ESTIMATE_INPUTS),
+    DETECTION_RATE, SOLVED_RATE, FLIP_RATE,
 )
 
-#: Quantiles of absolute errors, which take a second pass over the poses.
-QUANTILES = ErrorStatistic(
-    {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
-     "p99": "99 % quantile (p99)"},
-    lambda quantity: Quantiles(
-        quantity.named("{}"), f"absolute {quantity.words}", quantity.units, quantity.norm,
+
+def quantiles_of(quantity: Quantity) -> Statistic[Poses]:
+    """Return the quantiles of a kind of error, also of one with a sign: of the absolute values."""
+    return Quantiles(
+        quantity.named("{}"), f"absolute {quantity.words}", quantity.norm,
         lambda poses: poses.solved, lambda poses: poses.looked_for,
         # Why an end is missing is the same for all kinds of error.
-        with_reason=quantity is QUANTITIES[0]))
-
-#: Statistics of each kind of error; for `SIGNED` kinds only where it says so.
-ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
-    QUANTILES,
-    ErrorStatistic(
-        {"rmse": "RMSE of the solved"}, _root_mean_square),
-    ErrorStatistic(
-        {"rmse_unflipped": "RMSE without flips"},
-        lambda quantity: RootMeanSquare(
-            quantity.named("rmse_unflipped"), f"RMS {quantity.words}, solved and not flipped",
-            quantity.units, quantity.squares, lambda poses: poses.unflipped)),
-    ErrorStatistic({"bias": "bias without flips"}, _bias, of_signed=True),
-    ErrorStatistic(
-        {"sd": "standard deviation without flips"},
-        lambda quantity: StandardDeviation(
-            quantity.named("sd"),
-            f"standard deviation of the {quantity.words}, solved and not flipped",
-            quantity.units, quantity.vector, lambda poses: poses.unflipped),
-        of_signed=True),
-)
+        with_reason=quantity is QUANTITIES[0], units=quantity.units, inputs=quantity.inputs)
 
 
-def quantiles_of(quantity: Quantity) -> PoseStatistic:
-    """Return the quantiles of a kind of error, also of one with a sign: of the absolute values."""
-    return PoseStatistic(QUANTILES.make(quantity), (*QUANTILES.inputs, *quantity.inputs))
+def statistics_of(quantity: Quantity) -> list[Statistic[Poses]]:
+    """Return the statistics of a kind of error; of `SIGNED` ones the last two."""
+    words = quantity.words
+    described: dict[str, Any] = {"units": quantity.units, "inputs": quantity.inputs}
+
+    def solved(poses: Poses) -> Masks:
+        return poses.solved
+
+    def unflipped(poses: Poses) -> Masks:
+        return poses.unflipped
+
+    # A mean error is signed if the error is, else it is the mean vector's length. Flips make most
+    # of a rotation's RMSE, and it is bounded.
+    mean, of = (Mean, "mean") if quantity.signed else (MeanLength, "length of the mean")
+    square: Callable[..., Statistic[Poses]] = RootMeanSquare if quantity.bound is None else (
+        functools.partial(FlipMixture, bound=quantity.bound))
+    return [
+        *([] if quantity not in QUANTITIES else [
+            quantiles_of(quantity),
+            square(quantity.named("rmse"), f"RMS {words}, solved", quantity.squares, solved,
+                   **described),
+            RootMeanSquare(
+                quantity.named("rmse_unflipped"), f"RMS {words}, solved and not flipped",
+                quantity.squares, unflipped, **described)]),
+        mean(quantity.named("bias"), f"{of} {words}, solved and not flipped", quantity.vector,
+             unflipped, **described),
+        StandardDeviation(
+            quantity.named("sd"), f"standard deviation of the {words}, solved and not flipped",
+            quantity.vector, unflipped, **described),
+    ]
 
 
-def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[PoseStatistic]:
+def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[Statistic[Poses]]:
     """Return all statistics, with the ones of some kinds of error."""
     return [*POSE_STATISTICS, *(
-        PoseStatistic(record.make(quantity), (*record.inputs, *quantity.inputs))
-        for quantity in quantities for record in ERROR_STATISTICS
-        if quantity in QUANTITIES or record.of_signed)]
-
-
-def error_headings() -> dict[str, str]:
-    """Return the names of the statistics of errors by what a table calls them.
-
-    Examples
-    --------
-    >>> error_headings()["bias without flips"]
-    'bias'
-    """
-    return {heading: name for record in ERROR_STATISTICS
-            for name, heading in record.headings.items()}
+        statistic for quantity in quantities for statistic in statistics_of(quantity))]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -645,18 +561,17 @@ def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr
     Upper ends of root mean squares and standard deviations hold rare errors that no draw showed, as
     those of requirements do (`sweep.analysis.estimator.with_unseen_tail`).
     """
-    return _table(results, per, None, [
-        replace(record, statistic=guarded(record.statistic)) for record in registered()])
+    return _table(results, per, None, [*map(guarded, registered())])
 
 
 def _table(
-    results: xr.Dataset, per: Sequence[str], bins: Bins | None, records: Sequence[PoseStatistic],
+    results: xr.Dataset, per: Sequence[str], bins: Bins | None,
+    statistics: Sequence[Statistic[Poses]],
 ) -> xr.Dataset:
-    """Return the statistics of some records, (*per, *bins)."""
+    """Return some statistics, (*per, *bins)."""
     kept = kept_dimensions(results, per)
-    inputs = pose_arrays(results, [name for record in records for name in record.inputs])
-    return aggregate(
-        results, inputs, kept, [record.statistic for record in records], Poses, bins)
+    inputs = pose_arrays(results, [name for each in statistics for name in each.inputs])
+    return aggregate(results, inputs, kept, statistics, Poses, bins)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -678,18 +593,14 @@ def _with_nees(poses: Poses) -> Masks:
 
 
 #: The mean of ``nees``.
-NEES_MEAN = PoseStatistic(
-    PositiveMean("nees_mean", "mean normalised estimation error squared, expected 6", "1",
-                 lambda poses: _nees(poses)[..., None], _with_nees),
-    (*ESTIMATE_INPUTS, "nees"))
+NEES_MEAN: Statistic[Poses] = PositiveMean(
+    "nees_mean", "mean normalised estimation error squared, expected 6",
+    lambda poses: _nees(poses)[..., None], _with_nees, inputs=(*ESTIMATE_INPUTS, "nees"))
 
 
 @describes
 def covariance_trust(
-    results: xr.Dataset,
-    per: Sequence[str] = (),
-    levels: Sequence[float] = (0.5, 0.9, 0.99),
-    scale: xr.DataArray | None = None,
+    results: xr.Dataset, per: Sequence[str] = (), levels: Sequence[float] = (0.5, 0.9, 0.99),
 ) -> xr.Dataset:
     """Return whether the estimates' own covariances describe their errors.
 
@@ -702,9 +613,6 @@ def covariance_trust(
         Dimensions that are kept; all others are pooled.
     levels
         Probabilities of the covariance's regions, between 0 and 1.
-    scale
-        Factors of ``nees``, with axes of the dataset (the kept ones, as a rule) and their
-        coordinates: with 1/k² the assumed corner noise becomes k times as large.
 
     Returns
     -------
@@ -723,8 +631,7 @@ def covariance_trust(
     Raises
     ------
     ArgumentError
-        For a dimension that does not exist, a level outside (0, 1), and a ``scale`` whose
-        coordinates differ from the dataset's.
+        For a dimension that does not exist, and a level outside (0, 1).
     DatasetError
         As in `sweep.analysis.detection_rate`.
 
@@ -749,13 +656,11 @@ def covariance_trust(
     if not (nominal.size and ((nominal > 0.0) & (nominal < 1.0)).all()):
         raise ArgumentError("levels", levels, "expected numbers between 0 and 1")
     kept = kept_dimensions(results, per)
-    nees = results.get("nees", xr.DataArray(np.nan))
-    if scale is not None:
-        nees = _scaled(results, nees, scale)
     limits = special.chdtri(len(POSE_PARAMETERS), 1.0 - nominal).tolist()
-    inputs = {name: array.compute() for name, array in (
-        pose_arrays(results, ESTIMATE_INPUTS) | {"nees": nees}).items()}
-    table = aggregate(results, inputs, kept, [NEES_MEAN.statistic], Poses)
+    arrays = pose_arrays(results, ESTIMATE_INPUTS) | {
+        "nees": results.get("nees", xr.DataArray(np.nan))}
+    inputs = {name: array.compute() for name, array in arrays.items()}
+    table = aggregate(results, inputs, kept, [NEES_MEAN], Poses)
     at_levels = stacked([
         aggregate(results, inputs, kept, _within(limit, len(limits)), Poses) for limit in limits],
         "level").assign_coords(level=("level", nominal, {
@@ -770,20 +675,6 @@ def covariance_trust(
         at_levels[[f"covariance_coverage{end}" for end in INTERVAL]])
 
 
-def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.DataArray:
-    """Return ``nees`` times ``scale``, if their coordinates agree."""
-    described, axes = f"array over {', '.join(map(str, scale.dims))}", axes_of(results)
-    if not set(scale.dims) <= set(axes):
-        raise ArgumentError("scale", described,
-                            f"no such dimension; there are {', '.join(axes) or 'none'}")
-    try:
-        nees, scale = xr.align(nees, scale, join="exact")
-    except ValueError as error:
-        raise ArgumentError(
-            "scale", described, "expected the dataset's coordinates") from error
-    return nees * scale
-
-
 def _within(limit: float, levels: int) -> list[Statistic[Poses]]:
     """Return the share below a limit, with its interval and one of several levels together."""
     def within(poses: Poses) -> Masks:
@@ -793,7 +684,7 @@ def _within(limit: float, levels: int) -> list[Statistic[Poses]]:
     return [
         Rate("covariance_coverage", words, within, _with_nees, counts=(
             ("nees_count", "estimates with a normalised estimation error squared"), ("hits", ""))),
-        Rate("joint", "", within, _with_nees, 1.0 - (1.0 - LEVEL) / levels)]
+        Rate("joint", "", within, _with_nees, level=1.0 - (1.0 - LEVEL) / levels)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -862,23 +753,22 @@ class BoundRatio(RootMeanSquare[Poses]):
         The squared bounds (...) of poses.
     """
 
-    bound: Callable[[Poses], Floats] = field(kw_only=True)
+    bound: Callable[[Poses], Floats]
 
     def interval(self, columns: Columns[Poses], design: Design, level: float) -> Interval:
         """Return the ratio; its interval is the error's."""
         value, low, high = super().interval(columns, design, level)
-        squares: Mean[Poses] = Mean(
-            "", "", "", lambda poses: self.bound(poses)[..., None], self.used)
+        squares: Mean[Poses] = Mean("", "", lambda poses: self.bound(poses)[..., None], self.used)
         with np.errstate(divide="ignore", invalid="ignore"):
             bound = np.sqrt(squares.sums(columns).mean[:, 0])
             return bound / value, bound / high, bound / low
 
 
-def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> PoseStatistic:
-    return PoseStatistic(BoundRatio(
+def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> Statistic[Poses]:
+    return BoundRatio(
         f"{quantity.name}_efficiency",
-        f"RMS bound over RMS {quantity.words}, solved and not flipped", "1", quantity.squares,
-        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound=bound), BOUND_INPUTS)
+        f"RMS bound over RMS {quantity.words}, solved and not flipped", quantity.squares,
+        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound, inputs=BOUND_INPUTS)
 
 
 #: Of the rotation and of the depth.

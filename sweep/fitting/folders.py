@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import simulation_gap
-from sweep.analysis.simulation_gaps import QUANTILES, RATES
+from sweep.analysis.simulation_gaps import GAP_STATISTICS
 from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document
@@ -111,7 +111,7 @@ def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
     Of ratios the logarithms count. NaN if nothing has an interval.
     """
     sizes = []
-    for each in (*RATES, *QUANTILES):
+    for each in GAP_STATISTICS:
         value, low, high = (
             np.asarray(source[f"{each.name}_gap{end}"].values, dtype=np.float64)
             for source, end in ((gap, ""), (widths, "_low"), (widths, "_high"))

@@ -10,8 +10,15 @@ import xarray as xr
 
 from sweep.analysis.dataset import each_cell
 from sweep.analysis.estimator import Bins
-from sweep.analysis.poses import QUANTITIES, Poses
-from sweep.analysis.simulation_gaps import QUANTILES, RATES, SOURCES, Compared, paired_units
+from sweep.analysis.poses import QUANTITIES
+from sweep.analysis.simulation_gaps import (
+    GAP_STATISTICS,
+    RATES,
+    SOURCES,
+    ComparedRate,
+    SolvedQuantile,
+    matched_sides,
+)
 from sweep.report.figure import Figure
 from sweep.report.table import (
     Column,
@@ -47,7 +54,7 @@ def gap_table(gap: xr.Dataset) -> Table:
             Value(_scale(each) * float(one[each.name].sel(source=source))) for source in SOURCES),
          "ratio" if each.ratio else "difference",
          Column("", f"{each.name}_gap", 1.0 if each.ratio else _scale(each)).cells(one)[0]]
-        for each in (*RATES, *QUANTILES)
+        for each in GAP_STATISTICS
         for group, (_, one) in zip(groups, each_cell(gap, dims), strict=True)]
     return Table.of(
         "Photographs and simulation, with 95 % intervals of the gap: the difference, or the ratio",
@@ -70,7 +77,7 @@ def gap_lines(gap: xr.Dataset) -> list[str]:
     return lines
 
 
-def _scale(each: Compared) -> float:
+def _scale(each: ComparedRate | SolvedQuantile) -> float:
     return 100.0 if each in RATES else 1.0
 
 
@@ -91,11 +98,10 @@ def gap_figures(
     For each configuration the distribution functions of the rotation error and of the depth error
     of all solved poses; of a simulation that is compared in bins, those within the bins.
     """
-    pair = paired_units(photographs, simulated, bins)
-    inside = [np.logical_or.reduce(masks) for masks in zip(*pair.bins(), strict=True)]
-    sides = [Poses(arrays) for arrays in pair.within(inside)]
-    values = ([f"{name} {coordinate(each)}" for each in pair.coordinates[name].values.tolist()]
-              for name in pair.configurations)
+    matched = matched_sides(photographs, simulated, bins)
+    sides = matched.poses()
+    values = ([f"{name} {coordinate(each)}" for each in matched.datasets[0][name].values.tolist()]
+              for name in matched.kept)
     names = [", ".join(each) or "all markers" for each in itertools.product(*values)]
     figures = []
     for heading, errors_of in (

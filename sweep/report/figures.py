@@ -25,7 +25,7 @@ from sweep.analysis.dataset import of_photographs
 from sweep.analysis.decisions import Reached
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS
-from sweep.analysis.summaries import error_headings
+from sweep.analysis.summaries import ERROR_HEADINGS
 from sweep.experiment.experiment import used_settings
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
@@ -493,7 +493,7 @@ def errors_table(errors: xr.Dataset, name: str) -> Table:
             Column("", variable).cells(errors)[0] if variable in errors else None
             for quantity, (_, unit) in QUANTITIES.items()
             for variable in [f"{quantity}_{statistic}_{unit}"])]
-        for heading, statistic in error_headings().items()]
+        for heading, statistic in ERROR_HEADINGS.items()]
     headings = [f"{words}, {'%' if unit == 'percent' else unit}"
                 for words, unit in QUANTITIES.values()]
     whose = f", with {name}" if name else ""

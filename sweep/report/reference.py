@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from sweep.analysis.summaries import POSE_STATISTICS, error_headings
+from sweep.analysis.summaries import ERROR_HEADINGS, POSE_STATISTICS
 from sweep.errors import ArgumentError
 from sweep.experiment.parameters import PARAMETERS, SECTIONS, Parameter
 from sweep.experiment.schema import VARIABLES, Variable
@@ -132,8 +132,7 @@ TABLES: dict[str, Callable[[], Table]] = {
         "counted in rates": YES[flag.counted]} for name, flags in FLAGS.items() for flag in flags)),
     "statistics": lambda: _table("variables of error_statistics", (
         {"variable": name, "meaning": meaning} for name, meaning in (
-            *((each.statistic.outputs()[0].name, each.statistic.outputs()[0].meaning)
-              for each in POSE_STATISTICS),
-            *((f"*_{name}_*", f"error: {heading}") for heading, name in error_headings().items())
+            *((each.name, each.meaning) for each in POSE_STATISTICS),
+            *((f"*_{name}_*", f"error: {heading}") for heading, name in ERROR_HEADINGS.items())
         ))),
 }

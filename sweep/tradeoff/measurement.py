@@ -172,11 +172,12 @@ def _trade(
     axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     settings = [axis.name for axis in axes]
     kept = [*per, *settings]
+    nees = results.get("nees", xr.DataArray(np.nan)) * _corner_noise_scale(pipeline, results, per)
     accuracy = xr.merge(
         [
             guarded_error_statistics(results, kept),
             efficiency(results, kept),
-            covariance_trust(results, kept, scale=_corner_noise_scale(pipeline, results, per)),
+            covariance_trust(results.assign(nees=nees), kept),
             _bound(results, per),
         ],
         compat="no_conflicts", join="exact",

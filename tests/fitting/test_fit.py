@@ -9,7 +9,7 @@ import xarray as xr
 import sweep
 from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
-from sweep.analysis.simulation_gaps import QUANTILES, RATES
+from sweep.analysis.simulation_gaps import GAP_STATISTICS
 from sweep.fitting.folders import REPEATS, HeldOut
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles
@@ -108,7 +108,7 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
 def gap(simulated, photographs=1.0):
     """A gap whose statistics have these values, and intervals of ± 0.5 of the difference."""
     variables = {}
-    for each in (*RATES, *QUANTILES):
+    for each in GAP_STATISTICS:
         size = simulated - photographs
         for end, change in (("", 0.0), ("_low", -0.5), ("_high", 0.5)):
             variables[f"{each.name}_gap{end}"] = (

@@ -63,7 +63,8 @@ def intervals(wanted, values):
     arrays["true_depth_m"] = arrays["true_tvec_m"][..., 2]
     columns, table = Columns(arrays, Poses), {}
     for statistic in wanted.requirable.computed("", LEVEL):
-        table |= statistic.variables(columns, Design(stopped=True))
+        table |= zip((each.name for each in statistic.outputs()),
+                     statistic.arrays(columns, Design(stopped=True)), strict=True)
     return [table[f"{wanted.name}_{end}"] for end in ("low", "high")]
 
 

@@ -473,7 +473,7 @@ def _rewrite(store: RunStore, keys: Collection[str]) -> None:
     listed = metadata["files"] | lifecycle.checksums(again)
     for group in lifecycle.MEASURED:
         if any(key.startswith(f"{group}/") for key in keys):
-            files.sync(store.storage.delete_dir(group))
+            files.delete_folder(store.storage, group)
             listed = {key: crc for key, crc in listed.items() if not key.startswith(f"{group}/")}
     files.delete_files(store.storage, filter(lifecycle.is_of_table, keys))
     lifecycle.write_root(store, {**metadata, "files": listed})

@@ -373,7 +373,7 @@ def begin_block(store: RunStore, block: Block) -> bool:
 def withdraw_block(store: RunStore, block: Block) -> None:
     """Delete the mark that a block was begun, if that can be: it did not end its process."""
     with contextlib.suppress(Exception):
-        files.sync(store.storage.delete(f"{BEGUN}/{store.blocks.number(block)}"))
+        files.delete_files(store.storage, [f"{BEGUN}/{store.blocks.number(block)}"])
 
 
 def write_block(

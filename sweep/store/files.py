@@ -19,7 +19,7 @@ from zarr.abc.store import Store
 from zarr.buffer import cpu, default_buffer_prototype
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
-from zarr.storage import LocalStore
+from zarr.storage import FsspecStore, LocalStore
 
 __all__ = ["sync"]
 
@@ -66,7 +66,33 @@ def delete_files(storage: Store, keys: Iterable[str]) -> None:
     """Delete files one after another; missing ones are left out."""
     for key in keys:
         with contextlib.suppress(FileNotFoundError):
-            sync(storage.delete(key))
+            sync(_delete(storage, key))
+
+
+def delete_folder(storage: Store, folder: str) -> None:
+    """Delete all files below a folder, in any order."""
+    async def delete_all(keys: Sequence[str]) -> None:
+        await asyncio.gather(*(_delete(storage, key) for key in keys))
+
+    if isinstance(storage, LocalStore):
+        sync(storage.delete_dir(folder))
+        return
+    keys = list_files(storage, f"{folder}/")
+    for start in range(0, len(keys), DELETED_AT_ONCE):
+        sync(delete_all(keys[start : start + DELETED_AT_ONCE]))
+
+
+#: Requests that delete files of an object store, under way at once.
+DELETED_AT_ONCE = 100
+
+
+async def _delete(storage: Store, key: str) -> None:
+    if isinstance(storage, FsspecStore):
+        # Zarr asks for the deletion of a list of keys, which servers beside Amazon's refuse: the
+        # libraries no longer send the checksum (Content-MD5) that these expect.
+        await storage.fs._rm_file(f"{storage.path}/{key}")  # noqa: SLF001  (as Zarr does)
+    else:
+        await storage.delete(key)
 
 
 def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[str]:

@@ -385,7 +385,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             try:
                 _check_free(url)
             except BaseException:
-                files.sync(storage.delete_dir(run_id))
+                files.delete_folder(storage, run_id)
                 raise
             # The URL points to it once it is complete.
             files.write_document(storage, "zarr.json", _group_document({locations.POINTER: run_id}))
@@ -488,7 +488,7 @@ def remove_store(url: str) -> None:
             pointer = locations.storage_at(url, read_only=False)
             with changing(url, storage):
                 files.delete_files(pointer, ["zarr.json"])
-            files.sync(pointer.delete_dir(str(metadata["run_id"])))
+            files.delete_folder(pointer, str(metadata["run_id"]))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
         path = Path(url).resolve()
@@ -612,7 +612,7 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
     with locations.translate_errors(store.url, "written"):
         write_root(store, {**metadata, "finished": False, "files": listed}, pipeline)
         for name in TABLES:
-            files.sync(store.storage.delete_dir(name))
+            files.delete_folder(store.storage, name)
 
 
 def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
@@ -626,7 +626,7 @@ def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
     if len(others) < len(listed):
         with locations.translate_errors(store.url, "written"):
             write_root(store, metadata)
-            files.sync(store.storage.delete_dir(name))
+            files.delete_folder(store.storage, name)
     _write_groups(store, {name: content}, metadata)
 
 
@@ -646,7 +646,7 @@ def _write_groups(
     contents = {key: content for key, content in files.files_in(memory).items()
                 if key.startswith(within)}
     with locations.translate_errors(store.url, "written"):
-        files.sync(store.storage.delete_dir(blocks.BEGUN))
+        files.delete_folder(store.storage, blocks.BEGUN)
         files.write_files(store.storage, contents)
         write_root(store, {**metadata, "files": metadata["files"] | checksums(contents)})
 

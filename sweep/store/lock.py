@@ -128,7 +128,10 @@ def _key(storage: Store, *, alone: bool) -> Iterator[None]:
     thread = threading.Thread(target=renew, daemon=True)
     thread.start()
     try:
-        others = _living(storage) - {key}
+        living = _living(storage)
+        if key not in living:
+            raise OSError("its listing of files lacks one that was just written")
+        others = living - {key}
         if (alone and others) or any(other.startswith(CHANGE) for other in others):
             raise BlockingIOError
         yield

@@ -5,8 +5,10 @@ import http.client
 import json
 import os
 import re
+import subprocess
 import time
 import typing
+from pathlib import Path
 
 import boto3
 import dask
@@ -143,6 +145,18 @@ def test_server_refuses_changes_while_a_process_writes(bucket, monkeypatch):
         "zarr.json", store.run_id}
     remove_store(url)
     assert not exists(url)
+
+
+@pytest.mark.evidence
+def test_stores_on_a_real_object_store_are_as_local_ones(claim):
+    script = Path(__file__).parents[1] / "object_store.py"
+    with started([script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        out, err = running.communicate()
+    if out.startswith("not installed"):
+        pytest.skip(out.strip())
+    assert running.returncode == 0, out + err
+    claim("store on OpenStack Swift, its run killed and continued by two clients",
+          "a local store", 0.0, "bits differ")
 
 
 @pytest.fixture

@@ -26,6 +26,8 @@ guarded = [true, false]
 trial = 2
 """
 
+FLAGS = {"detection": DetectionStatus, "estimate": EstimateStatus, "flipped": Flipped}
+
 ENGINES = {"scipy": "scipy", "netcdf4": "netCDF4", "h5netcdf": "h5netcdf"}
 
 
@@ -57,10 +59,7 @@ def test_an_opened_store_is_written_as_netcdf_and_read_again(engine, results, tm
         assert set(again.variables) == set(results.variables)
         for name, variable in results.variables.items():
             there = again[name].transpose(*variable.dims)
-            if variable.dtype.kind in "OTU":
-                assert there.values.tolist() == variable.values.tolist(), name
-            else:
-                np.testing.assert_array_equal(there.values, variable.values, err_msg=str(name))
+            np.testing.assert_array_equal(there.values, variable.values, err_msg=str(name))
         assert again.attrs["pipeline"] == TEXT
         assert json.loads(again.attrs["sweep"]) == json.loads(results.attrs["sweep"])
 
@@ -73,30 +72,20 @@ def test_an_opened_store_is_copied_as_zarr_and_as_a_table(results, tmp_path):
     assert len(table) == results.rotation_error_deg.size
 
 
-def test_every_flag_is_told_in_words_and_all_else_stays(results):
+def test_every_flag_is_told_in_words_lazily_and_all_else_stays(results):
     told = sweep.decode_flags(results)
-    named = {"detection": DetectionStatus, "estimate": EstimateStatus, "flipped": Flipped}
-    for name, flags in named.items():
+    assert told.detection.chunks is not None
+    for name, flags in FLAGS.items():
         words = [flags(value).name for value in results[name].values.ravel()]
         assert told[name].values.ravel().tolist() == words
         assert told[name].attrs.keys() == results[name].attrs.keys() - {
             "flag_values", "flag_meanings"}
-    flagged = {name for name in results.data_vars if "flag_meanings" in results[name].attrs}
-    assert flagged >= named.keys()
+    flagged = [name for name in results.data_vars if "flag_meanings" in results[name].attrs]
     xr.testing.assert_identical(
         told.drop_vars(flagged).compute(), results.drop_vars(flagged).compute())
-
-
-def test_labels_are_lazy_and_those_of_any_part_and_what_is_no_flag_is_unknown(results):
-    told = sweep.decode_flags(results)
-    assert told.detection.chunks is not None
-    part = sweep.decode_flags(results.detection.isel(side_px=1, trial=[0]))
-    assert (part.values == told.detection.isel(side_px=1, trial=[0]).values).all()
-    masked = results.detection.where(results.side_px > 30)
-    assert masked.dtype.kind == "f"
-    again = sweep.decode_flags(masked).transpose(*told.detection.dims)
-    assert (again.isel(side_px=0) == "not_run").all()
-    assert (again.isel(side_px=1) == told.detection.isel(side_px=1)).all()
+    masked = sweep.decode_flags(results.detection.where(results.side_px > 30))
+    assert (masked.isel(side_px=0) == "not_run").all()
+    assert (masked.isel(side_px=1) == told.detection.isel(side_px=1)).all()
     for value in (0.5, -1, 257):  # 257 is 1 in eight bits, as "detected" is
         other = results.detection.astype(type(value)) * 0 + value
         other.attrs = results.detection.attrs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -38,13 +38,11 @@ from sweep.analysis.estimator import (
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
 from sweep.analysis.poses import Poses
 from sweep.analysis.requirements import (
-    ERROR_PROBABILITY,
     MIN_DRAWS,
     Cause,
     Decision,
     ErrorShares,
     Requirable,
-    Requirement,
     combined_decision,
     decide,
     draws_needed,
@@ -52,39 +50,109 @@ from sweep.analysis.requirements import (
     kept_by,
     named,
     parse_requirements,
-    read_requirements,
     requirable_arrays,
     requirables,
     worst_cell,
 )
 from sweep.analysis.summaries import LOOKED_FOR
 from sweep.errors import ArgumentError, DatasetError
-from sweep.experiment.document import SEARCH
-from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
-from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.messages import shown
 from sweep.model.marker import module_count
-from sweep.typing import Floats, Integers, Masks
+from sweep.typing import Floats, Masks
+
+Decisions = NDArray[np.uint8]
+
+# --------------------------------------------------------------------------------------------------
+# One course along an axis, whose values stand in an order: of a limit from easy to hard, of the
+# smallest size that will do from the largest down. Values at which nothing can be judged, such as
+# sizes that do not fit into the image, are left out; a value beyond one that fails, on the other
+# side of a dip, ends nothing.
+#
+# That makes the error of what is decided that of a single decision: it is wrong only if, at the
+# first value that truly fails, the condition at which it fails is decided as met. Neither the
+# number of values nor that of conditions counts (Berger, "Multiparameter hypothesis testing and
+# acceptance sampling", Technometrics 24, 1982: an intersection-union test; Marcus, Peritz and
+# Gabriel, Biometrika 63, 1976: tests in a fixed order); the numbers of waves, after each of which a
+# decision is made, and of alternatives do (Bonferroni).
+
+class Course(NamedTuple):
+    """How far requirements are met along an axis: indices of its values.
+
+    Attributes
+    ----------
+    met
+        The last value at which, and at all judged ones before it, all is decided to be met.
+    possible
+        The same of values at which nothing is decided not to be met.
+    kept
+        The same of values whose estimates keep all limits; each -1 for none.
+    unmet
+        The first judged value that is not met, or undecided.
+    failing
+        The first judged value whose estimates do not keep a limit; each the number of values if
+        there is none.
+    """
+
+    met: int
+    possible: int
+    kept: int
+    unmet: int
+    failing: int
+
+
+def course(decision: Decisions, keeps: Masks, start: int = 0) -> Course:
+    """Return how far requirements are met.
+
+    Parameters
+    ----------
+    decision
+        (values, ...) of `Decision`, in the order of the course, at all conditions.
+    keeps
+        Of the same shape: where the estimates keep all limits.
+    start
+        The first value that counts.
+
+    Examples
+    --------
+    >>> met, failed = Decision.met, Decision.not_met
+    >>> decision = np.array([[met], [met], [failed], [met], [failed]], np.uint8)
+    >>> course(decision, decision == met)
+    Course(met=1, possible=1, kept=1, unmet=2, failing=2)
+    """
+    inner = tuple(range(1, decision.ndim))
+    keep = (keeps | (decision == Decision.not_applicable)).all(inner)
+    value = combined_decision(decision, inner)
+    judged = (value != Decision.not_applicable) & (np.arange(len(value)) >= start)
+
+    def ends(holds: Masks) -> tuple[int, int]:
+        """Return the last judged value up to which it holds, and the first where it does not."""
+        fails = np.flatnonzero(judged & ~holds)
+        first = int(fails[0]) if fails.size else len(value)
+        before = np.flatnonzero(judged[:first])
+        return int(before[-1]) if before.size else -1, first
+
+    (met, unmet), (kept, failing) = ends(value == Decision.met), ends(keep)
+    return Course(met, ends(value != Decision.not_met)[0], kept, unmet, failing)
+
+
+def error_shares(looks: float, decisions: int) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a search may spend.
+
+    Parameters
+    ----------
+    looks
+        How often an answer can be wrong: looks after each wave, and alternatives.
+    decisions
+        How many decisions are made at once for one answer: any false "not met" shortens it.
+    """
+    return ErrorShares(met=1.0 / looks, not_met=1.0 / (looks * decisions))
+
 
 # --------------------------------------------------------------------------------------------------
 # How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".
-
-def last_steady(holds: Masks, judged: Masks) -> Integers:
-    """Return the index (...) of the last judged value up to which all judged ones hold; -1 of none.
-
-    ``holds`` and ``judged`` are (..., values), from easy to hard.
-
-    >>> last_steady(np.array([True, False, True, False]), np.array([True, False, True, True]))
-    array(2)
-    """
-    steady = np.logical_and.accumulate(holds | ~judged, axis=-1) & judged
-    last = steady.shape[-1] - 1 - np.argmax(steady[..., ::-1], axis=-1)
-    return np.asarray(np.where(steady.any(axis=-1), last, -1))
-
 
 class Reach(Flag):
     """How far the requirements are met along the axis."""
@@ -96,18 +164,20 @@ class Reach(Flag):
     within = flag(4, "They are met between two values, but not at the easiest.", present=True)
 
 
-def error_shares(decisions: int, times: int) -> ErrorShares:
-    """Return the shares of the error probability of each decision of a search.
+#: Variables of limits: name -> meaning, and units; those of the axis if they are None.
+LIMITS: dict[str, tuple[str, str | None]] = {
+    "value": ("{} up to which all requirements are met", None),
+    "low": ("lower end of the interval: {} up to which all are met", None),
+    "high": ("upper end of the interval: {} up to which all are met", None),
+    "start": ("{} from which all requirements are met", None),
+    "fails_at": ("first {} at which one is not", None),
+    "farthest_beyond": ("farthest {} beyond it at which all are met again", None),
+    "failing_value": ("value of the requirement that fails there", ""),
+    "met_beyond": ("values beyond it at which all are met again", "1"),
+}
 
-    Parameters
-    ----------
-    decisions
-        How many are made for one limit: a false "not met" of any shortens it.
-    times
-        How often each is made.
-    """
-    factor = looks_factor(times)
-    return ErrorShares(met=1.0 / factor, not_met=1.0 / (factor * decisions))
+#: Texts of limits: name -> meaning.
+LIMIT_TEXTS = {"limited_by": "requirement that fails", "fails_where": "where it fails"}
 
 
 @describes
@@ -196,73 +266,64 @@ def requirement_limits(
     required = parse_requirements(require)
     values = axis_values(results, along)
     together = [name for name in as_names(at_all or ()) if name != along]
-    names = [name for name in axes_of(results, Stage.scene)
-             if name not in (DRAWS, *together)] if per is None else as_names(per)
-    names = [name for name in names if name != along]
-    overlap = [name for name in together if name in names]
-    if overlap:
+    names = [name for name in (as_names(per) if per is not None else axes_of(results, Stage.scene))
+             if name != along and (per is not None or name not in (DRAWS, *together))]
+    if overlap := [name for name in together if name in names]:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
     table = decide(results, required, [*names, *together, along],
-                   shares=error_shares(count, len(rule.ends) if rule else 1))
-    keeps = kept_by(table, required)
-    upwards = is_harder_upwards(results, along, keeps)
+                   shares=error_shares(looks_factor(len(rule.ends) if rule else 1), count))
+    table = table.assign(keeps=kept_by(table, required))
+    upwards = is_harder_upwards(results, along, table["keeps"])
     order = np.argsort(values if upwards else -values, kind="stable")
-    table, keeps = table.isel({along: order}), keeps.isel({along: order})
+    table = table.isel({along: order})
     inner = [*together, "requirement"]
     applicable = table["decision"] != Decision.not_applicable
-    judged = applicable.any(inner)
-    all_keep = ((keeps | ~applicable).all(inner) & judged).assign_attrs(
+    keeps = ((table["keeps"] | ~applicable).all(inner) & applicable.any(inner)).assign_attrs(
         long_name="whether all values keep their limits", units="1")
     decision = xr.apply_ufunc(
         combined_decision, table["decision"], input_core_dims=[inner],
         kwargs={"axis": tuple(range(-len(inner), 0))}).assign_attrs(
         cf_attributes("whether all requirements are met", flags=Decision))
     kept = [dim for dim in decision.dims if dim != along]
-    shape = [table.sizes[dim] for dim in kept]
-    arrays = [array.transpose(*kept, along).values for array in (all_keep, judged, decision)]
     rows = []
-    for index in np.ndindex(*shape):
-        row = _reach(values[order], upwards, *(array[index] for array in arrays))
-        if "fails" in row:
-            cell = {**dict(zip(kept, index, strict=True)), along: row["fails"]}
-            row |= _cause(table.isel(cell), keeps.isel(cell), together)
+    for index in np.ndindex(*(table.sizes[dim] for dim in kept)):
+        at = dict(zip(kept, index, strict=True))
+        failing, row = _limit(values[order], upwards, *(
+            array.isel(at).to_numpy() for array in (decision, keeps)))
+        if failing is not None:
+            row |= _cause(table.isel({**at, along: failing}), together)
         rows.append(row)
+
+    def column(name: str, missing: Any) -> Any:
+        found = np.array([row.get(name, missing) for row in rows])
+        return found.reshape([table.sizes[dim] for dim in kept])
+
     units = str(results[along].attrs.get("units", ""))
-    meanings = {
-        "value": (f"{along} up to which all requirements are met", units),
-        "low": (f"lower end of the interval: {along} up to which all are met", units),
-        "high": (f"upper end of the interval: {along} up to which all are met", units),
-        "start": (f"{along} from which all requirements are met", units),
-        "fails_at": (f"first {along} at which one is not", units),
-        "farthest_beyond": (f"farthest {along} beyond it at which all are met again", units),
-        "failing_value": ("value of the requirement that fails there", ""),
-        "met_beyond": ("values beyond it at which all are met again", "1"),
-        "limited_by": ("requirement that fails", None),
-        "fails_where": ("where it fails", None),
-    }
-    variables: dict[str, Any] = {}
-    for name, (meaning, unit) in meanings.items():
-        column = np.array([row.get(name, np.nan if unit is not None else "") for row in rows])
-        variables[name] = (kept, column.reshape(shape), {
-            "long_name": meaning} | ({} if unit is None else {"units": unit}))
-    reach = np.array([row["reach"] for row in rows], dtype=np.uint8).reshape(shape)
-    variables["reach"] = kept, reach, cf_attributes("how far the requirements are met", flags=Reach)
+    variables: dict[str, Any] = {
+        name: (kept, column(name, np.nan), {
+            "long_name": meaning.format(along), "units": units if unit is None else unit})
+        for name, (meaning, unit) in LIMITS.items()}
+    variables |= {name: (kept, column(name, ""), {"long_name": meaning})
+                  for name, meaning in LIMIT_TEXTS.items()}
+    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8),
+                          cf_attributes("how far the requirements are met", flags=Reach))
     variables |= {name: array.transpose(*kept, along)
-                  for name, array in (("decision", decision), ("keeps", all_keep))}
+                  for name, array in (("decision", decision), ("keeps", keeps))}
     coordinates = {name: value for name, value in table.coords.items()
                    if set(value.dims) <= {*kept, along}}
     found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
-    found["settled"] = (found["low"] == found["high"]).assign_attrs(
-        long_name="whether the interval is a single value of the grid", units="1")
     computed = computed_scenes(results)
-    cells = [name for name in computed.dims if name not in (*names, along)]
-    found["trials"] = computed.sum(DRAWS).max(
-        [name for name in cells if name != DRAWS]).compute().assign_attrs(
-        long_name="trials of a cell, the most at this value", units="1")
-    found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
-        long_name="scenes that were computed, of all values", units="1")
-    return found.assign_attrs(
+    cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
+    trials = computed.sum(DRAWS).compute()
+    return found.assign(
+        settled=(found["low"] == found["high"]).assign_attrs(
+            long_name="whether the interval is a single value of the grid", units="1"),
+        trials=trials.max(cells).assign_attrs(
+            long_name="trials of a cell, the most at this value", units="1"),
+        poses=trials.sum([*cells, along]).assign_attrs(
+            long_name="scenes that were computed, of all values", units="1"),
+    ).assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
         configuration_dims=[name for name in configuration_axes(results) if name in kept],
         per=[*names], at_all=together, require=[*require])
@@ -326,42 +387,36 @@ def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
     return float(np.sum(keeps[least])) >= float(np.sum(keeps[most]))
 
 
-def _reach(
-    values: Floats, upwards: bool, keeps: Masks, judged: Masks, decision: Decisions
-) -> dict[str, Any]:
+def _limit(
+    values: Floats, upwards: bool, decision: Decisions, keeps: Masks
+) -> tuple[int | None, dict[str, Any]]:
     """Return the limit of one condition along the axis, from easy to hard.
 
-    ``fails`` is the index of the first value beyond it that fails.
+    With it, before it: the index of the first value beyond that fails.
     """
+    judged = decision != Decision.not_applicable
     if not judged.any():
-        return {"reach": Reach.not_run}
-    none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+        return None, {"reach": Reach.not_run}
+    # Where the easiest values fail, the limit is the end of the longest run of values that do not.
     run, index = met_run(keeps, judged), np.arange(len(values))
     gaps = np.flatnonzero(judged & ~keeps & (index < (run[0] if run else 0)))
-    if gaps.size:
-        judged = judged & (index > gaps[-1])
-
-    def up_to(holds: Masks) -> float:
-        """Return the last judged value up to which it holds."""
-        at = int(last_steady(holds, judged))
-        return none if at < 0 else float(values[at])
-
-    possible = decision != Decision.not_met
-    ends = sorted((up_to(decision == Decision.met),
-                   beyond if (possible | ~judged).all() else up_to(possible)))
-    value = up_to(keeps)
-    row = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
-           "met_beyond": 0.0}
-    if run:
-        row["start"] = float(values[run[0]])
-    failing = np.flatnonzero(judged & ~keeps)
-    if not failing.size:
-        return {**row, "reach": Reach.within if gaps.size else Reach.always}
-    again = np.flatnonzero(judged & keeps & (index > failing[0]))
-    return {**row, "fails": int(failing[0]), "fails_at": float(values[failing[0]]),
-            "met_beyond": float(len(again)),
-            "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
-            "reach": Reach.never if run is None else Reach.within if gaps.size else Reach.found}
+    start = int(gaps[-1]) + 1 if gaps.size else 0
+    found = course(decision, keeps, start)
+    none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+    met, possible, value = (none if k < 0 else float(values[k])
+                            for k in (found.met, found.possible, found.kept))
+    if (decision[start:] != Decision.not_met).all():
+        possible = beyond
+    low, high = sorted((met, possible))
+    row = {"value": value if np.isfinite(value) else np.nan, "low": low, "high": high,
+           "start": float(values[run[0]]) if run else np.nan, "met_beyond": 0.0}
+    if found.failing == len(values):
+        return None, {**row, "reach": Reach.within if gaps.size else Reach.always}
+    again = np.flatnonzero(judged & keeps & (index > found.failing))
+    return found.failing, {
+        **row, "fails_at": float(values[found.failing]), "met_beyond": float(len(again)),
+        "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
+        "reach": Reach.never if run is None else Reach.within if gaps.size else Reach.found}
 
 
 def met_run(
@@ -385,11 +440,9 @@ def met_run(
     return int(at[first]), int(at[end - 1])
 
 
-def _cause(
-    cell: xr.Dataset, keeps: xr.DataArray, together: Sequence[str]
-) -> dict[str, Any]:
+def _cause(cell: xr.Dataset, together: Sequence[str]) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
-    failing = ~keeps & (cell["decision"] != Decision.not_applicable)
+    failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
     worst = largest_cell(cell, excess_of(cell).where(failing, -np.inf))
     at = {name: worst[name].item() for name in together}
     where = ", ".join(f"{name} = {value:g}" if isinstance(value, float) else f"{name} = {value}"
@@ -462,130 +515,44 @@ def detection_limit(
     if not sides.dims:
         raise DatasetError("side_px or distance_m: no axis changes the size in the image; there "
                            f"are {', '.join(axes) or 'none'}")
-    along = [str(dim) for dim in sides.dims if dim not in per]
-    if len(along) != 1:
+    along, *others = [str(dim) for dim in sides.dims if dim not in per] or [""]
+    if others or not along:
         raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
                             f"the limit is along; there are {', '.join(map(str, sides.dims))}")
-    found = requirement_limits(results, [f"detection >= {rate:.12g}"], along[0], per)
+    found = requirement_limits(results, [f"detection >= {rate:.12g}"], along, per)
     names = parameter_value(results, "dictionary")
     modules: Any = module_count(names) if isinstance(names, str) else xr.apply_ufunc(
         np.vectorize(module_count), names)
     smaller = found.attrs["harder"] == "upwards"
-    # Ends of sides are the other ends of what makes markers small as it grows.
-    ends = ("", "_high", "_low") if smaller else tuple(INTERVAL)
     out = {"reach": found["reach"]}
-    for (end, words), other in zip(INTERVAL.items(), ends, strict=True):
-        value, at = (found[each[1:] or "value"] for each in (end, other))
-        nowhere = at.isnull()
-        at = at.where(~nowhere, -np.inf if smaller else np.inf)
-        known = sides.sel({along[0]: at.clip(float(sides[along[0]].min()),
-                                             float(sides[along[0]].max()))}, method="nearest")
+    for end, words in INTERVAL.items():
+        # Where the axis makes markers small as it grows, ends of sides are the other ends.
+        other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
+        at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
+        within = at.clip(float(sides[along].min()), float(sides[along].max()))
+        side = sides.sel({along: within}, method="nearest").drop_vars(along)
         beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
-        side = known.drop_vars(along).where(np.isfinite(at), beyond).where(
-            found["reach"] != Reach.not_run)
+        side = side.where(np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
         meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
         out |= {
             f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
             f"side_px_per_module{end}": (side / modules).assign_attrs(
                 long_name=f"{meaning}, per module", units="px")}
-        if along[0] != "side_px":
-            out[f"{along[0]}{end}"] = value
+        if along != "side_px":
+            out[f"{along}{end}"] = found[end[1:] or "value"]
     # Others along the axis, such as the distance of a side, do not belong to the answer.
     return xr.Dataset({name: each.drop_vars(along, errors="ignore").reset_coords(drop=True)
                        for name, each in out.items()})
 
 
 # --------------------------------------------------------------------------------------------------
-# Faults of a choice that show before anything is computed, a line each.
-
-def choice_faults(pipeline: Pipeline, rule: StoppingRule, shares: ErrorShares) -> list[str]:
-    """Return the reasons why a choice is impossible.
-
-    Such are requirements that cannot hold, and ones that ``max_trials`` cannot show to be met even
-    if no trial fails.
-    """
-    required, faults = read_requirements(rule.requirements)
-    lines = [f"require.all = {shown(text)}: {problem}" for text, problem in faults]
-    kept = {TRIAL, rule.along, *rule.among, *rule.at_all}
-    pooled = math.prod(len(axis) for axis in pipeline.axes if axis.name not in kept)
-    for each in required:
-        least = math.ceil(least_draws(each, shares.met) / pooled)
-        if least > rule.max_trials:
-            lines.append(
-                f"{SEARCH}.max_trials = {rule.max_trials}: expected at least {least:,}: fewer "
-                f"cannot show {each.text} with {100 * CONFIDENCE:g} % confidence, even if all "
-                "meet it")
-    return lines
-
-
-def least_draws(requirement: Requirement, share: float) -> int:
-    """Return the draws below which a requirement cannot be decided as met.
-
-    Of a rate, with no failure Clopper and Pearson's end is the tail's n-th root; a quantile needs
-    an order statistic beyond; means are not decided below `MIN_DRAWS`.
-
-    Examples
-    --------
-    >>> least_draws(parse_requirements("detection >= 0.99")[0], 1.0)
-    368
-    """
-    what = requirement.requirable
-    if what.is_rate:
-        good = requirement.limit if requirement.at_least else 1.0 - requirement.limit
-        return draws_to_see(1.0 - good, what.level(share)) if 0.0 < good < 1.0 else 1
-    if what.percent is not None:
-        below = what.percent / 100.0
-        return draws_to_see(
-            below if requirement.at_least else 1.0 - below, what.level(share))
-    return MIN_DRAWS
-
-
-# --------------------------------------------------------------------------------------------------
-# The walk from the safe end of an axis to the wanted one: answers so far, and trials still needed.
+# The choice that meets requirements at all conditions: of a size, and among other settings.
 #
-# The values of the axis stand in the order of the walk: for the smallest size that will do, from
-# the largest down. Each value's conditions are decided one by one. The answer is the last value
-# of the walk that meets the requirements, as all values before it do that can be judged: so a
-# value beyond one that fails, on the other side of a dip, is no answer. Values at which nothing
-# can be judged, such as sizes that do not fit into the image, are left out.
-#
-# That makes the error of the answer that of a single decision: it is wrong only if, at the first
-# value of the walk that truly fails, the condition at which it fails is decided as met. Neither
-# the number of values nor that of conditions counts (Berger, "Multiparameter hypothesis testing
-# and acceptance sampling", Technometrics 24, 1982: an intersection-union test; Marcus, Peritz and
-# Gabriel, Biometrika 63, 1976: tests in a fixed order); the numbers of waves, after each of which
-# a decision is made, and of alternatives do (Bonferroni).
-
-Decisions = NDArray[np.uint8]
+# What a choice is stands in `sweep.experiment.sampling`. Every alternative, a combination of the
+# values of the axes ``among``, has its own answer: the course of the values from the safe end on.
 
 #: Probability with which an answer meets the requirements.
 CONFIDENCE = 0.95
-
-
-def shares_of_choice(
-    confidence: float, *, waves: int, alternatives: int, values: int, conditions: int,
-    requirements: int,
-) -> ErrorShares:
-    """Return the shares of the error probability that each decision of a search may spend.
-
-    Parameters
-    ----------
-    confidence
-        Probability with which no answer fails, and, again, with which no value that is told to
-        fail meets all.
-    waves
-        How often a decision is made at most: once after each wave.
-    alternatives, values, conditions, requirements
-        How many there are. "Met" is corrected for waves and alternatives, "not met" for all.
-
-    Examples
-    --------
-    >>> shares_of_choice(0.9, waves=10, alternatives=2, values=5, conditions=2, requirements=1)
-    ErrorShares(met=0.1, not_met=0.01)
-    """
-    met = (1.0 - confidence) / ERROR_PROBABILITY / waves / alternatives
-    not_met = met / (values * conditions * requirements)
-    return ErrorShares(float(f"{met:.12g}"), float(f"{not_met:.12g}"))
 
 
 def needed(decision: Decisions, keeps: Masks) -> Masks:
@@ -599,7 +566,7 @@ def needed(decision: Decisions, keeps: Masks) -> Masks:
     ----------
     decision
         (..., values, conditions) of `sweep.analysis.requirements.Decision`, in the order of the
-        walk.
+        course.
     keeps
         Of the same shape: where the estimates keep all limits.
     """
@@ -611,63 +578,6 @@ def needed(decision: Decisions, keeps: Masks) -> Masks:
     first = stops & (np.cumsum(stops, axis=-1) == 1) & (value == Decision.undecided)
     return np.asarray((undecided & before[..., None]) | (seems & first[..., None]))
 
-
-@dataclass(frozen=True, slots=True)
-class Walk:
-    """How far a walk came; indices along the walk.
-
-    Attributes
-    ----------
-    answer
-        The last value before which, and at which, all is met; -1 for none.
-    next
-        The first value that is not met or undecided; the number of values if there is none.
-    isolated
-        Values from ``next`` on that fail, or seem to, and beyond which another seems to meet all:
-        failures that a search by halving would have stepped over.
-    passing
-        The values beyond that seem to meet all, or do.
-    """
-
-    answer: int
-    next: int
-    isolated: tuple[int, ...]
-    passing: tuple[int, ...]
-
-
-def walk(decision: Decisions, keeps: Masks) -> Walk:
-    """Return how far a walk comes, of one alternative.
-
-    Parameters
-    ----------
-    decision, keeps
-        (values, conditions), as in `needed`.
-
-    Examples
-    --------
-    >>> met, failed = Decision.met, Decision.not_met
-    >>> decision = np.array([[met], [met], [failed], [met], [failed]], np.uint8)
-    >>> walk(decision, decision == met)
-    Walk(answer=1, next=2, isolated=(2,), passing=(3,))
-    """
-    value = combined_decision(decision, -1)
-    judged = value != Decision.not_applicable
-    stops = np.flatnonzero(judged & (value != Decision.met))
-    after = int(stops[0]) if stops.size else len(value)
-    met = np.flatnonzero(value[:after] == Decision.met)
-    applicable = decision != Decision.not_applicable
-    seems = (keeps | ~applicable).all(axis=-1) & judged & (value != Decision.not_met)
-    passing = [k for k in range(after + 1, len(value)) if seems[k]]
-    isolated = [k for k in range(after, passing[-1])
-                if judged[k] and (not seems[k] or k == after)] if passing else []
-    return Walk(int(met[-1]) if met.size else -1, after, tuple(isolated), tuple(passing))
-
-
-# --------------------------------------------------------------------------------------------------
-# The choice that meets requirements at all conditions: of a size, and among other settings.
-#
-# What a choice is stands in `sweep.experiment.sampling`. Every alternative, a combination of the
-# values of the axes ``among``, has its own answer.
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
@@ -706,10 +616,8 @@ class Answer:
     next, next_cause
         The next value, which fails or is undecided, and by what; None if all values meet them.
         Without an axis ``next`` is None, and ``next_cause`` that of the alternative itself.
-    isolated
-        Values that fail, or seem to, with others beyond that seem to meet all: (value, cause).
     passing
-        Those values beyond.
+        Values beyond the next one that seem to meet all.
     nearest
         If none is met: the nearest alternative.
     is_open
@@ -721,14 +629,13 @@ class Answer:
     alternative: Mapping[str, Any]
     met: bool
     value: float | None
-    tightest: Cause | None = None
-    next: float | None = None
-    next_cause: Cause | None = None
-    isolated: tuple[tuple[float, Cause], ...] = ()
-    passing: tuple[float, ...] = ()
-    nearest: Nearest | None = None
-    is_open: bool = False
-    possible: float | None = None
+    tightest: Cause | None
+    next: float | None
+    next_cause: Cause | None
+    passing: tuple[float, ...]
+    nearest: Nearest | None
+    is_open: bool
+    possible: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -739,44 +646,45 @@ class ChoiceCells:
     ----------
     table
         Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *at_all, requirement),
-        the values in the order of the walk; without the axis ``along`` if there is none.
-    decision, keeps
-        (alternatives, values, conditions): of all requirements together, and whether the estimates
-        keep all limits.
-    excess
-        (alternatives, values): how far the worst value is beyond its limit, relative to it;
-        negative on the right side of it, infinite for no number.
-    hopeless
-        (alternatives, values, conditions): undecided, and no number of trials will tell.
+        the values in the order of the course; without the axis ``along`` if there is none. With
+        ``keeps``, whether the estimates keep their limits, ``excess``, how far they are beyond
+        them, and ``hopeless``: undecided, and no number of trials will tell.
     rule, shares
         The search, and the shares of the error probability that a decision may spend.
     """
 
     table: xr.Dataset
-    decision: Decisions
-    keeps: Masks
-    excess: Floats
-    hopeless: Masks
     rule: StoppingRule
     shares: ErrorShares
+
+    def of(self, name: str) -> NDArray[Any]:
+        """Return a variable (alternatives, values, conditions, requirements)."""
+        sizes = self.table.sizes
+        return self.table[name].to_numpy().reshape(
+            -1, sizes[self.rule.along] if self.rule.along else 1,
+            math.prod(sizes[name] for name in self.rule.at_all), sizes["requirement"])
+
+    @property
+    def decision(self) -> Decisions:
+        """Decisions (alternatives, values, conditions) on all requirements together."""
+        return combined_decision(self.of("decision"), -1)
+
+    @property
+    def keeps(self) -> Masks:
+        """Where (alternatives, values, conditions) the estimates keep all limits."""
+        return np.asarray(self.of("keeps").all(axis=-1))
+
+    @property
+    def hopeless(self) -> Masks:
+        """Where (alternatives, values, conditions) trials will not tell."""
+        return np.asarray(
+            self.of("hopeless").any(axis=-1) & (self.decision == Decision.undecided))
 
     def needed(self) -> xr.DataArray:
         """Return which cells need more trials, dimensions (*among, along, *at_all)."""
         template = self.table["decision"].isel(requirement=0, drop=True)
         decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
         return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
-
-
-def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
-    """Return the shares of the error probability that each decision of a search may spend."""
-    def size(names: Sequence[str]) -> int:
-        axes = [axis for name in names if (axis := pipeline.axis(name)) is not None]
-        return math.prod(map(len, axes))
-
-    return shares_of_choice(
-        CONFIDENCE, waves=len(rule.ends), alternatives=size(rule.among),
-        values=size([rule.along] if rule.along else []), conditions=size(rule.at_all),
-        requirements=len(rule.requirements))
 
 
 def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> ChoiceCells:
@@ -789,47 +697,34 @@ def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -
     """
     required = parse_requirements(rule.requirements)
     kept = [*rule.among, *([rule.along] if rule.along else []), *rule.at_all]
-    table = decide(results, required, kept, shares=shares)
-    table = table.transpose(*kept, "requirement", missing_dims="ignore")
+    table = decide(results, required, kept, shares=shares).transpose(..., *kept, "requirement")
     if rule.along:
-        values = table[rule.along].to_numpy()
-        order = np.argsort(values, kind="stable")
-        table = table.isel({rule.along: order if rule.largest else order[::-1]})
-    conditions = math.prod(table.sizes[name] for name in rule.at_all)
-    shape = (-1, table.sizes[rule.along] if rule.along else 1, conditions, len(required))
-
-    def cells(name: str) -> NDArray[Any]:
-        values = table[name].to_numpy().reshape((*table[name].shape[:len(kept)], -1))
-        return np.broadcast_to(values, table["value"].shape).reshape(shape)
-
+        table = table.sortby(rule.along, ascending=rule.largest)
     # Where so few poses count that max_trials will not have enough, there is nothing to learn.
-    poses = cells("looked_for").astype(np.float64)
     pooled = math.prod(results.sizes[str(name)] for name in results["true_tvec_m"].dims if
                        name not in (*kept, DRAWS, "xyz"))
-    with np.errstate(invalid="ignore"):
-        coming = cells("draws") / poses * rule.max_trials * pooled
-    each = cells("decision").astype(np.uint8)
-    hopeless = (poses >= MIN_DRAWS) & (coming < MIN_DRAWS) & (each == Decision.undecided)
-    decision = combined_decision(each, -1)
-    table = table.assign(excess=excess_of(table), keeps=kept_by(table, required))
-    excess = np.where(each == Decision.not_applicable, -np.inf, cells("excess"))
-    keeps = cells("keeps") | (each == Decision.not_applicable)
-    return ChoiceCells(
-        table, decision, np.asarray(keeps.all(-1)), excess.max(axis=(2, 3)),
-        hopeless.any(-1) & (decision == Decision.undecided), rule, shares)
+    coming = table["draws"] / table["looked_for"] * rule.max_trials * pooled
+    few = (table["looked_for"] >= MIN_DRAWS) & (coming < MIN_DRAWS)
+    judged = table["decision"] != Decision.not_applicable
+    return ChoiceCells(table.assign(
+        hopeless=(table["decision"] == Decision.undecided) & few,
+        excess=excess_of(table).where(judged, -np.inf),
+        keeps=kept_by(table, required) | ~judged), rule, shares)
 
 
 def answers(cells: ChoiceCells) -> list[Answer]:
     """Return the answer of each alternative, in the order of the table's dimensions."""
-    return [_answer(cells, k, *alternative)
-            for k, alternative in enumerate(each_cell(cells.table, cells.rule.among))]
+    parts = zip(cells.decision, cells.keeps, cells.of("excess").max(axis=(2, 3)),
+                each_cell(cells.table, cells.rule.among), strict=True)
+    return [_answer(cells, *part) for part in parts]
 
 
 def _answer(
-    cells: ChoiceCells, k: int, alternative: Mapping[str, Any], table: xr.Dataset
+    cells: ChoiceCells, decision: Decisions, keeps: Masks, excess: Floats,
+    part: tuple[dict[str, Any], xr.Dataset],
 ) -> Answer:
-    """Return the answer of alternative number ``k``, whose part of the cells is a table."""
-    along = cells.rule.along
+    """Return the answer of an alternative, a part of the table."""
+    (alternative, table), along = part, cells.rule.along
     values: list[Any] = table[along].to_numpy().tolist() if along else [None]
 
     def cause(at: int) -> Cause:
@@ -842,23 +737,18 @@ def _answer(
             needed = float(draws_needed(required, cell, solved, cells.shares.met))
         return Cause.at(cell, cells.rule.at_all, draws_needed=needed)
 
-    came = walk(cells.decision[k], cells.keeps[k])
-    value = combined_decision(cells.decision[k], -1)
+    found, value = course(decision, keeps), combined_decision(decision, -1)
     judged = value != Decision.not_applicable
-    met, after = came.answer >= 0, came.next < len(values)
-    nearest = None
-    if not met:
-        best = int(np.argmin(np.where(judged, cells.excess[k], np.inf)))
-        nearest = Nearest(values[best], float(cells.excess[k, best]), cause(best))
-    possible = int(last_steady(value != Decision.not_met, judged))
+    met, after = found.met >= 0, found.unmet < len(values)
+    best = int(np.argmin(np.where(judged, excess, np.inf)))
     return Answer(
-        alternative, met, values[came.answer] if met else None,
-        cause(came.answer) if met else None, values[came.next] if after else None,
-        cause(came.next) if after else None,
-        tuple((values[at], cause(at)) for at in came.isolated),
-        tuple(values[at] for at in came.passing), nearest,
-        bool((value[: possible + 1] == Decision.undecided).any()),
-        None if possible < 0 else values[possible])
+        alternative, met, values[found.met] if met else None, cause(found.met) if met else None,
+        values[found.unmet] if after else None, cause(found.unmet) if after else None,
+        tuple(value for k, value in enumerate(values)
+              if k > found.unmet and judged[k] and keeps[k].all()),
+        None if met else Nearest(values[best], float(excess[best]), cause(best)),
+        bool((value[: found.possible + 1] == Decision.undecided).any()),
+        None if found.possible < 0 else values[found.possible])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -900,7 +790,7 @@ class WantedPrecision:
     requirable
         The quantity.
     half_width
-        As the module says; above 0, below 1.
+        As the comment above says; above 0, below 1.
     """
 
     requirable: Requirable
@@ -912,21 +802,13 @@ class WantedPrecision:
         return self.requirable.name
 
     @property
-    def relative_to(self) -> str:
-        """Quantity of which the half-width is a share; empty for a rate."""
-        return "" if self.requirable.is_rate else "RMSE" if self.spread else "value"
-
-    @property
     def spread(self) -> Requirable | None:
         """Of a bias the standard deviation; else None."""
         return requirables().get(self.name.replace("_bias_", "_sd_")) \
             if "_bias_" in self.name else None
 
     def statistics(self, prefix: str) -> list[Statistic[Poses]]:
-        """Return the statistics that must be computed, their variables' names with a prefix.
-
-        Their intervals must hold for stores whose sampling was stopped.
-        """
+        """Return the statistics that must be computed, their variables' names with a prefix."""
         parts = self.requirable.computed(prefix, LEVEL)
         return parts + self.spread.computed(f"{prefix}of ", LEVEL)[:1] if self.spread else parts
 
@@ -947,9 +829,8 @@ class WantedPrecision:
         """Draws below which no interval is narrow enough, whatever the results are."""
         if not self.requirable.is_rate:
             return self.least_draws
-        if self.half_width >= 0.5:
-            return 1
-        return draws_to_see(2.0 * self.half_width, stopped_level(LEVEL))
+        # An interval of half of all shares, or more, has a single draw.
+        return draws_to_see(min(2.0 * self.half_width, 0.999), stopped_level(LEVEL))
 
     def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
         """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.
@@ -963,10 +844,10 @@ class WantedPrecision:
         total
             Poses that all trials would be.
         """
-        what = self.requirable
-        ends = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL]
+        what, run = self.requirable, table["run"]
         # Of a bias with its sign.
-        value, low, high = ends if what.signed else what.interval(table, prefix)
+        value, low, high = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL] \
+            if what.signed else what.interval(table, prefix)
         used, draws = table[f"{prefix}used"], table[f"{prefix}draws"]
         with np.errstate(all="ignore"):
             half = (high - low) / 2.0
@@ -976,26 +857,19 @@ class WantedPrecision:
                 half = (half / scale).where(half != 0.0, 0.0)
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
         half = half.where(low != np.inf, 0.0)
+        # Even the upper end of the share of poses with a number gives too few draws of all trials.
+        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
+        worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
+        too_rare = (share * total * worth < self.least_draws) & (total >= self.least_draws)
         reached = np.select(
-            [table["run"] == 0, table["looked_for"] == 0,
+            [run == 0, table["looked_for"] == 0,
              (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS)),
-             self._too_rare(used, draws, table["run"], total)],
+             too_rare],
             [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
             Reached.not_reached)
         return xr.Dataset({
             "value": value, "half_width": half, "used": used, "draws": draws,
             "reached": used.copy(data=reached.astype(np.uint8))})
-
-    def _too_rare(
-        self, used: xr.DataArray, draws: xr.DataArray, run: xr.DataArray, total: xr.DataArray
-    ) -> xr.DataArray:
-        """Return where even all trials give fewer draws with a number than `least_draws`.
-
-        By the upper end of the share of poses that have one; ``used`` poses are worth ``draws``.
-        """
-        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
-        worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
-        return (share * total * worth < self.least_draws) & (total >= self.least_draws)
 
 
 def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
@@ -1019,28 +893,22 @@ def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...
     for name, half_width in wanted.items():
         try:
             what = named(name)
-        except ValueError as error:
-            text = str(error)
-            faults.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
-            continue
-        if not 0.0 < half_width < 1.0:
-            faults.append(f"{name}: expected the half-width of an interval, above 0 and below 1")
-        elif what.name in precisions:
-            faults.append(f"{name}: {what.name} has another half-width; delete one")
-        else:
+            if not 0.0 < half_width < 1.0:
+                raise ValueError("expected the half-width of an interval, above 0 and below 1")
+            if what.name in precisions:
+                raise ValueError(f"{what.name} has another half-width; delete one")
             precisions[what.name] = WantedPrecision(what, float(half_width))
+        except ValueError as error:
+            faults.append(f"{name}: {error}")
     if faults:
         raise ValueError("\n".join(faults))
     return tuple(precisions.values())
 
 
-# --------------------------------------------------------------------------------------------------
-# How well each condition of a store is known, against the precision that was wanted.
-
 @describes
 def precision_reached(
     results: xr.Dataset, wanted: Mapping[str, float] | None = None,
-    per: Sequence[str] | None = None,
+    per: Sequence[str] | None = None, max_trials: int | None = None,
 ) -> xr.Dataset:
     """Return how well each condition is known, against the precision that was wanted.
 
@@ -1055,6 +923,8 @@ def precision_reached(
     per
         Dimensions whose values are conditions; by default as in the pipeline's [search].
         Detector and estimator are always kept.
+    max_trials
+        The most trials that there may be; by default as many as there are.
 
     Returns
     -------
@@ -1099,49 +969,38 @@ def precision_reached(
         precisions = wanted_precisions(wanted)
     except ValueError as error:
         raise ArgumentError("wanted", wanted, str(error)) from None
-    return precision_table(results, precisions, as_names(per))
-
-
-def precision_table(
-    results: xr.Dataset, precisions: Sequence[WantedPrecision], per: Sequence[str],
-    trials: int | None = None,
-) -> xr.Dataset:
-    """Return the table of `precision_reached`.
-
-    ``trials`` are the most that there may be; by default as many as there are.
-    """
     configuration = configuration_axes(results)
-    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *per))))
-    configuration = [name for name in configuration if name in kept]
-    statistics = [
-        Count(*LOOKED_FOR, lambda poses: poses.looked_for),
-        Count("run", "poses that were run", lambda poses: poses.run),
-        Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
-        *(each for number, precision in enumerate(precisions)
-          for each in precision.statistics(f"{number} ")),
-    ]
-    inputs = requirable_arrays(results, [each.requirable for each in precisions])
-    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True)
+    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *as_names(per)))))
+    table = aggregate(
+        results, requirable_arrays(results, [each.requirable for each in precisions]), kept, [
+            Count(*LOOKED_FOR, lambda poses: poses.looked_for),
+            Count("run", "poses that were run", lambda poses: poses.run),
+            Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
+            *(each for number, precision in enumerate(precisions)
+              for each in precision.statistics(f"{number} ")),
+        ], Poses, stopped=True)
     total = table["poses"]
-    if trials is not None:
-        total = total // results.sizes[DRAWS] * trials
-    judged = [each.judged(table, f"{number} ", total) for number, each in enumerate(precisions)]
-    out = stacked(judged, "quantity").reset_coords(drop=True)
-    for name, meaning, units in (
-        ("value", "value", ""), ("half_width", "half-width of the interval, as was wanted", ""),
+    if max_trials is not None:
+        total = total // results.sizes[DRAWS] * max_trials
+    out = stacked([each.judged(table, f"{number} ", total)
+                   for number, each in enumerate(precisions)], "quantity").reset_coords(drop=True)
+    needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
+    out = out.assign(
+        settled=~needs.any([*configuration, "quantity"]), run=table["run"], poses=table["poses"])
+    for name, *described in (
+        ("value", "value"), ("half_width", "half-width of the interval, as was wanted"),
         ("used", "poses that the value is of", "1"),
         ("draws", "random draws that these are worth", "1"),
+        ("reached", "whether the interval is as narrow as was wanted", "", Reached),
+        ("settled", "whether no configuration and quantity needs more trials", "1"),
     ):
-        out[name].attrs = cf_attributes(meaning, units)
-    out["reached"].attrs = cf_attributes(
-        "whether the interval is as narrow as was wanted", flags=Reached)
-    needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
-    out["settled"] = (~needs.any([*configuration, "quantity"])).assign_attrs(
-        cf_attributes("whether no configuration and quantity needs more trials", "1"))
-    out = out.assign(run=table["run"], poses=table["poses"]).assign_coords(
-        {name: each for name, each in table.coords.items() if set(each.dims) <= {*kept}})
+        out[name].attrs = cf_attributes(*described)
     return out.assign_coords(
-        quantity=("quantity", [each.name for each in precisions]),
-        wanted=("quantity", [each.half_width for each in precisions]),
-        relative_to=("quantity", [each.relative_to for each in precisions]),
-    ).assign_attrs(configuration_dims=list(configuration))
+        {name: each for name, each in table.coords.items() if {*each.dims} <= {*kept}},
+    ).assign_coords({name: ("quantity", listed) for name, listed in (
+        ("quantity", [each.name for each in precisions]),
+        ("wanted", [each.half_width for each in precisions]),
+        # The quantity of which the half-width is a share; none of a rate.
+        ("relative_to", ["" if each.requirable.is_rate else "RMSE" if each.spread else "value"
+                         for each in precisions]))},
+    ).assign_attrs(configuration_dims=configuration)

@@ -37,7 +37,6 @@ from sweep.analysis.estimator import (
     Bins,
     Count,
     Mean,
-    Output,
     Quantiles,
     Rate,
     RootMeanSquare,
@@ -90,8 +89,8 @@ class Requirable:
 
     Attributes
     ----------
-    output
-        Its name, meaning and units.
+    name, units
+        Of the output.
     statistic
         What computes it.
     inputs
@@ -102,21 +101,12 @@ class Requirable:
         The percent of a quantile, else None.
     """
 
-    output: Output
+    name: str
+    units: str
     statistic: Any
     inputs: tuple[str, ...]
     largest: float = math.inf
     percent: int | None = None
-
-    @property
-    def name(self) -> str:
-        """The output's name."""
-        return self.output.name
-
-    @property
-    def units(self) -> str:
-        """The output's units."""
-        return self.output.units
 
     @property
     def is_rate(self) -> bool:
@@ -217,7 +207,7 @@ def _of_record(
             name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
         percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
         found.append(Requirable(
-            output, statistic, statistic.inputs,
+            name, output.units, statistic, statistic.inputs,
             1.0 if isinstance(statistic, Rate) else largest, percent))
     return found
 
@@ -272,7 +262,7 @@ def named(name: str) -> Requirable:
         hint = nearest(short, [*known]) or (
             f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
             "the guide sweep/analysis/README.md")
-        problem = f"{name}: nothing of this name has an interval{hint}"
+        problem = f"nothing of this name has an interval{hint}"
     raise ValueError(problem)
 
 
@@ -315,37 +305,17 @@ def _wrong_unit(what: Requirable, given: RequirementText) -> str:
 
 
 def contradictions(given: Sequence[Requirement]) -> list[tuple[str, str]]:
-    """Return the requirements that cannot hold together, each as its text and a line.
-
-    Implied requirements count: a median is at most the 95 % quantile, a solved pose was detected,
-    and where a 95 % quantile is finite, 95 % of the poses were solved.
-    """
+    """Return the requirements on one quantity that cannot hold together, each a text and a line."""
     faults = []
-    for number, each in enumerate(given):
-        if any((each.variable, each.at_least) == (other.variable, other.at_least)
-               for other in given[:number]):
-            faults.append((each.text, f"{each.variable} has another such limit; delete one"))
-    solved = [Requirement(each.text, "solved_rate", ">=", each.requirable.percent / 100.0)
-              for each in given if not each.at_least and each.requirable.percent]
-    for least in (*(each for each in given if each.at_least), *solved):
-        for most in given:
-            if most.at_least or least.limit < most.limit:
-                continue
-            if (least.variable, most.variable) in ORDERED or least.variable == most.variable:
-                faults.append((least.text, f"contradicts {most.text}: no result can be both"))
+    for one, other in itertools.combinations(given, 2):
+        if one.variable != other.variable:
+            continue
+        least, most = (one, other) if one.at_least else (other, one)
+        if one.at_least == other.at_least:
+            faults.append((other.text, f"{other.variable} has another such limit; delete one"))
+        elif least.limit >= most.limit:
+            faults.append((least.text, f"contradicts {most.text}: no result can be both"))
     return faults
-
-
-def _ordered() -> frozenset[tuple[str, str]]:
-    pairs = {("solved_rate", "detection_rate")}
-    for quantity in (*QUANTITIES, *(each for group in SIGNED.values() for each in group)):
-        pairs |= {*itertools.combinations([quantity.named(each) for each in PERCENTS], 2),
-                  (quantity.named("bias"), quantity.named("rmse_unflipped"))}
-    return frozenset(pairs)
-
-
-#: Names of which the first's value is never above the second's.
-ORDERED = _ordered()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -776,8 +746,7 @@ def _rounded(count: float) -> float:
 # The requirements in a pipeline's section [require], their names checked.
 
 def check_required(
-    texts: Iterable[str], source: str, others: PipelineError | None = None,
-    key: str = "require.all",
+    texts: Iterable[str], source: str, others: PipelineError | None = None
 ) -> None:
     """Check the requirements of a pipeline, by what can be required (`requirables`).
 
@@ -789,8 +758,6 @@ def check_required(
         The name that lines begin with.
     others
         The faults that the pipeline has besides.
-    key
-        Where the pipeline has them.
 
     Raises
     ------
@@ -800,7 +767,7 @@ def check_required(
     known = () if others is None else others.faults
     faults = [*known, *(
         plain(line, MAX_LINE_LENGTH) for text, problem in read_requirements(texts)[1]
-        if (line := f"{source}: {key} = {shown(text)}: {problem}") not in known)]
+        if (line := f"{source}: require.all = {shown(text)}: {problem}") not in known)]
     if faults:
         raise PipelineError(faults)
 
@@ -974,26 +941,19 @@ def conditions(
     Returns
     -------
     tuple
-        ``per``, else the pipeline's, else `usual_conditions`.
+        ``per``, else the pipeline's, else the axis of the size in the image, or the first other
+        one with numbers, that of angles, and that of boards, if there are several: what holds of
+        them together holds of none that someone puts up. IDs of markers are no conditions.
     """
     if per is not None:
         return tuple(per)
-    return tuple(
-        name for name in required_per if name in results.dims) or usual_conditions(results)
-
-
-def usual_conditions(results: xr.Dataset) -> tuple[str, ...]:
-    """Return the axis of the size in the image, or the first other one with numbers, and of angles.
-
-    And that of boards, if there are several: what holds of them together holds of none that someone
-    puts up. IDs of markers are no conditions.
-    """
+    if found := tuple(name for name in required_per if name in results.dims):
+        return found
     axes = [name for name in axes_of(results, Stage.scene)
             if name != DRAWS and results.sizes[name] > 1]
-    others = [name for name in axes if name in results.coords and name not in (IDS, *ANGLE_AXES)
-              and results[name].dtype.kind in "fiu"]
-    size = next((name for name in (*SIZE_AXES, *SIZES_BESIDE, *others) if name in axes), None)
-    angle = next((name for name in ANGLE_AXES if name in axes), None)
-    boards = next((name for name in axes if BOARDS in results.coords
-                   and results[BOARDS].dims == (name,)), None)
-    return tuple(dict.fromkeys(name for name in (size, angle, boards) if name))
+    numeric = [name for name in axes if name in results.coords and name not in (IDS, *ANGLE_AXES)
+               and results[name].dtype.kind in "fiu"]
+    boards = [name for name in axes if BOARDS in results.coords and results[BOARDS].dims == (name,)]
+    usual = [next((name for name in names if name in axes), "") for names in (
+        (*SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES, boards)]
+    return tuple(dict.fromkeys(filter(None, usual)))

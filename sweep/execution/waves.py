@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule, digest_of
-from sweep.sampling.rules import Decider, Decision, Waves, condition_axes, make_rule
+from sweep.sampling.rules import Decider, Decision, Waves, make_rule
 from sweep.store.blocks import Receipt, RunStore, committed, receipts
 
 #: Blocks of which nothing is needed that one task writes.
@@ -63,12 +64,12 @@ class InWaves:
         self._read = sorted({"detection", *sampling.variables})
         self._only = only
         self._known: dict[int, _Known] = {}
-        self._settled_shares = np.zeros(self._waves.groups)
+        self._settled_shares = np.zeros(len(self._waves.groups))
         #: Numbers of the blocks that are committed on the basis that they have now.
         self.current: set[int] = set()
         for number, receipt in receipts(store, committed(store)):
             self.committed(number, receipt)
-        self._groups = [self._of_group(group) for group in range(self._waves.groups)]
+        self._groups = [self._of_group(group) for group in range(len(self._waves.groups))]
         self._next = self._next_wave()
 
     @property
@@ -134,28 +135,24 @@ class InWaves:
 def condition_count(pipeline: Pipeline) -> int:
     """Return the number of conditions."""
     return math.prod(len(axis) for axis, kept in zip(
-        condition_axes(pipeline), _conditions(pipeline), strict=True) if kept)
+        pipeline.experiment.scene_axes, _conditions(pipeline), strict=True) if kept)
 
 
 def unsettled_count(store: RunStore) -> int:
     """Return how many conditions of a complete store would need more than ``max_trials``."""
     rule = _rule_of(store)
     decider = Decider.of(store, rule)
-    waves, last = decider.waves, len(decider.waves.ends)
+    decision = Decision(rule, len(rule.ends), tuple(range(len(rule.ends))))
     pooled = tuple(k for k, kept in enumerate(_conditions(store.pipeline)) if not kept)
-    count = 0
-    for group in range(waves.groups):
-        first = next(waves.numbers(group, last - 1))
-        mask = decider.of_group(
-            waves.span(store.blocks[first]), Decision(rule, last, tuple(range(last))))
-        count += int(np.asarray(mask.any(axis=pooled)).sum())
-    return count
+    return sum(int(decider.of_group(group, decision).any(axis=pooled).sum())
+               for group in range(len(decider.waves.groups)))
 
 
 def _conditions(pipeline: Pipeline) -> list[bool]:
-    """Return which of the condition axes make conditions; cells along the others are pooled."""
+    """Return which of the scene axes make conditions; cells along the others are pooled."""
     per = getattr(pipeline.stopping, "per", None)
-    return [per is None or axis.name in per for axis in condition_axes(pipeline)]
+    return [axis.name != TRIAL and (per is None or axis.name in per)
+            for axis in pipeline.experiment.scene_axes]
 
 
 def _rule_of(store: RunStore) -> StoppingRule:

@@ -213,8 +213,7 @@ def _why(choice: Choice, k: int) -> str:
         out.append(reason(answer.next_cause))
     if answer.passing:
         beyond = ", ".join(map(coordinate, answer.passing))
-        failing = ", ".join(coordinate(value) for value, _ in answer.isolated)
-        out.append(f"beyond {failing}, {beyond} keep all limits by estimate")
+        out.append(f"beyond {coordinate(answer.next)}, {beyond} keep all limits by estimate")
     if answer.met and cost is not None and not choice.within_budget(k):
         at = f" at {described(cost.condition)}" if cost.condition else ""
         state = "not within" if cost.low > (choice.budget_ms or 0.0) else "not decided: within"

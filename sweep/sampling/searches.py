@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,67 +14,67 @@ from scipy import special
 
 from sweep.analysis.dataset import sides_of
 from sweep.analysis.decisions import (
+    CONFIDENCE,
     ChoiceCells,
     choice_cells,
-    choice_faults,
-    choice_shares,
     easier_first,
     error_shares,
     met_run,
-    precision_table,
+    precision_reached,
     smaller_upwards,
     wanted_precisions,
 )
+from sweep.analysis.estimator import draws_to_see
+from sweep.analysis.intervals import looks_factor
 from sweep.analysis.poses import ESTIMATE_INPUTS, REQUIRED_VARIABLES
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
+    MIN_DRAWS,
     Decision,
     ErrorShares,
+    Requirable,
     Requirement,
     check_required,
     combined_decision,
     decide,
     kept_by,
     parse_requirements,
+    read_requirements,
 )
-from sweep.errors import DatasetError
-from sweep.experiment.grid import TRIAL
-from sweep.experiment.parameters import Stage
+from sweep.errors import DatasetError, PipelineError
+from sweep.experiment.document import SEARCH
+from sweep.experiment.grid import TRIAL, Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import CHOICES, StoppingRule
+from sweep.experiment.sampling import CHOICES, MAX_TRIALS, StoppingRule
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.messages import refusal
-from sweep.sampling.rules import GroupResults, Stopping, condition_axes, result_dimensions
+from sweep.sampling.rules import Stopping
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # The results of a group of scenes as a dataset, as the analysis reads them.
 
-def group_dataset(results: GroupResults) -> xr.Dataset:
-    """Return the results of a group as a dataset with coordinates of its axes.
+def group_dataset(
+    pipeline: Pipeline, group: Block, values: Mapping[str, NDArray[Any]]
+) -> xr.Dataset:
+    """Return the results of a group of scenes as a dataset with coordinates of its axes.
 
-    Variables that every dataset of results has, and the group has not, are NaN.
+    ``values`` are of variables, in their own dimensions. Other variables that every dataset of
+    results has are NaN.
     """
-    pipeline = results.pipeline
-    scene = condition_axes(pipeline)
-    starts = dict(zip((axis.name for axis in scene), results.starts, strict=True))
-    stops = dict(zip((axis.name for axis in scene), results.stops, strict=True))
+    scene = [axis.name for axis in pipeline.experiment.scene_axes]
+    parts = dict(zip(scene, zip(group.starts, group.stops, strict=True), strict=True))
     coordinates = {
-        axis.name: (axis.name, axis.coordinates(starts.get(axis.name, 0), stops.get(axis.name)),
+        axis.name: (axis.name, axis.coordinates(*parts.get(axis.name, ())),
                     {"zip": " ".join(axis.columns)} if axis.zipped else {})
-        for axis in pipeline.axes if axis.name != TRIAL
-    }
-    coordinates[TRIAL] = (TRIAL, np.arange(results.trials), {})
-    sizes = {name: len(values) for name, (_, values, _) in coordinates.items()}
-    arrays: dict[str, Any] = {}
-    for name in dict.fromkeys([*REQUIRED_VARIABLES, *results.values]):
-        variable = VARIABLES[name]
-        dims = result_dimensions(pipeline, variable)
-        if name in results.values:
-            arrays[name] = (dims, results.values[name])
-        else:
-            shape = [sizes[dim] if dim in sizes else len(LABELS[dim]) for dim in dims]
-            arrays[name] = (dims, np.broadcast_to(np.float32(np.nan), shape))
+        for axis in pipeline.axes}
+    lengths = {name: len(listed) for name, (_, listed, _) in coordinates.items()}
+    arrays = {}
+    for name in dict.fromkeys([*REQUIRED_VARIABLES, *values]):
+        dims = VARIABLES[name].dimensions(pipeline)
+        missing = np.broadcast_to(np.float32(np.nan), [
+            lengths[dim] if dim in lengths else len(LABELS[dim]) for dim in dims])
+        arrays[name] = dims, values.get(name, missing)
     return xr.Dataset(arrays, coordinates)
 
 
@@ -149,37 +149,50 @@ def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Stopping:
         One line for each requirement that is none or cannot be judged within ``max_trials``, for
         those that contradict each other, and for each quantity whose interval cannot be as narrow.
     """
-    axes = condition_axes(pipeline)
-    if rule.kind == "precision":
-        variables, open_cells = _precision(pipeline, rule)
-    else:
-        open_cells = (_limit if rule.kind == "along" else _choice)(pipeline, rule)
-        variables = [name for each in parse_requirements(rule.requirements)
-                     for name in each.requirable.variables]
+    scene = [axis.name for axis in pipeline.experiment.scene_axes]
+    make = {"precision": _precision, "along": _limit}.get(rule.kind, _choice)
+    quantities, open_cells = make(pipeline, rule)
+    variables = [name for each in quantities for name in each.variables]
     free = rule.among if rule.kind in CHOICES else rule.per
 
-    def needed(results: GroupResults) -> Masks:
-        dataset = group_dataset(results)
-        wanted = open_cells(dataset)  # over some axes of the scene
-        pooled = {axis.name: dataset.sizes[axis.name] for axis in axes
-                  if axis.name not in wanted.dims}
-        return np.asarray(
-            wanted.expand_dims(pooled).transpose(*(axis.name for axis in axes)).values)
+    def needed(group: Block, values: Mapping[str, NDArray[Any]]) -> Masks:
+        dataset = group_dataset(pipeline, group, values)
+        wanted = open_cells(dataset)  # over some axes of the scene, and of settings
+        wanted = wanted.any([name for name in wanted.dims if name not in scene])
+        pooled = {name: 1 if name == TRIAL else dataset.sizes[name]
+                  for name in scene if name not in wanted.dims}
+        if rule.along:
+            wanted = wanted.sel({rule.along: dataset[rule.along]})
+        return np.asarray(wanted.expand_dims(pooled).transpose(*scene).values)
 
     return Stopping(rule.ends, tuple(dict.fromkeys([*ESTIMATE_INPUTS, *variables])),
-                    tuple(axis.name for axis in axes if axis.name not in free), needed)
+                    tuple(name for name in scene if name not in (*free, TRIAL)), needed)
 
 
-def _limit(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return a function that tells at which values of the axis trials decide the limit."""
+#: The quantities that a search reads, and what tells the undecided cells of a dataset.
+Search = tuple[list[Requirable], Callable[[xr.Dataset], xr.DataArray]]
+
+
+def product_of(pipeline: Pipeline, names: Iterable[str]) -> int:
+    """Return how many combinations the values of some axes have; other names are no axes."""
+    return math.prod(len(axis) for axis in pipeline.axes if axis.name in {*names})
+
+
+def pooled_cells(pipeline: Pipeline, rule: StoppingRule) -> int:
+    """Return how many cells are pooled: those along axes that have no role in the search."""
+    roles = {TRIAL, rule.along, *rule.among, *rule.per, *rule.at_all}
+    return product_of(pipeline, {axis.name for axis in pipeline.experiment.scene_axes} - roles)
+
+
+def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
+    """Return a search of the values of the axis at which trials decide the limit."""
     check_required(rule.requirements, pipeline.source)
     required = parse_requirements(rule.requirements)
     searched = (*rule.per, *rule.at_all, rule.along)
-    lengths = {axis.name: len(axis) for axis in condition_axes(pipeline)}
-    count = len(required) * math.prod(lengths[name] for name in {rule.along, *rule.at_all})
-    most = rule.max_trials * math.prod(
-        length for name, length in lengths.items() if name not in searched)
-    shares = error_shares(count, len(rule.ends))
+    shares = error_shares(
+        looks_factor(len(rule.ends)),
+        len(required) * product_of(pipeline, (rule.along, *rule.at_all)))
+    most = rule.max_trials * pooled_cells(pipeline, rule)
     upwards = size_shrinks_upwards(pipeline, rule.along)
 
     def open_cells(dataset: xr.Dataset) -> xr.DataArray:
@@ -192,10 +205,9 @@ def _limit(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.
             functools.partial(_of_row, upwards), *arrays,
             input_core_dims=[[rule.along, *inner]] * 3, output_core_dims=[[rule.along, *inner]],
             vectorize=True)
-        others = [name for name in wanted.dims if name not in searched]
-        return wanted.any(others).sel({rule.along: dataset[rule.along]})
+        return wanted
 
-    return open_cells
+    return [each.requirable for each in required], open_cells
 
 
 def may_be_decided(
@@ -269,19 +281,44 @@ def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
     return smaller_upwards(sides, values, along)
 
 
-def _choice(pipeline: Pipeline, rule: StoppingRule) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return a function that tells which cells decide the smallest, or the cheapest, choice."""
-    shares = choice_shares(pipeline, rule)
-    if faults := choice_faults(pipeline, rule, shares):
-        raise refusal([f"{pipeline.source}: {line}" for line in faults])
-    configurations = [axis.name for axis in pipeline.axes_of(Stage.detection, Stage.estimation)]
+def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a choice may spend."""
+    return error_shares(
+        len(rule.ends) * product_of(pipeline, rule.among),
+        product_of(pipeline, (rule.along, *rule.at_all)) * len(rule.requirements))
 
-    def open_cells(dataset: xr.Dataset) -> xr.DataArray:
-        wanted = choice_cells(dataset, rule, shares).needed()
-        wanted = wanted.any([name for name in configurations if name in wanted.dims])
-        return wanted.sel({rule.along: dataset[rule.along]}) if rule.along else wanted
 
-    return open_cells
+def least_draws(requirement: Requirement, share: float) -> int:
+    """Return the draws below which a requirement cannot be decided as met.
+
+    Of a rate, with no failure Clopper and Pearson's end is the tail's n-th root; a quantile needs
+    an order statistic beyond; means are not decided below `MIN_DRAWS`.
+
+    Examples
+    --------
+    >>> least_draws(parse_requirements("detection >= 0.99")[0], 1.0)
+    368
+    """
+    what = requirement.requirable
+    if not what.exact:
+        return MIN_DRAWS
+    # The share of the draws that must not be seen, or must be.
+    below = requirement.limit if what.percent is None else what.percent / 100.0
+    rare = below if requirement.at_least == (what.percent is not None) else 1.0 - below
+    return draws_to_see(rare, what.level(share)) if 0.0 < rare < 1.0 else 1
+
+
+def _choice(pipeline: Pipeline, rule: StoppingRule) -> Search:
+    """Return a search of the cells that decide the smallest, or the cheapest, choice."""
+    shares, required = choice_shares(pipeline, rule), read_requirements(rule.requirements)[0]
+    lines = [
+        _too_few(pipeline, rule, least, f"fewer cannot show {each.text} with "
+                 f"{100 * CONFIDENCE:g} % confidence, even if all meet it")
+        for each in required if (least := least_draws(each, shares.met))]
+    lines = [line for line in lines if line]
+    check_required(rule.requirements, pipeline.source, PipelineError(lines) if lines else None)
+    return [each.requirable for each in required], lambda dataset: choice_cells(
+        dataset, rule, shares).needed()
 
 
 def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> ChoiceCells:
@@ -294,27 +331,25 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> 
 # pose was looked for, or so few have the number that all trials would not give enough
 # (`sweep.analysis.decisions.Reached`).
 
-def _precision(
-    pipeline: Pipeline, rule: StoppingRule
-) -> tuple[list[str], Callable[[xr.Dataset], xr.DataArray]]:
-    """Return the variables that are read, and a function that tells the undecided conditions."""
+def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
+    """Return a search of the conditions at which an interval is wider than was wanted."""
+    widths = dict(rule.precision)
     try:
-        wanted = wanted_precisions(dict(rule.precision))
+        wanted = wanted_precisions(widths)
     except ValueError as error:
         raise refusal([f"{pipeline.source}: search.precision.{line}"
                        for line in str(error).splitlines()]) from None
-    axes = condition_axes(pipeline)
-    pooled = math.prod(len(axis) for axis in axes if axis.name not in rule.per)
-    if too_few := [
-        f"{pipeline.source}: search.max_trials = {rule.max_trials}: expected at least "
-        f"{least:,}: with fewer no interval of {each.name} has a half-width of {each.half_width:g}"
-        for each in wanted
-        if rule.max_trials < (least := math.ceil(each.fewest_draws / pooled))
-    ]:
-        raise refusal(too_few)
-    per = [axis.name for axis in axes if axis.name in rule.per]
+    lines = [_too_few(pipeline, rule, each.fewest_draws, f"with fewer no interval of {each.name} "
+                      f"has a half-width of {each.half_width:g}") for each in wanted]
+    if any(lines):
+        raise refusal(list(filter(None, lines)))
+    return [each.requirable for each in wanted], lambda dataset: ~precision_reached(
+        dataset, widths, rule.per, rule.max_trials)["settled"]
 
-    def open_cells(dataset: xr.Dataset) -> xr.DataArray:
-        return ~precision_table(dataset, wanted, per, trials=rule.ends[-1])["settled"]
 
-    return [name for each in wanted for name in each.requirable.variables], open_cells
+def _too_few(pipeline: Pipeline, rule: StoppingRule, draws: int, why: str) -> str:
+    """Return the fault of ``max_trials`` that are fewer than some draws; empty without one."""
+    least = math.ceil(draws / pooled_cells(pipeline, rule))
+    return "" if least <= rule.max_trials else (
+        f"{pipeline.source}: {SEARCH}.{MAX_TRIALS} = {rule.max_trials}: expected at least "
+        f"{least:,}: {why}")

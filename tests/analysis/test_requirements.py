@@ -163,7 +163,6 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["detektion >= 0.9"], "did you mean detection_rate?"),
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
     (["rotation_error <= 5"], "which statistic of it? There are rotation_median_deg, "),
-    (["x_p95_m <= 0.005", "x_median_m >= 0.01"], "contradicts"),
     (["range_p95_percent <= -1"], "never negative"),
     (["yaw_bias_deg >= -1"], "the absolute value is required"),
     (["rotation_p95_deg >= 200"], "never above 180"),

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from support.searches import DOCUMENT, flags_of
+from support.searches import DOCUMENT, block_of, flags_of, needed_by
 from support.small_datasets import perfect
 from sweep.analysis.decisions import answers, choice_cells
 from sweep.analysis.requirements import Decision, ErrorShares
@@ -13,16 +13,15 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report import decisions as size_lines
-from sweep.sampling.rules import GroupResults, make_rule
+from sweep.sampling.rules import make_rule
 from sweep.sampling.searches import group_dataset, store_cells
 from sweep.tradeoff import choice_search
 
 
-def group(pipeline, rates, trials, generator):
+def found_at(rates, trials, generator):
     """Return results of a group with detections at rates (size, tilt, dictionary)."""
     found = generator.random((3, 2, 2, trials)) < np.asarray(rates)[..., None]
-    flags = flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.rejected), 2)
-    return GroupResults(pipeline, (0, 0, 0), (3, 2, 2), 1, trials, flags)
+    return flags_of(np.where(found, DetectionStatus.detected, DetectionStatus.rejected), 2)
 
 
 @pytest.fixture
@@ -37,8 +36,8 @@ def chosen(monkeypatch):
         found = np.arange(trials) < np.round(trials * np.asarray(rates))[..., None]
         detection = np.where(found, DetectionStatus.detected, DetectionStatus.rejected)
         detection[np.isnan(rates)] = DetectionStatus.not_visible
-        results = group_dataset(
-            GroupResults(pipeline, (0, 0), (3, 2), 1, trials, flags_of(detection)))
+        values = flags_of(detection)
+        results = group_dataset(pipeline, block_of(values), values)
         monkeypatch.setattr(choice_search, "execute", lambda *_, **__: SimpleNamespace(
             store="runs/a.zarr", warnings=()))
         monkeypatch.setattr(choice_search, "open_dataset", lambda _: results)
@@ -77,12 +76,12 @@ def test_trials_are_needed_up_to_the_first_size_that_fails():
     rule = make_rule(pipeline)
     rates = np.ones((3, 2, 2))
     rates[2, 1, 0] = 0.0
-    needed = rule.needed(group(pipeline, rates, 50, np.random.default_rng(1)))
+    needed = needed_by(rule, found_at(rates, 50, np.random.default_rng(1)))
     assert rule.coupled == ("size_m", "tilt_deg")
     assert needed[:, :, 1].all()
     assert needed[:, :, 0].tolist() == [[False, False], [True, True], [False, False]]
     rates = np.ones((3, 2, 2))
-    assert not rule.needed(group(pipeline, rates, 400, np.random.default_rng(1))).any()
+    assert not needed_by(rule, found_at(rates, 400, np.random.default_rng(1))).any()
 
 
 def test_answers_name_the_next_size_and_what_it_fails_by():
@@ -90,7 +89,8 @@ def test_answers_name_the_next_size_and_what_it_fails_by():
     rates = np.ones((3, 2, 2))
     rates[0, 1, 1] = 0.3
     rates[1] = [[1.0, 1.0], [0.2, 1.0]]
-    results = group_dataset(group(pipeline, rates, 400, np.random.default_rng(2)))
+    flags = found_at(rates, 400, np.random.default_rng(2))
+    results = group_dataset(pipeline, block_of(flags), flags)
     found = answers(store_cells(results, pipeline, pipeline.stopping))
     by = {tuple(each.alternative.values()): each for each in found}
     assert list(by) == [(dictionary, solver) for dictionary in ("DICT_4X4_50", "DICT_6X6_50")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from support.searches import flags_of, searched, true_limits
+from support.searches import block_of, flags_of, searched, true_limits
 from sweep.analysis.decisions import requirement_limits
 from sweep.analysis.intervals import looks_factor
 from sweep.analysis.requirements import Decision
@@ -14,7 +14,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import DetectionStatus
 from sweep.report.decisions import limit_table, limits_as_json
-from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import (
     BEYOND,
     group_dataset,
@@ -123,7 +122,8 @@ def test_the_hard_end_of_an_axis_is_the_same_for_the_search_and_for_its_results(
         "axes": {"size_m": [0.1, 0.2], "trial": 50}})
     detection = np.full((2, 50), DetectionStatus.detected, np.uint8)
     detection[1] = DetectionStatus.rejected
-    results = group_dataset(GroupResults(pipeline, (0,), (2,), 1, 50, flags_of(detection)))
+    values = flags_of(detection)
+    results = group_dataset(pipeline, block_of(values), values)
     results.attrs["pipeline"] = pipeline.text
     harder = requirement_limits(results, ["detection >= 0.9"], "size_m").attrs["harder"]
     assert size_shrinks_upwards(pipeline, "size_m") is False

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from support.searches import flags_of
-from sweep.analysis.decisions import wanted_precisions
+from support.searches import flags_of, needed_by
+from support.small_datasets import perfect
+from sweep.analysis.decisions import Reached, precision_reached, wanted_precisions
 from sweep.analysis.estimator import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.sampling.rules import GroupResults, make_rule
+from sweep.sampling.rules import make_rule
 
 TEXT = """
 seed = 3
@@ -25,7 +26,7 @@ def pipeline_of(wanted):
     return Pipeline.from_text(TEXT.replace("WANTED", wanted), name="precise")
 
 
-def results_of(pipeline, trials, detected, sigma=(1.0, 1.0), seed=0):
+def results_of(trials, detected, sigma=(1.0, 1.0), seed=0):
     """Return results of both markers, with errors of the range in percent (normal)."""
     rng = np.random.default_rng(seed)
     shape = (2, 4, trials)
@@ -35,23 +36,27 @@ def results_of(pipeline, trials, detected, sigma=(1.0, 1.0), seed=0):
     errors[~found] = np.nan
     truth = np.zeros((*shape, 3))
     truth[..., 2] = 1.0
-    return GroupResults(pipeline, (0, 0), (2, 4), 1, trials, {
-        **flags_of(flags, 2), "rotation_error_rad": errors, "translation_error_m": errors,
-        "true_tvec_m": truth,
-    })
+    return {
+        **flags_of(flags, 2), "true_tvec_m": truth, **dict.fromkeys(
+            ("rotation_error_rad", "translation_error_m"), errors.swapaxes(2, 3)),
+    }
+
+
+def needed(pipeline, results):
+    rule = make_rule(pipeline)
+    return needed_by(rule, {name: results[name] for name in rule.variables})
 
 
 @pytest.mark.parametrize("trials", [50, 75, 600])
 def test_a_rate_needs_trials_until_its_interval_is_narrow(trials):
     pipeline = pipeline_of("detection_rate = 0.04")
-    results = results_of(pipeline, trials, [0.0, 0.02, 0.5, 1.0])
+    results = results_of(trials, [0.0, 0.02, 0.5, 1.0])
     expected = []
     for k in range(4):
-        hits = int((results.values["detection"][:, k] == 1).sum())  # both markers together
+        hits = int((results["detection"][:, k] == 1).sum())  # both markers together
         ends = stats.binomtest(hits, 2 * trials).proportion_ci(0.97, method="exact")
         expected.append((ends.high - ends.low) / 2 > 0.04)
-    needed = make_rule(pipeline).needed(results)
-    assert needed.tolist() == [expected, expected]
+    assert needed(pipeline, results).tolist() == [expected, expected]
 
 
 @pytest.mark.parametrize(("wanted", "expected"), [
@@ -63,26 +68,34 @@ def test_a_rate_needs_trials_until_its_interval_is_narrow(trials):
 ])
 def test_every_quantity_must_be_known_relative_to_the_root_mean_square(wanted, expected):
     pipeline = pipeline_of(wanted)
-    needed = make_rule(pipeline).needed(results_of(pipeline, 600, [1.0] * 4))
-    assert needed.all() == needed.any() == expected
+    more = needed(pipeline, results_of(600, [1.0] * 4))
+    assert more.all() == more.any() == expected
 
 
 def test_a_configuration_of_which_too_little_is_known_needs_more():
     """One solver's quantiles are infinite half of the time."""
     pipeline = pipeline_of('range_median_percent = "20 %"')
-    results = results_of(pipeline, 600, [1.0] * 4)
-    assert not make_rule(pipeline).needed(results).any()
-    results.values["estimate"][:, 2, ::2, 1] = EstimateStatus.solver_failed
-    assert make_rule(pipeline).needed(results).any(axis=0).tolist() == [False, False, True, False]
+    results = results_of(600, [1.0] * 4)
+    assert not needed(pipeline, results).any()
+    results["estimate"][:, 2, 1, ::2] = EstimateStatus.solver_failed
+    assert needed(pipeline, results).any(axis=0).tolist() == [False, False, True, False]
 
 
 def test_what_cannot_be_seen_or_solved_is_settled():
     pipeline = pipeline_of('range_rmse_percent = "5 %"')
-    results = results_of(pipeline, 300, [0.0, 0.5, 0.5, 0.5])
-    results.values["detection"][:, 3] = DetectionStatus.not_visible
-    results.values["estimate"][:, 3] = EstimateStatus.no_detection
-    needed = make_rule(pipeline).needed(results)
-    assert needed.tolist() == [[False, True, True, False]] * 2
+    results = results_of(300, [0.0, 0.5, 0.5, 0.5])
+    results["detection"][:, 3] = DetectionStatus.not_visible
+    results["estimate"][:, 3] = EstimateStatus.no_detection
+    assert needed(pipeline, results).tolist() == [[False, True, True, False]] * 2
+
+
+@pytest.mark.parametrize(("most", "reached"), [(49, "not_reached"), (50, "too_rare")])
+def test_a_rate_is_too_rare_where_all_trials_could_give_enough(most, reached):
+    """One of all poses is looked for: 50 trials would be enough if they all were."""
+    results = perfect(np.random.default_rng(1), {"trial": most, "solver": 1})
+    results["detection"].values[1:] = DetectionStatus.not_visible
+    table = precision_reached(results, {"detection": 0.02})
+    assert Reached(table["reached"].item()).name == reached
 
 
 @pytest.mark.parametrize("width", [0.49, 0.05, 0.01])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from support.searches import DOCUMENT, changed
+from support.searches import changed
 from sweep.errors import PipelineError
 from sweep.experiment.pipeline import Pipeline
 from sweep.sampling.rules import make_rule
@@ -47,4 +47,3 @@ def test_all_faults_come_at_once():
     lines = faults_of(search=PRECISION | {"precision": unknown})
     assert len(lines) == 3
     assert "nothing of this name has an interval; did you mean detection_rate?" in lines[0]
-    assert DOCUMENT["search"]["smallest"] == "size_m"

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from support.searches import flags_of
+from support.searches import flags_of, needed_by
 from sweep.analysis.decisions import wanted_precisions
 from sweep.analysis.estimator import Columns, Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import Poses
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, Flipped
-from sweep.sampling.rules import GroupResults, make_rule
+from sweep.sampling.rules import make_rule
 
 REPETITIONS = 2000
 FEWEST = int(stats.binom.ppf(1e-6, REPETITIONS, 0.95))
@@ -108,10 +108,9 @@ def test_intervals_with_which_sampling_stops_cover_the_truth(
     values = {"true_tvec_m": np.broadcast_to([0.0, 0.0, 1.0], (REPETITIONS, most, 3)),
               **draw(np.random.default_rng(20), (REPETITIONS, most))}
     left, held = np.arange(REPETITIONS), 0
-    for wave, end in enumerate(rule.ends, 1):
+    for end in rule.ends:
         now = {key: array[left, :end] for key, array in values.items()}
-        results = GroupResults(pipeline, (0,), (len(left),), wave, end, now)
-        stop = np.ones(len(left), bool) if end == most else ~rule.needed(results)
+        stop = np.ones(len(left), bool) if end == most else ~needed_by(rule, now)
         if stop.any():
             low, high = intervals(wanted, {key: array[stop] for key, array in now.items()})
             held += int(((low <= truth) & (truth <= high)).sum())

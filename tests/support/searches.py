@@ -3,9 +3,9 @@
 import numpy as np
 
 from sweep.analysis.decisions import requirement_limits
+from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import group_dataset, search_rule
 
 DOCUMENT = {
@@ -40,12 +40,12 @@ def pipeline_of(curves, values, text, most):
 
 
 def flags_of(detection, solvers=None):
-    """Return the values of a group with these flags of detection, for a number of solvers."""
+    """Return the values of a group with flags of detection (..., trial), for some solvers."""
     detected = detection == DetectionStatus.detected
     unneeded = detection == DetectionStatus.not_needed
     if solvers is not None:
         detected, unneeded = (
-            np.repeat(each[..., None], solvers, axis=-1) for each in (detected, unneeded))
+            np.repeat(each[..., None, :], solvers, axis=-2) for each in (detected, unneeded))
     return {
         "detection": detection.astype(np.uint8),
         "estimate": np.select([detected, unneeded],
@@ -56,6 +56,16 @@ def flags_of(detection, solvers=None):
     }
 
 
+def block_of(values):
+    """Return the group of all scenes of some values, whose last axis is ``trial``."""
+    return Block((0,) * values["detection"].ndim, values["detection"].shape)
+
+
+def needed_by(rule, values):
+    """Return which cells (axes of the scene but ``trial``) a rule needs more trials of."""
+    return rule.needed(block_of(values), values)[..., 0]
+
+
 def searched(curves, values, text, most, seed):
     """Return the limits that a search finds on curves (conditions, values) of rates."""
     pipeline = pipeline_of(curves, values, text, most)
@@ -64,19 +74,18 @@ def searched(curves, values, text, most, seed):
     shape = curves.shape
     detection = np.full((*shape, most), DetectionStatus.not_needed, dtype=np.uint8)
     needed, first = np.ones(shape, dtype=bool), 0
-    for wave, end in enumerate(rule.ends, start=1):
+    for end in rule.ends:
         hits = rng.random((*shape, end - first)) < curves[..., None]
         found = np.where(hits, DetectionStatus.detected, DetectionStatus.no_candidate)
         detection[..., first:end] = np.where(
             needed[..., None], found, DetectionStatus.not_needed)
         first = end
         if end < most:
-            needed = rule.needed(GroupResults(
-                pipeline, (0, 0), shape, wave, end, flags_of(detection[..., :end].copy())))
+            needed = needed_by(rule, flags_of(detection[..., :end].copy()))
         if not needed.any():
             break
-    results = group_dataset(GroupResults(
-        pipeline, (0, 0), shape, len(rule.ends), most, flags_of(detection)))
+    values = flags_of(detection)
+    results = group_dataset(pipeline, block_of(values), values)
     results.attrs["pipeline"] = pipeline.text
     return requirement_limits(results)
 

@@ -122,10 +122,6 @@ class Waves:
             for name, length, extent in zip(names, blocks.lengths, blocks.extents, strict=True))
         return Waves(blocks, Blocks(blocks.lengths, extents), trial, rule.ends)
 
-    def group(self, number: int) -> int:
-        """Return the number of the group that a block belongs to."""
-        return self.groups.number(self.blocks[number])
-
     def numbers(self, group: int, first: int, last: int | None = None) -> Iterator[int]:
         """Yield the numbers of a group's blocks in the waves ``first`` to ``last``, from 0.
 

@@ -53,6 +53,6 @@ def test_each_block_is_in_one_wave_of_one_group(extents, pipeline):
     assert sorted(number for number, _, _ in found) == list(range(len(blocks)))
     for number, group, wave in found:
         block = blocks[number]
-        assert waves.group(number) == group
+        assert waves.groups.number(block) == group
         assert (0, *rule.ends)[wave] <= block.starts[2] < block.stops[2] <= rule.ends[wave]
         assert group == block.starts[1] // extents[1]  # tilt_deg is pooled

@@ -449,8 +449,6 @@ def sampling_text(results: xr.Dataset) -> str:
 #: Label of a value that the attributes do not name.
 UNKNOWN = "unknown"
 
-#: Where a table of labels has :data:`UNKNOWN`: flags are stored as uint8, and none has so many.
-UNNAMED = 255
 
 def decode_flags(results: Labelled) -> Labelled:
     """Return results with every flag in words: ``"detected"`` in place of 1.
@@ -497,13 +495,12 @@ def _decoded(variable: xr.DataArray) -> xr.DataArray:
     values = np.atleast_1d(np.asarray(attributes.pop("flag_values", [])))
     if not meanings or len(meanings) != len(values) or variable.dtype.kind not in "uif":
         return variable
-    labels = np.full(256, UNKNOWN, dtype=f"U{max(map(len, (*meanings, UNKNOWN)))}")
-    labels[values.astype(np.intp)] = meanings
+    labels, ascending = np.array([*meanings, UNKNOWN]), np.argsort(values)
 
     def look_up(flags: NDArray[Any]) -> NDArray[Any]:
-        known = np.nan_to_num(flags, nan=0.0) if flags.dtype.kind == "f" else np.asarray(flags)
-        index = np.clip(known, 0, UNNAMED).astype(np.uint8)
-        return labels[np.where(index == known, index, UNNAMED)]
+        flags = np.nan_to_num(flags, nan=0.0)
+        at = ascending[np.searchsorted(values, flags, sorter=ascending).clip(max=len(values) - 1)]
+        return labels[np.where(values[at] == flags, at, -1)]
 
     words: xr.DataArray = xr.apply_ufunc(
         look_up, variable, dask="parallelized", output_dtypes=[labels.dtype]

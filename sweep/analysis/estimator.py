@@ -679,16 +679,17 @@ def outward(
 
 
 def newcombe_and_mcnemar(
-    both: Integers, first: Integers, second: Integers, neither: Integers, draws: Integers,
-    drawn: Masks, level: float = LEVEL,
+    counts: Sequence[Integers], draws: Integers, drawn: Masks, level: float = LEVEL
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the difference of two paired rates, its interval's ends, and McNemar's p-value.
 
-    ``both``, ``first`` (alone), ``second`` (alone) and ``neither`` are counts of pairs, scaled to
-    ``draws`` if these are fewer; without ``drawn`` the interval and the p-value are NaN.
+    ``counts`` are of the pairs of which both, the first alone, the second alone, and neither are
+    hits. They are scaled to ``draws`` if these are fewer; without ``drawn`` the interval and the
+    p-value are NaN.
     Newcombe, Statistics in Medicine 17 (1998), pages 2635-2650, method 10, with the continuity
     correction of the correlation; the test is the exact binomial one of the discordant pairs.
     """
+    both, first, second, neither = counts
     n = both + first + second + neither
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = draws / np.maximum(n, 1)

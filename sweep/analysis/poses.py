@@ -571,6 +571,10 @@ SIGNED: dict[str, tuple[Quantity, ...]] = {
 }
 
 
+#: Kinds of error by name.
+ALL_QUANTITIES = {each.name: each for group in (QUANTITIES, *SIGNED.values()) for each in group}
+
+
 def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
     """Return the quantities of some names of quantities or groups, each once; default `QUANTITIES`.
 
@@ -586,8 +590,7 @@ def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
     """
     if names is None:
         return list(QUANTITIES)
-    known: dict[str, tuple[Quantity, ...]] = {each.name: (each,) for each in QUANTITIES}
-    known |= {each.name: (each,) for group in SIGNED.values() for each in group} | SIGNED
+    known = {name: (each,) for name, each in ALL_QUANTITIES.items()} | SIGNED
     if isinstance(names, str):
         names = (names,)
     if not isinstance(names, Iterable) or not (wanted := list(names)):

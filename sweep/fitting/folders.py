@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import simulation_gap
-from sweep.analysis.simulation_gaps import GAP_STATISTICS
+from sweep.analysis.comparisons import GAP_STATISTICS
 from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document

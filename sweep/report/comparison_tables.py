@@ -8,17 +8,17 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.dataset import each_cell
-from sweep.analysis.estimator import Bins
-from sweep.analysis.poses import QUANTITIES
-from sweep.analysis.simulation_gaps import (
+from sweep.analysis.comparisons import (
+    GAP_RATES,
     GAP_STATISTICS,
-    RATES,
     SOURCES,
     ComparedRate,
     SolvedQuantile,
     matched_sides,
 )
+from sweep.analysis.dataset import each_cell
+from sweep.analysis.estimator import Bins
+from sweep.analysis.poses import QUANTITIES
 from sweep.report.figure import Figure
 from sweep.report.table import (
     Column,
@@ -78,7 +78,7 @@ def gap_lines(gap: xr.Dataset) -> list[str]:
 
 
 def _scale(each: ComparedRate | SolvedQuantile) -> float:
-    return 100.0 if each in RATES else 1.0
+    return 100.0 if each in GAP_RATES else 1.0
 
 
 #: Configurations that are drawn, two panels each.

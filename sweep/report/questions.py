@@ -17,7 +17,7 @@ from typing import Any
 import xarray as xr
 
 from sweep.analysis import simulation_gap
-from sweep.analysis.comparisons import regressions, store_differences
+from sweep.analysis.comparisons import is_measured, regressions, store_differences
 from sweep.analysis.requirements import (
     Decision,
     check_required,
@@ -27,7 +27,6 @@ from sweep.analysis.requirements import (
     parse_requirements,
     verdicts,
 )
-from sweep.analysis.simulation_gaps import is_measured
 from sweep.errors import ArgumentError
 from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute

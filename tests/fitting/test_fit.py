@@ -9,7 +9,7 @@ import xarray as xr
 import sweep
 from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
-from sweep.analysis.simulation_gaps import GAP_STATISTICS
+from sweep.analysis.comparisons import GAP_STATISTICS
 from sweep.fitting.folders import REPEATS, HeldOut
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import shlex
@@ -24,6 +23,7 @@ from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
 from sweep.store.lifecycle import finish, open_store, reopen
 from sweep.store.lock import changing, is_written
+from sweep.typing import Integers
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,18 +48,26 @@ class Totals:
         Counts of cells; the flag is the index.
     processors
         Blocks by the features of the processors that computed them.
-    cells
-        Kind -> failed and crashed cells, at most :data:`MAX_ROWS` of each.
+    failed, crashed
+        Such cells, at most :data:`MAX_ROWS` of each.
     """
 
     blocks: int = 0
     scenes: int = 0
     needed: int = 0
-    detection: list[int] = field(default_factory=lambda: [0] * len(DetectionStatus))
-    estimate: list[int] = field(default_factory=lambda: [0] * len(EstimateStatus))
+    detection: Integers = field(default_factory=lambda: np.zeros(len(DetectionStatus), np.int64))
+    estimate: Integers = field(default_factory=lambda: np.zeros(len(EstimateStatus), np.int64))
     processors: Counter[str] = field(default_factory=Counter)
-    cells: dict[str, list[FailedCell]] = field(
-        default_factory=lambda: {"failed": [], "crashed": []})
+    failed: list[FailedCell] = field(default_factory=list)
+    crashed: list[FailedCell] = field(default_factory=list)
+
+    @staticmethod
+    def of(receipts: Iterable[tuple[int, Receipt]]) -> Totals:
+        """Return the totals of the receipts of blocks."""
+        totals = Totals()
+        for _, receipt in receipts:
+            totals.add(receipt)
+        return totals
 
     def add(self, receipt: Receipt) -> None:
         """Add the receipt of another block."""
@@ -67,15 +75,12 @@ class Totals:
         self.scenes += receipt.scenes
         self.needed += receipt.scenes_needed
         self.processors.update(receipt.processors)
-        self._count(receipt.detection, receipt.estimate)
+        self.detection[: len(receipt.detection)] += receipt.detection
+        self.estimate[: len(receipt.estimate)] += receipt.estimate
         for cell in receipt.failures:
-            if len(self.cells[cell.kind]) < MAX_ROWS:
-                self.cells[cell.kind].append(cell)
-
-    def _count(self, *added: Sequence[int]) -> None:
-        for counts, more in zip((self.detection, self.estimate), added, strict=True):
-            for flag, count in enumerate(more):
-                counts[flag] += count
+            listed = self.failed if cell.kind == "failed" else self.crashed
+            if len(listed) < MAX_ROWS:
+                listed.append(cell)
 
     @staticmethod
     def of_finished(store: RunStore) -> Totals:
@@ -86,14 +91,13 @@ class Totals:
         StoreError
             If cells failed, and a receipt that may record them is damaged.
         """
-        counts, totals = store.run_metadata["counts"], Totals()
-        totals._count(counts["detection"], counts["estimate"])
-        totals.processors.update(counts.get("processors") or {})
+        counts = store.run_metadata["counts"]
+        totals = Totals(
+            detection=np.array(counts["detection"]), estimate=np.array(counts["estimate"]),
+            processors=Counter(counts["processors"]))
         if any(totals.lost.values()):
-            listed = Totals()
-            for _, receipt in blocks.receipts(store, blocks.committed(store)):
-                listed.add(receipt)
-            totals.cells = listed.cells
+            listed = Totals.of(blocks.receipts(store, blocks.committed(store)))
+            totals.failed, totals.crashed = listed.failed, listed.crashed
         return totals
 
     @property
@@ -102,16 +106,16 @@ class Totals:
         return _lost(self.detection, self.estimate)
 
 
-def _lost(detection: Sequence[int], estimate: Sequence[int]) -> dict[str, int]:
+def _lost(detection: Iterable[int], estimate: Iterable[int]) -> dict[str, int]:
     """Return how many cells crashed and failed, from counts by flag."""
-    stages = _by_name(DetectionStatus, detection), _by_name(EstimateStatus, estimate)
-    return {kind: sum(counts[kind] for counts in stages) for kind in ("crashed", "failed")}
+    both = _by_name(DetectionStatus, detection) + _by_name(EstimateStatus, estimate)
+    return {kind: both[kind] for kind in ("crashed", "failed")}
 
 
 def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:
     """Return the counts of the flags that occur, by name."""
     return Counter({
-        flag.name: count for flag, count in zip(flags, counts, strict=False) if count})
+        flag.name: int(count) for flag, count in zip(flags, counts, strict=False) if count})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -169,15 +173,14 @@ def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
     >>> [(group.reason, group.count, group.at) for group in failure_groups(cells)]
     [('ValueError: 3 px', 2, 'trial=3')]
     """
-    first: dict[tuple[str, str, str], FailedCell] = {}
-    counts: dict[tuple[str, str, str], int] = {}
+    alike: dict[tuple[str, str, str], list[FailedCell]] = {}
     for cell in cells:
         key = cell.kind, cell.stage, _VARYING.sub("#", cell.reason)
-        first.setdefault(key, cell)
-        counts[key] = counts.get(key, 0) + 1
+        alike.setdefault(key, []).append(cell)
     groups = [
-        FailureGroup(cell.kind, cell.stage, plain(cell.reason, MAX_REASON), counts[key], cell.at)
-        for key, cell in first.items()
+        FailureGroup(
+            some[0].kind, some[0].stage, plain(some[0].reason, MAX_REASON), len(some), some[0].at)
+        for some in alike.values()
     ]
     return sorted(groups, key=lambda group: -group.count)
 
@@ -221,19 +224,35 @@ def outcome_of(url: str, totals: Totals, first: str) -> Outcome:
     first
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
-    groups = failure_groups([*totals.cells["failed"], *totals.cells["crashed"]])
-    stages = _by_name(DetectionStatus, totals.detection), _by_name(EstimateStatus, totals.estimate)
-    shares, lines = zip(*map(_lost_share, ("detections", "estimates"), stages), strict=True)
-    warnings = list(filter(None, lines))
-    advice = ""
+    groups = failure_groups([*totals.failed, *totals.crashed])
+    shares, warnings, advice = list[float](), list[str](), ""
+    counts = {"detections": _by_name(DetectionStatus, totals.detection),
+              "estimates": _by_name(EstimateStatus, totals.estimate)}
+    for cells, flags in counts.items():
+        kinds = [kind for kind in ("failed", "crashed") if flags[kind]]
+        lost = sum(flags[kind] for kind in kinds)
+        tried = flags.total() - sum(flags[name] for name in NOT_TRIED)
+        share = lost / tried if lost else 0.0
+        shares.append(share)
+        if share == 1.0:
+            warnings.append(f"nothing computed: all {lost:,} {cells} {' or '.join(kinds)}")
+        elif lost:
+            listed = " and ".join(f"{flags[kind]:,} {kind}" for kind in kinds)
+            percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
+            warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
+                            f"{tried:,} {cells} ({percent})")
+    warnings += [f"  {group.count:,} x {group.kind} in {group.stage}: {group.reason}"
+                 for group in groups[:MAX_GROUPS]]
+    if others := groups[MAX_GROUPS:]:
+        rest = sum(group.count for group in others)
+        warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
     if groups:
-        warnings += _listed(groups)
         advice = repro_command(url, [group.at for group in groups])
-    if 1.0 not in shares and (nothing := _nothing_found(*stages)):
+    if 1.0 not in shares and (nothing := _nothing_found(*counts.values())):
         warnings.append(nothing)
         advice = advice or f"{repro_command(url, [first])} -o scene.png"
     warnings += differing_processors(totals.processors, "blocks")
-    return Outcome(1.0 in shares, max(shares), groups, warnings, advice)
+    return Outcome(1.0 in shares, round(max(shares), 6), groups, warnings, advice)
 
 
 def outcome_of_store(store: RunStore, totals: Totals) -> Outcome:
@@ -242,33 +261,6 @@ def outcome_of_store(store: RunStore, totals: Totals) -> Outcome:
     outcome = outcome_of(store.url, totals, first)
     outcome.warnings.extend(bound_notes(store.pipeline))
     return outcome
-
-
-def _lost_share(cells: str, counts: Counter[str]) -> tuple[float, str]:
-    """Return the share of ``cells`` that failed or crashed, and a line on them if there are any."""
-    kinds = [kind for kind in ("failed", "crashed") if counts[kind]]
-    lost = counts["failed"] + counts["crashed"]
-    tried = counts.total() - sum(counts[flag] for flag in NOT_TRIED)
-    if not lost:
-        return 0.0, ""
-    if lost == tried:
-        return 1.0, f"nothing computed: all {lost:,} {cells} {' or '.join(kinds)}"
-    share = lost / tried
-    loud = "warning: " if share > LOUD_SHARE else ""
-    listed = " and ".join(f"{counts[kind]:,} {kind}" for kind in kinds)
-    percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
-    return share, f"{loud}{listed} of {tried:,} {cells} ({percent})"
-
-
-def _listed(groups: Sequence[FailureGroup]) -> list[str]:
-    lines = [
-        f"  {group.count:,} x {group.kind} in {group.stage}: {group.reason}"
-        for group in groups[:MAX_GROUPS]
-    ]
-    if len(groups) > MAX_GROUPS:
-        rest = sum(group.count for group in groups[MAX_GROUPS:])
-        lines.append(f"  {rest:,} x for {len(groups) - MAX_GROUPS:,} other reasons")
-    return lines
 
 
 def repro_command(url: str, cells: Sequence[str]) -> str:
@@ -283,15 +275,12 @@ def repro_command(url: str, cells: Sequence[str]) -> str:
 
 def _nothing_found(detection: Counter[str], estimate: Counter[str]) -> str:
     """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
-    if not detection["detected"]:
-        flags: type[Flag] = DetectionStatus
-        counts, what = detection, "nothing was detected"
-    elif not any(estimate[flag.name] for flag in EstimateStatus if flag.present):
+    flags: type[Flag] = DetectionStatus
+    counts, what = detection, "nothing was detected"
+    if detection["detected"]:
         flags, counts, what = EstimateStatus, estimate, "no pose was estimated"
-    else:
-        return ""
     needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
-    if not needed:
+    if not needed or any(flags[name].present for name in needed):
         return ""
     ((name, count),) = needed.most_common(1)
     return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
@@ -318,7 +307,7 @@ def close(store: RunStore) -> None:
         if receipt.seconds["scene"]:
             costs[number] = receipt.seconds
     counts: dict[str, Any] = {
-        "detection": totals.detection, "estimate": totals.estimate,
+        "detection": totals.detection.tolist(), "estimate": totals.estimate.tolist(),
         "processors": dict(totals.processors),
     }
     if store.pipeline.stopping is not None:
@@ -333,13 +322,10 @@ def _failure_table(totals: Totals) -> xr.Dataset:
     """Return the table of failures, with the total number of cells of each kind."""
     import xarray as xr  # noqa: PLC0415  (slow to import)
 
-    cells = [*totals.cells["failed"], *totals.cells["crashed"]]
-
-    def column(name: str) -> tuple[tuple[str], Any]:
-        return ("failure",), np.array([getattr(cell, name) for cell in cells], dtype=object)
-
+    cells = [*totals.failed, *totals.crashed]
     return xr.Dataset(
-        {name: column(name) for name in ("at", "kind", "stage", "text")},
+        {name: ("failure", np.array([getattr(cell, name) for cell in cells], dtype=object))
+         for name in ("at", "kind", "stage", "text")},
         attrs={
             "long_name": "scenes that raised or ended their process",
             "rows_kept": f"at most {MAX_ROWS} of each kind, and {blocks.MAX_PER_BLOCK} of a block",
@@ -415,58 +401,84 @@ def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# The result of a run, in one record.
+# The totals of a store in one record: the summary of a run, and the status of a store.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Summary(Outcome):
-    """The result of a run; ``sweep run --json`` prints it.
+class Account(Outcome):
+    """What a summary and a status have in common.
 
     Attributes
     ----------
     store
         The store as it was given, or the default.
+    poses, blocks
+        Cells of the grid's scene axes; blocks of the store.
+    looked_for
+        Detections that count in rates, over all detector settings: what is not visible, not
+        modelled or not needed is not looked for.
+    needed, conditions
+        Of a run in waves, how many of the committed poses were needed, and the conditions; None of
+        a run of fixed trials.
+    """
+
+    store: str
+    poses: int
+    blocks: int
+    looked_for: int
+    needed: int | None = None
+    conditions: int | None = None
+
+
+def _account(store: RunStore, totals: Totals, needed: int) -> dict[str, Any]:
+    """Return the fields of an account."""
+    outcome, in_waves = outcome_of_store(store, totals), store.pipeline.stopping is not None
+    return {
+        **{name: getattr(outcome, name) for name in Outcome.__slots__},
+        "store": store.url,
+        "poses": store.pipeline.size(Stage.scene),
+        "blocks": len(store.blocks),
+        "looked_for": int(looked_for(totals.detection.tolist())),
+        "needed": needed if in_waves else None,
+        "conditions": condition_count(store.pipeline) if in_waves else None,
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary(Account):
+    """The result of a run; ``sweep run --json`` prints it.
+
+    Attributes
+    ----------
     data
         What ``xarray.open_zarr`` opens.
-    poses
-        Cells of the grid's scene axes.
     results
         Estimates: poses times detector settings times estimators.
-    detected, looked_for
-        Markers that were detected, of those that were looked for, over all detector settings: what
-        is not visible, not modelled or not needed is not looked for.
-    blocks
-        Blocks of the store.
+    detected
+        Markers that were detected, over all detector settings.
     computed_blocks, computed_scenes, computed_estimates
         What this run computed; the rest was committed before, or reused from other stores.
     seconds
         Duration of this run.
     crashed, failed
         Cells that are flagged so.
-    needed, conditions, unsettled
-        Of a run in waves, the poses that were needed, the conditions, and those of them that would
-        need more than ``max_trials``; None of a run of fixed trials.
     retried, recovered
         Failed and crashed cells that were tried again, and those that did not fail again.
+    unsettled
+        Of a run in waves, conditions that would need more than ``max_trials``.
     """
 
-    store: str
     data: str
-    poses: int
     results: int
     detected: int
-    looked_for: int
-    blocks: int
     computed_blocks: int
     computed_scenes: int
     computed_estimates: int
     seconds: float
-    crashed: int = 0
-    failed: int = 0
-    retried: int = 0
-    recovered: int = 0
-    needed: int | None = None
-    conditions: int | None = None
-    unsettled: int | None = None
+    crashed: int
+    failed: int
+    retried: int
+    recovered: int
+    unsettled: int | None
 
     @property
     def detected_line(self) -> str:
@@ -495,54 +507,31 @@ def summary_of(
     StoreError
         If blocks, chunks of them, or receipts that tell of failures are missing.
     """
-    totals = Totals.of_finished(store)
-    sampled = store.run_metadata["counts"].get("sampled") or {}
-    tried = sum(retried.values())
+    totals, rule = Totals.of_finished(store), store.pipeline.stopping
+    sampled = store.run_metadata["counts"].get("sampled", {})
+    account, unsettled = _account(store, totals, sampled.get("needed", 0)), sampled.get("unsettled")
+    # A search says itself what it does not know.
+    if unsettled and rule is not None and rule.precision:
+        account["warnings"].append(
+            f"warning: {unsettled:,} of {account['conditions']:,} conditions are not settled after "
+            f"all {rule.max_trials:,} trials; the report's table of precision names them")
+    tried, lost = sum(retried.values()), totals.lost
     return Summary(
-        store=store.url,
+        **account,
         data=store.data_url,
-        poses=store.pipeline.size(Stage.scene),
         results=math.prod(len(axis) for axis in store.pipeline.axes),
-        detected=totals.detection[DetectionStatus.detected],
-        looked_for=looked_for(totals.detection),
-        blocks=len(store.blocks),
+        detected=int(totals.detection[DetectionStatus.detected]),
         computed_blocks=computed.get("blocks", 0),
         computed_scenes=computed.get("scenes", 0),
         computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
-        crashed=totals.lost["crashed"],
-        failed=totals.lost["failed"],
-        **_fields(outcome_of_store(store, totals), *_unsettled_lines(store, sampled)),
+        crashed=lost["crashed"],
+        failed=lost["failed"],
         retried=tried,
         recovered=tried - sum(failed_blocks(store, retried).values()),
-        needed=sampled.get("needed"),
-        conditions=sampled.get("conditions"),
-        unsettled=sampled.get("unsettled"),
+        unsettled=unsettled,
     )
 
-
-def _fields(outcome: Outcome, *more: str) -> dict[str, Any]:
-    """Return the fields of an outcome, with more warnings."""
-    told = {each.name: getattr(outcome, each.name) for each in dataclasses.fields(outcome)}
-    return told | {"failed_share": round(outcome.failed_share, 6),
-                   "warnings": [*outcome.warnings, *more]}
-
-
-def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
-    """Return a line on the conditions that would need more than ``max_trials``, if there are any.
-
-    A search says itself what it does not know.
-    """
-    count, rule = sampled.get("unsettled"), store.pipeline.stopping
-    if not count or rule is None or not rule.precision:
-        return []
-    of = f"{count:,} of {sampled['conditions']:,}"
-    return [(f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials; "
-             "the report's table of precision names them")]
-
-
-# --------------------------------------------------------------------------------------------------
-# The status of a store: progress, counts of flags, rate, time left; also while it is written.
 
 #: Seconds over which the rate is measured, up to the last block that was written.
 RATE_S = 60.0
@@ -552,59 +541,50 @@ RATE_BLOCKS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Status(Outcome):
+class Status(Account):
     """A store's status, from the receipts of its committed blocks.
 
     Attributes
     ----------
-    store, title
-        The store's URL; the pipeline's title or name.
+    title
+        The pipeline's title or name.
     finished
         Whether every block is committed and the store is closed.
     being_written
         Whether a process writes it; on S3 also one that was killed less than two minutes ago.
-    blocks, blocks_done, poses, poses_done
-        Sizes of the grid, and how much of it is committed.
+    blocks_done, poses_done
+        How many blocks and poses are committed.
     detection, estimate
         Cells by flag; flags without cells are left out.
-    looked_for
-        Cells of the detection that count in its rates, as in `Summary`.
     poses_per_s, seconds_left
         Rate over the last minute of work; time to the end at that rate. None if unknown, and of a
         store that nobody writes.
     crashed, failed
         Cells whose process died and cells that raised, at most 1,000 of each.
-    needed, settled, conditions
-        Of a run to a precision, how many of the committed poses were needed, and how many of the
-        conditions need no more trials; None of a run of fixed trials.
+    settled
+        Of a run in waves, how many of the conditions need no more trials.
     processors
         Blocks by the features of the processors that computed them: where there are several, the
         last digits of results differ from a uniform run's.
     """
 
-    store: str
     title: str
     finished: bool
     being_written: bool
-    blocks: int
     blocks_done: int
-    poses: int
     poses_done: int
-    looked_for: int
     detection: dict[str, int]
     estimate: dict[str, int]
     poses_per_s: float | None
     seconds_left: float | None
     crashed: list[FailedCell]
     failed: list[FailedCell]
-    needed: int | None = None
-    settled: int | None = None
-    conditions: int | None = None
-    processors: dict[str, int] = field(default_factory=dict)
+    settled: int | None
+    processors: dict[str, int]
 
 
 def status(url: str) -> Status:
-    """Return the status of a store.
+    """Return the status of a store, also while it is written.
 
     Raises
     ------
@@ -615,73 +595,51 @@ def status(url: str) -> Status:
     totals, written = Totals(), []
     for _, receipt in blocks.receipts(store, blocks.check_whole(store)):
         totals.add(receipt)
-        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
-    poses = store.pipeline.size(Stage.scene)
-    in_waves = store.pipeline.stopping is not None
+        written.append((receipt.written, receipt.wall_s, receipt.scenes_needed))
+    account, settled = _account(store, totals, totals.needed), None
+    if sampled := store.finished and store.run_metadata["counts"].get("sampled"):
+        settled = account["conditions"] - sampled["unsettled"]
+    elif account["conditions"] is not None:
+        settled = int(InWaves(store).settled_share * account["conditions"])
     writing = not store.finished and is_written(store.storage)
     rate = poses_per_second(written)
+    left = account["poses"] - totals.scenes
     return Status(
-        store=url,
+        **account,
         title=store.pipeline.heading,
         finished=store.finished,
         being_written=writing,
-        blocks=len(store.blocks),
         blocks_done=totals.blocks,
-        poses=poses,
         poses_done=totals.scenes,
-        looked_for=looked_for(totals.detection),
         detection=dict(_by_name(DetectionStatus, totals.detection)),
         estimate=dict(_by_name(EstimateStatus, totals.estimate)),
         poses_per_s=rate,
-        seconds_left=(poses - totals.scenes) / rate if rate and writing and not in_waves else None,
-        crashed=totals.cells["crashed"],
-        failed=totals.cells["failed"],
-        **_fields(outcome_of_store(store, totals)),
-        needed=totals.needed if in_waves else None,
-        settled=_settled(store),
-        conditions=condition_count(store.pipeline) if in_waves else None,
+        seconds_left=left / rate if rate and writing and settled is None else None,
+        crashed=totals.crashed,
+        failed=totals.failed,
+        settled=settled,
         processors=dict(totals.processors),
     )
 
 
-def _settled(store: RunStore) -> int | None:
-    """Return how many conditions need no more trials; None of a run of fixed trials."""
-    if store.pipeline.stopping is None:
-        return None
-    count = condition_count(store.pipeline)
-    if store.finished and (sampled := store.run_metadata["counts"].get("sampled")):
-        return count - int(sampled["unsettled"])
-    return int(InWaves(store).settled_share * count)
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenBlock:
-    """A committed block: when it was written (s since 1970), the seconds it took, its scenes."""
-
-    at: float
-    took_s: float
-    scenes: int
-
-
-def poses_per_second(finished: Iterable[WrittenBlock]) -> float | None:
-    """Return the rate at the last of some blocks, None if it is not known.
+def poses_per_second(written: Sequence[tuple[float, float, int]]) -> float | None:
+    """Return the rate at the last of some committed blocks, in any order; None if it is not known.
 
     Parameters
     ----------
-    finished
-        Committed blocks, in any order.
+    written
+        For each block, when it was written (s since 1970), the seconds it took, its scenes.
 
     Examples
     --------
-    >>> poses_per_second([WrittenBlock(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
+    >>> poses_per_second([(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
     50.0
     """
-    written = list(finished)
     if not written:
         return None
-    last = max(block.at for block in written)
-    recent = [block for block in written if block.at > last - RATE_S]
-    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in recent))
-    recent = [block for block in written if block.at > last - window_s]
-    begin = max(min(block.at - block.took_s for block in recent), last - window_s)
-    return sum(block.scenes for block in recent) / (last - begin) if last > begin else None
+    at, took_s, scenes = np.array(written).T
+    last = at.max()
+    window_s = max(RATE_S, RATE_BLOCKS * took_s[at > last - RATE_S].max())
+    recent = at > last - window_s
+    begin = max((at - took_s)[recent].min(), last - window_s)
+    return float(scenes[recent].sum() / (last - begin)) if last > begin else None

@@ -24,7 +24,6 @@ from sweep.execution.on_cluster import OnCluster
 from sweep.execution.runner import compute, execute
 from sweep.execution.status import (
     Totals,
-    WrittenBlock,
     close,
     failure_groups,
     outcome_of,
@@ -51,7 +50,7 @@ def outcome(detection, estimate, cells):
     counts = [[given.get(flag.name, 0) for flag in flags]
               for flags, given in ((DetectionStatus, detection), (EstimateStatus, estimate))]
     totals = Totals(
-        detection=counts[0], estimate=counts[1], cells={"failed": cells, "crashed": []})
+        detection=np.array(counts[0]), estimate=np.array(counts[1]), failed=cells)
     return outcome_of("a b.zarr", totals, "trial=0")
 
 
@@ -113,7 +112,7 @@ def blocks(workers, count, *, begin, took=2.0, scenes=100, lockstep=True):
     """Return blocks of workers that are always busy, from ``begin`` on."""
     shift = 0.0 if lockstep else took / workers
     return [
-        WrittenBlock(begin + took * (n // workers + 1) + shift * (n % workers), took, scenes)
+        (begin + took * (n // workers + 1) + shift * (n % workers), took, scenes)
         for n in range(count)
     ]
 

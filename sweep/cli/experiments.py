@@ -167,9 +167,8 @@ def plan(
     expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
     refused = library.forecast.objections(
-        library.forecast.Demand(
-            expected.seconds, expected.workers, expected.bytes, expected.files),
-        library.forecast.free_disk(f"runs/{read.name}.zarr"), up_to=read.stopping is not None)
+        expected, library.forecast.free_disk(f"runs/{read.name}.zarr"),
+        up_to=read.stopping is not None)
     sections = {
         "Camera": [facts.camera_line, *facts.camera_notes],
         "Poses": [facts.pose_line, *facts.pose_notes, *facts.detector_notes, *bound],

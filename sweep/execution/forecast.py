@@ -22,8 +22,13 @@ from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation import child_process
-from sweep.isolation.child_process import Child
+from sweep.isolation.child_process import (
+    Child,
+    ChildDiedError,
+    ChildError,
+    default_workers,
+    last_line,
+)
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
@@ -116,33 +121,37 @@ def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
         count = min(wanted, GROWTH * count)
 
 
-def measure(child: Child, pipeline: Pipeline, limit_s: float) -> Timing:
+def measure(
+    child: Child, pipeline: Pipeline, block_limit_s: float, *, assumed_s: float | None = None
+) -> Timing:
     """Time a batch of scenes in a child process, which ends if that takes too long.
+
+    Parameters
+    ----------
+    child, pipeline
+        The process, and the experiment.
+    block_limit_s
+        A block's timeout in seconds, of which the measurement takes a small share.
+    assumed_s
+        Seconds that a scene is assumed to take if one crashes or raises, or if this machine is at
+        fault: whether the workers' are is seen by their blocks. Without it, that is an error.
 
     Raises
     ------
-    ChildError
-        If a scene crashes the child, or raises.
+    ChildError, MachineFaultError
+        If scenes cannot be measured.
     """
+    limit_s = min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S)
     try:
         return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
-    except child_process.ChildDiedError as error:
-        child.restart()
-        if not error.timed_out:
+    except (ChildError, MachineFaultError) as error:
+        if isinstance(error, ChildDiedError):
+            child.restart()
+            if error.timed_out:
+                return Timing(limit_s, 1, over=True)
+        if assumed_s is None:
             raise
-        return Timing(limit_s, 1, over=True)
-
-
-def measured_or_assumed(child: Child, pipeline: Pipeline, block_limit_s: float) -> Timing:
-    """Time scenes, which may crash or raise: then :data:`UNMEASURED_S` is assumed.
-
-    Also if this machine is at fault: whether the workers' are is seen by their blocks. The time
-    limit is a block's, in seconds.
-    """
-    try:
-        return measure(child, pipeline, min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S))
-    except (child_process.ChildError, MachineFaultError):
-        return Timing(UNMEASURED_S, 0)
+        return Timing(assumed_s, 0)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -395,8 +404,8 @@ def scene_s_of(store: RunStore, done: AbstractSet[int]) -> float:
 # --------------------------------------------------------------------------------------------------
 # The forecast of a run: blocks, bytes, memory and time.
 
-#: Seconds after which a forecast, which is answered within 5 s, abandons the batch of scenes.
-PLAN_SCENES_S = 1.5
+#: Block timeout by which a forecast, which is answered within 5 s, abandons the batch of scenes.
+PLAN_S = 12.0
 
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
@@ -404,23 +413,21 @@ START_S = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class Forecast(Demand):
     """The expected cost of a run.
 
     Attributes
     ----------
     poses, results
         Cells of the scene axes; estimates, which are poses times configurations.
-    block, blocks, files
-        Scenes of a block along each scene axis; number of blocks, and of the files that they make.
-    bytes, worker_bytes
-        Size of the store before compression; memory of a worker.
+    block, blocks
+        Scenes of a block along each scene axis; number of blocks.
+    worker_bytes
+        Memory of a worker.
     pose_s, sampled
         Mean seconds a pose, all configurations included; scenes that were measured.
     over
         Whether the measurement was abandoned: a pose takes more than ``pose_s``.
-    workers, seconds
-        Number of workers, and how long they would take.
     least_share
         Share of the poses that is computed in any case: of a run in waves the first wave. All else
         is that of all poses.
@@ -430,15 +437,11 @@ class Forecast:
     results: int
     block: tuple[int, ...]
     blocks: int
-    files: int
-    bytes: int
     worker_bytes: int
     pose_s: float
     sampled: int
     over: bool
-    workers: int
-    seconds: float
-    least_share: float = 1.0
+    least_share: float
 
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
@@ -465,33 +468,30 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
         raise ArgumentError("workers", workers, "expected at least 1")
     try:
         with Child("sweep.execution.forecast") as child:
-            timing = measure(child, pipeline, PLAN_SCENES_S)
-    except child_process.ChildError as error:
+            timing = measure(child, pipeline, PLAN_S)
+    except ChildError as error:
         raise RunError(
-            f"a measured scene crashed its process ({child_process.last_line(error)}); "
+            f"a measured scene crashed its process ({last_line(error)}); "
             "`sweep run` isolates it and computes the others"
         ) from None
     poses, least = pipeline.size(Stage.scene), least_share(pipeline)
     small = workers is None and least * poses * timing.scene_s < SMALL_RUN_S
-    count = workers or (1 if small else child_process.default_workers())
+    count = workers or (1 if small else default_workers())
     blocks = blocks_of(pipeline, timing.scene_s, count)
-    busy = min(count, child_process.default_workers(), len(blocks))
+    busy = min(count, default_workers(), len(blocks))
     demand = demand_of(pipeline, timing.scene_s, busy, len(blocks), len(blocks))
     # The child ended: its memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     return Forecast(
+        START_S + demand.seconds, count, demand.bytes, demand.files,
         poses=poses,
         results=pipeline.size(*Stage),
         block=blocks.extents,
         blocks=len(blocks),
-        files=demand.files,
-        bytes=demand.bytes,
         worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
         pose_s=timing.scene_s,
         sampled=timing.sampled,
         over=timing.over,
-        workers=count,
-        seconds=START_S + demand.seconds,
         least_share=least,
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import RunStore, check_whole, receipts, region
-from sweep.store.provenance import changes, excerpt, fingerprint
+from sweep.store.provenance import changes, differences, fingerprint
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -161,39 +160,23 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         shared = mine.get(part, {}).keys() & theirs.get(part, {}).keys()
         for stamp in (mine, theirs):
             stamp[part] = {name: stamp[part][name] for name in sorted(shared)}
-    faults = [
-        f"{part}: the store has {json.dumps(old_value)}, this run {json.dumps(value)}"
-        for part, old_value, value in changes(theirs, mine)
-    ]
     present = {variable.name for variable in store.variables}
-    faults += [
-        f"{variable.name}: not a variable of the store"
-        for variable in pipeline.experiment.variables
-        if variable.name not in present and not variable.drawn_as
-    ]
+    lacking = [variable.name for variable in pipeline.experiment.variables
+               if variable.name not in present and not variable.drawn_as]
     source = Source.of(pipeline, store, frozenset(check_whole(store)))
-    drawn = pipeline.distributions.keys() | old.distributions.keys()
-    for name in dict.fromkeys((*pipeline.parameters, *old.parameters, TRIAL)):
-        if pipeline.distributions.get(name) != old.distributions.get(name):
-            faults.append(f"{name}: not drawn from the same distribution in both")
-        elif (
-            name in pipeline.fixed and name in old.fixed
-            and pipeline.fixed[name] != old.fixed[name]
-        ):
-            faults.append(_difference(pipeline, old, name))
-    for key in source.keys:
-        if len(key.new) > 1 or drawn.intersection(key.parameters):
-            continue  # looked up cell by cell, or a fault that is noted already
-        if all(index is None for index in key.found([range(len(axis)) for axis in key.new])):
-            names = dict.fromkeys([*(axis.name for axis in key.new), key.axis or key.parameters[0]])
-            faults.append(
-                f"{', '.join(names)}: no values of {', '.join(sorted(key.parameters))} go together "
-                "in both" if len(key.parameters) > 1
-                else _difference(pipeline, old, key.parameters[0])
-            )
-    if faults:
-        listed = "\n".join(f"  {fault}" for fault in faults)
-        raise StoreError(f"{store.url}: no cell of it can be reused\n{listed}")
+    agree = (
+        not any(changes(theirs, mine)) and pipeline.distributions == old.distributions
+        and all(pipeline.fixed[name] == old.fixed[name]
+                for name in pipeline.fixed.keys() & old.fixed.keys())
+        # What several new axes give is looked up cell by cell.
+        and all(len(key.new) > 1 or any(
+            index is not None for index in key.found([range(len(axis)) for axis in key.new]))
+            for key in source.keys)
+    )
+    if lacking or not agree:
+        lines = [f"{name}: not a variable of the store" for name in lacking]
+        lines += differences(pipeline, old, store.fingerprint)
+        raise StoreError("\n  ".join([f"{store.url}: no cell of it can be reused", *lines]))
     return source
 
 
@@ -203,14 +186,6 @@ def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
         return bool(match(pipeline, store).done)
     except StoreError:
         return False
-
-
-def _difference(pipeline: Pipeline, old: Pipeline, name: str) -> str:
-    """Return a line on the values that a parameter has in either grid."""
-    ours, theirs = (
-        excerpt((fixed_value(grid, name),) if axis is None else axis.columns[name])
-        for grid in (pipeline, old) for axis in [grid.axis_of(name)])
-    return f"{name}: the store has {theirs}, this run {ours}"
 
 
 @dataclass(slots=True)

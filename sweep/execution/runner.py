@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,14 @@ from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.reuse import is_reusable, match
-from sweep.execution.status import Summary, close, drop_failed, failed_blocks, summary_of
+from sweep.execution.status import (
+    Summary,
+    Totals,
+    close,
+    drop_failed,
+    failed_blocks,
+    summary_of,
+)
 from sweep.execution.waves import InWaves, Work, condition_count
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -34,7 +41,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store import blocks, lifecycle
-from sweep.store.blocks import Receipt, RunStore
+from sweep.store.blocks import RunStore
 from sweep.store.locations import absolute_url, check_writable, exists, open_storage
 from sweep.store.lock import changing, is_written, writing
 from sweep.store.provenance import differences
@@ -133,20 +140,16 @@ def execute(
         check_writable(url)
 
     with contextlib.ExitStack() as stack:
-        interrupts = stack.enter_context(Interrupts())
-        thread = stack.enter_context(ThreadPoolExecutor(1))
-        child = child or Child(BLOCK_TASK)
-        stack.callback(child.close)  # the thread waits for it
-        if pipeline.plugins:
-            interrupts.await_result(thread.submit(check_plugins, child, pipeline))
+        child = stack.enter_context(child or Child(BLOCK_TASK))
+        check_plugins(child, pipeline)
         if begun is not None and done:
             scene_s, left = forecast.scene_s_of(begun, done), 1 - len(done) / len(begun.blocks)
         else:
-            measuring = thread.submit(
-                forecast.measured_or_assumed, child, pipeline, time_limit_s or TIME_LIMIT_S)
+            timing = forecast.measure(
+                child, pipeline, time_limit_s or TIME_LIMIT_S, assumed_s=forecast.UNMEASURED_S)
             # In waves, nobody knows how much more than the first one is needed.
-            left = forecast.least_share(pipeline)
-            scene_s = interrupts.await_result(measuring).scene_s
+            scene_s, left = timing.scene_s, forecast.least_share(pipeline)
+        interrupts = stack.enter_context(Interrupts())
         executor: Executor
         if scheduler is not None or client is not None:
             from sweep.execution.on_cluster import connected  # noqa: PLC0415  (slow to import)
@@ -307,25 +310,22 @@ def compute(
     waves = None if pipeline.stopping is None else InWaves(store, set(numbers))
     conditions = condition_count(pipeline)
     computed: Counter[str] = Counter()
-    so_far: Counter[str] = Counter()
     failed: list[Failed] = []
 
     def task(work: Work) -> tuple[Any, ...]:
         some = [store.blocks[number] for number in work.numbers]
         return (url, store.run_id, some, work.decision, sources, time_limit_s)
 
-    def report(receipts: Iterable[Receipt] = ()) -> None:
-        for receipt in receipts:
-            so_far.update(scenes=receipt.scenes, needed=receipt.scenes_needed,
-                          detected=sum(receipt.detection[DetectionStatus.detected :][:1]))
+    def report() -> None:
         if progress is not None:
             progress(Progress(
-                so_far["scenes"], pipeline.size(Stage.scene), so_far["detected"],
-                *(() if waves is None else (
-                    so_far["needed"], int(waves.settled_share * conditions), conditions))))
+                totals.scenes, pipeline.size(Stage.scene),
+                int(totals.detection[DetectionStatus.detected]), *(() if waves is None else (
+                    totals.needed, int(waves.settled_share * conditions), conditions))))
 
     done = blocks.committed(store).difference(numbers) if waves is None else waves.current
-    report(receipt for _, receipt in blocks.receipts(store, done))
+    totals = Totals.of(blocks.receipts(store, done))
+    report()
     for works in waves or [(Work((number,)) for number in numbers)]:
         with contextlib.closing(executor.map(works, task, time_limit_s, interrupts)) as results:
             for work, result in results:
@@ -339,7 +339,8 @@ def compute(
                     if waves is not None:
                         waves.committed(number, receipt)
                     computed.update({"blocks": 1, **receipt.computed})
-                    report([receipt])
+                    totals.add(receipt)
+                    report()
         _raise_failed(store.url, failed)
     if waves is not None:
         report()

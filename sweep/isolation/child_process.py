@@ -14,7 +14,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, wait
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from types import FrameType
@@ -294,11 +293,3 @@ class Interrupts:
         """Raise KeyboardInterrupt if Ctrl-C has been noted."""
         if self._noted:
             raise KeyboardInterrupt
-
-    def await_result(self, future: Future[Result]) -> Result:
-        """Return a future's result, checking meanwhile."""
-        while not future.done():
-            self.check()
-            wait([future], timeout=POLL_S)
-        self.check()
-        return future.result()

@@ -16,7 +16,7 @@ import pytest
 import trustme
 
 import sweep
-from support.clusters import Cluster
+from support.clusters import CLIENT, Cluster
 from support.commands import command, started
 from support.stores import by_hand
 from sweep.cli import main
@@ -24,6 +24,7 @@ from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed
 from sweep.experiment.pipeline import Pipeline
+from sweep.integrity.verification import verify
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.locations import exists
 from sweep.store.lock import is_written, writing
@@ -157,6 +158,28 @@ def test_stores_on_a_real_object_store_are_as_local_ones(claim):
     assert running.returncode == 0, out + err
     claim("store on OpenStack Swift, its run killed and continued by two clients",
           "a local store", 0.0, "bits differ")
+
+
+@pytest.mark.parametrize("url", [
+    pytest.param("two.zarr", marks=pytest.mark.system),
+    pytest.param("s3://bucket/two.zarr", marks=pytest.mark.evidence),
+])
+def test_two_clients_at_once_leave_one_sound_store_of_the_same_bits(url, small, tmp_path, request):
+    if url.startswith("s3:"):
+        request.getfixturevalue("bucket")
+    else:
+        url = str(tmp_path / url)
+    create_store(url, Pipeline.from_toml(small), (1, 1, 1, 3))
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(started(["-c", CLIENT, small, url, "", 1.0]))
+                   for _ in range(2)]
+        assert [client.wait(timeout=TIMEOUT_S) for client in clients] == [0, 0]
+    report = verify(url, 0)
+    assert (report.finished, report.blocks_done, report.damage) == (True, 16, [])
+    by_hand(str(tmp_path / "one.zarr"), Pipeline.from_toml(small))
+    alone = sweep.open(tmp_path / "one.zarr").load()
+    for name, values in sweep.open(url).load().items():
+        assert values.to_numpy().tobytes() == alone[name].to_numpy().tobytes(), name
 
 
 @pytest.fixture

@@ -26,9 +26,13 @@ from numpy.typing import NDArray
 
 import sweep
 from sweep.analysis import simulation_gap
-from sweep.experiment.photographs import read_board
-from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
-from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
+from sweep.fitting.photograph_fit import (
+    START,
+    VARIANCE,
+    fit_photograph,
+    is_saturated,
+    photograph_views,
+)
 from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
@@ -126,19 +130,15 @@ def mean_images(
     return means
 
 
-def older_scene(
-    photographs: sweep.Pipeline, board: Path, fitted: Mapping[str, Any]
-) -> dict[str, Any]:
+def older_scene(photographs: sweep.Pipeline, fitted: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scene without the new effects: the blur is fitted without them, the noise is white.
 
     The blur is the mean over the photographs, as in a fitted scene without a spread.
     """
-    printed = read_board(board)
-    views = photograph_views(photograph_scenes(photographs), printed, MARKERS)
     moved = np.zeros(len(START), dtype=bool)
     moved[VARIANCE] = True
     fits = [
-        fit for each in views
+        fit for each in photograph_views(photographs, MARKERS).values()
         if not is_saturated(each) and (fit := fit_photograph(each, moved, START)) is not None
     ]
     variance = float(np.mean([fit.parameters[VARIANCE] for fit in fits]))
@@ -172,7 +172,7 @@ def compared(
     print("".join(line for line in path.read_text().splitlines(keepends=True)
                   if line.startswith("#")), end="```\n")
     scenes = {"fitted": read_scene(path)}
-    scenes["without new effects"] = older_scene(photographs, board, scenes["fitted"])
+    scenes["without new effects"] = older_scene(photographs, scenes["fitted"])
     results = {"photographs": shots}
     for source, scene in scenes.items():
         results[source] = results_of(

@@ -21,13 +21,13 @@ from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord, read_board
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
-from sweep.fitting.fit import MARKERS, Say, SceneFit, Term, fit_scene, scene_views, shortened
-from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_scenes
-from sweep.measure.surroundings import BoardMarker, clear_modules
+from sweep.fitting.fit import MARKERS, Say, SceneFit, fit_scene, scene_views, shortened
+from sweep.fitting.photograph_fit import Views, record_of
+from sweep.fitting.shifts import Estimate
+from sweep.measure.surroundings import clear_modules
 from sweep.messages import notice, plain
-from sweep.model.board import Board
 from sweep.photographs.prepare import name_of, prepare, setting_name
 from sweep.photographs.twins import twin_pipeline
 from sweep.store.files import write_whole
@@ -58,6 +58,11 @@ REPEATS = 4
 #: were narrower by 0.11 and 0.15 without a sharpening and a bloom with which they had been
 #: rendered.
 CLEARLY = 0.5
+
+#: Effects that are kept where the errors of photographs that were not fitted say so.
+SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
+
+NOT_NEEDED = "errors are clearly nearer to those of photographs that were not fitted without it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,34 +130,33 @@ def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
     return float(known.mean()) if len(known) else math.nan
 
 
-def held_out(
-    pipeline: Pipeline, numbers: Integers, record: PhotographRecord, folder: Path, say: Say
-) -> HeldOut:
+def held_out(pipeline: Pipeline, numbers: Integers, folder: Path, say: Say) -> HeldOut:
     """Measure photographs that are held out.
 
     Parameters
     ----------
-    pipeline, record
+    pipeline
         Of all photographs.
     numbers
         Of the photographs that are held out.
     folder
-        Where the record and the stores go.
+        Where their record and the stores go.
     say
         Gets a line before each simulation.
     """
+    record, name = record_of(pipeline), "held-out"
     chosen = dataclasses.replace(
-        record,
-        paths=tuple(str((folder / record.paths[k]).resolve()) for k in numbers.tolist()),
-        digests=tuple(record.digests[k] for k in numbers.tolist()),
-        **{name: getattr(record, name)[numbers]
-           for name in ("rotation", "translation", "std", "source")},
+        record, **{
+            each: getattr(record, each)[numbers]
+            for each in ("rotation", "translation", "std", "source")
+        },
+        paths=tuple(str((Path(pipeline.folder) / record.paths[k]).resolve()) for k in numbers),
+        digests=tuple(record.digests[k] for k in numbers),
     )
-    name = "held-out"
     write_whole(folder / f"{name}{SUFFIX}", PHOTOGRAPH_RECORDS.content(chosen))
     document = read_document(pipeline.to_toml())
-    axes = document["axes"]
     document["scene"][PHOTOGRAPHS] = f"{name}{SUFFIX}"
+    axes = document["axes"]
     axes["trial"] = len(numbers)
     if "marker_id" in axes:
         every = record.marker_id
@@ -162,6 +166,32 @@ def held_out(
     store = str(folder / f"{name}.zarr")
     execute(smaller, store, overwrite=True)
     return HeldOut(smaller, open_dataset(store), folder, say)
+
+
+def checked(
+    found: SceneFit, views: Views, pipeline: Pipeline, home: Path, say: Say
+) -> tuple[SceneFit, xr.Dataset]:
+    """Return the scene with what moves errors of held-out photographs, and the gap that is left.
+
+    Every other photograph is held out, and the scene of the others simulated. The record, in
+    ``home``, and its simulations are of the photographs of ``views``.
+    """
+    numbers, known = list(views), found.tested_fits
+    others, held = {number: views[number] for number in numbers[::2]}, np.array(numbers[1::2])
+    say(f"measuring {len(held)} photographs that the scene of the others is compared with")
+    photographs = held_out(pipeline, held, home, say)
+    half = fit_scene(others, known=known).scene
+    gap = photographs.gap(half, "the whole scene")
+    worth = photographs.worth(gap, {
+        switch: fit_scene(others, {switch: NOT_NEEDED}, known).scene
+        for switch in SWITCHES if switch in half
+    })
+    refused = {switch: NOT_NEEDED for switch, needed in worth.items() if not needed}
+    if refused:
+        rest = photographs.gap(fit_scene(others, refused, known).scene, "what is kept")
+        if gap_size(rest, gap) <= gap_size(gap, gap):
+            return fit_scene(views, refused, known), rest
+    return found, gap
 
 
 # --------------------------------------------------------------------------------------------------
@@ -176,30 +206,30 @@ MAX_BEARING = 0.8
 TRIALS = 200
 
 
-def scene_document(
-    pipeline: Pipeline, taken: PhotographScenes, board: Board | None, found: SceneFit
-) -> dict[str, Any]:
+def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[str, Any]:
     """Return a pipeline of the fitted camera, with poses as in the photographs."""
-    scenes, shown = taken.scenes, taken.shown
-    first = int(np.flatnonzero(shown)[0])
-    marker: dict[str, Any] = {
-        "dictionary": scenes.dictionary[first], "marker_id": int(scenes.marker_id[first]),
-        "size_m": float(scenes.size_m[first]),
+    record, fixed = record_of(pipeline), pipeline.fixed
+    first = next(iter(views.values()))[0].shown
+    marker = {
+        "dictionary": first.dictionary, "marker_id": first.marker_id, "size_m": first.size_m,
     }
-    if board is not None:
-        clear = min(clear_modules(BoardMarker(board, k)) for k in range(len(board)))
-        marker["quiet_zone_modules"] = shortened(min(clear, 10.0))
-    distance = scenes.translation[shown, 2]
-    tilt = np.degrees(np.arccos(np.clip(-scenes.rotation[shown, 2, 2], -1, 1)))
-    bearing = np.abs(scenes.translation[shown, :2] / distance[:, None])
+    on_board = [each for each in record.on_board(record.marker_id) if each is not None]
+    if on_board:
+        marker["quiet_zone_modules"] = shortened(min(10.0, *map(clear_modules, on_board)))
+    rotation, translation = record.rotation[record.shown], record.translation[record.shown]
+    tilt = np.degrees(np.arccos(np.clip(-rotation[:, 2, 2], -1, 1)))
+    bearing = np.abs(translation[:, :2] / translation[:, 2:])
     wide = np.degrees(np.arctan(MAX_BEARING * np.quantile(bearing, 0.9, axis=0))).tolist()
+    turned = {"uniform": [0.0, 360.0]}
     return {
         "title": f"The camera of {plain(pipeline.name)}",
-        "camera": _camera(pipeline),
+        "camera": {
+            name: list(fixed[name]) if name == "distortion" else fixed[name] for name in CAMERA
+        },
         "marker": marker,
         "pose": {
-            "distance_m": _between(distance), "tilt_deg": _between(tilt),
-            "azimuth_deg": {"uniform": [0.0, 360.0]}, "roll_deg": {"uniform": [0.0, 360.0]},
+            "distance_m": _between(translation[:, 2]), "tilt_deg": _between(tilt),
+            "azimuth_deg": turned, "roll_deg": turned,
             **{
                 name: {"uniform": [-shortened(each), shortened(each)]}
                 for name, each in zip(("bearing_x_deg", "bearing_y_deg"), wide, strict=True)
@@ -217,15 +247,6 @@ def _between(values: Floats) -> Any:
     return {"uniform": [low, high]} if low < high else low
 
 
-def _camera(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the camera's parameters."""
-    values = {name: pipeline.fixed.get(name) for name in CAMERA}
-    return {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in values.items() if value is not None
-    }
-
-
 def scene_text(
     document: dict[str, Any], found: SceneFit, record: PhotographRecord, name: str,
     lines: Sequence[str] = (),
@@ -235,22 +256,19 @@ def scene_text(
     head = [
         f"Fitted to {found.markers} markers in {found.photographs} photographs ({plain(name)}),",
         f"SHA-256 of their digests {digest[:16]}. Value, 95 % interval by photograph:",
-        *(f"  {each.parameter}: {numbers_text(each)}" for each in found.terms if each.kept),
+        *(f"  {each.parameter}: {in_words(each.estimate)}" for each in found.terms if each.kept),
         *(f"  left out: {each.name}: {each.reason}" for each in found.terms if not each.kept),
         *lines, *found.lines,
     ]
     return "".join(f"# {plain(line, 200)}\n" for line in head) + "\n" + document_text(document)
 
 
-def numbers_text(term: Term) -> str:
-    """Return a term's estimate in words."""
-    one = term.estimate
+def in_words(one: Estimate) -> str:
+    """Return an estimate as a text."""
     if not math.isfinite(one.value):
         return "not known"
-    text = f"{one.value:.4g}"
-    if math.isfinite(one.low):
-        text += f" [{one.low:.4g}, {one.high:.4g}]"
-    return text
+    interval = f" [{one.low:.4g}, {one.high:.4g}]" if math.isfinite(one.low) else ""
+    return f"{one.value:.4g}{interval}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -263,11 +281,6 @@ OF_MARKERS = ("dictionary", "size_m")
 
 #: Detector settings that the check compares unless others are given.
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
-
-#: Effects that are kept where the errors of photographs that were not fitted say so.
-SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
-
-NOT_NEEDED = "errors are clearly nearer to those of photographs that were not fitted without it"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,7 +337,6 @@ def fit_folder(
     """
     if not 1 <= markers <= 1000:
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
-    target = None if board is None else read_board(Path(board))
     if all(setting_name(each) in OF_MARKERS for each in settings):
         settings = [*settings, COMPARED]
     with tempfile.TemporaryDirectory() as written:
@@ -333,50 +345,19 @@ def fit_folder(
             folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
             one_camera=True,
         )
-        pipeline = prepared.pipeline
-        name = name_of(Path(folders[0]))
-        record, _ = PHOTOGRAPH_RECORDS.read(home / pipeline.values_of(PHOTOGRAPHS)[0])
-        taken = photograph_scenes(pipeline)
-        views, lines = scene_views(taken, target, markers)
-        found, gap = fit_scene(views, taken, target, say=say), None
-        if check:
-            if len(views) >= 2 * MIN_HELD_OUT:
-                found, gap = _checked(found, views, taken, target, pipeline, record, home, say)
-            else:
-                lines.append(
-                    f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to "
-                    "see which effects move errors"
-                )
-        document = scene_document(pipeline, taken, target, found)
+        pipeline, name = prepared.pipeline, name_of(Path(folders[0]))
+        views, lines = scene_views(pipeline, markers)
+        found, gap = fit_scene(views, say=say), None
+        if check and len(views) >= 2 * MIN_HELD_OUT:
+            found, gap = checked(found, views, pipeline, home, say)
+        elif check:
+            lines.append(
+                f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to see "
+                "which effects move errors"
+            )
+        document = scene_document(pipeline, views, found)
+        text = scene_text(document, found, record_of(pipeline), name, lines)
     return FittedScene(
-        found, Pipeline.from_dict(document, name=name, source="scene"),
-        scene_text(document, found, record, name, lines), (*prepared.lines, *lines), gap,
+        found, Pipeline.from_dict(document, name=name, source="scene"), text,
+        (*prepared.lines, *lines), gap,
     )
-
-
-def _checked(
-    found: SceneFit, views: Sequence[FittedPhotograph], taken: PhotographScenes,
-    board: Board | None, pipeline: Pipeline, record: PhotographRecord, home: Path, say: Say,
-) -> tuple[SceneFit, xr.Dataset]:
-    """Return the scene with what moves errors of held-out photographs, and the gap that is left.
-
-    Every other photograph is held out, and the scene of the others simulated.
-    """
-    others, held = views[::2], np.array([each.number for each in views[1::2]])
-    say(f"measuring {len(held)} photographs that the scene of the others is compared with")
-    photographs = held_out(pipeline, held, record, home, say)
-    known = found.tested_fits
-    half = fit_scene(others, taken, board, known=known)
-    gap = photographs.gap(half.scene, "the whole scene")
-    worth = photographs.worth(gap, {
-        switch: fit_scene(others, taken, board, {switch: NOT_NEEDED}, known).scene
-        for switch in SWITCHES if switch in half.scene
-    })
-    refused = {switch: NOT_NEEDED for switch, needed in worth.items() if not needed}
-    if refused:
-        rest = photographs.gap(
-            fit_scene(others, taken, board, refused, known).scene, "what is kept"
-        )
-        if gap_size(rest, gap) <= gap_size(gap, gap):
-            found, gap = fit_scene(views, taken, board, refused, known), rest
-    return found, gap

@@ -1,16 +1,258 @@
-"""The fit of the simulator's own image to one photograph: noise and edges by its residuals."""
+"""The fit of the simulator's own image to photographs: their pixels, and the noise by residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
 
-from sweep.fitting.views import FittedMarker, FittedPhotograph, drawn
+from sweep.experiment.parameters import PHOTOGRAPHS
+from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, PhotographRecord
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
-from sweep.typing import Floats, Masks
+from sweep.measure.photograph import PANEL_PX, add_plane, photograph_view, system
+from sweep.measure.solver import marker_frame
+from sweep.measure.surroundings import BoardMarker, clear_modules, ring_modules
+from sweep.model.board import single_marker
+from sweep.model.calibration import VIEW
+from sweep.model.coverage import MarkerEdges
+from sweep.model.image_file import photograph_image, reference
+from sweep.model.marker import OUTSIDE, module_count, overhang
+from sweep.model.polygon import Optics, Projection, side_lengths
+from sweep.photographs.pose_fit import Lens, cameras_of
+from sweep.typing import Floats, Grey, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# Pixels that are fitted: of some markers, well spread over each frame.
+
+#: Pixels that get more than this share from outside the print through that point spread are left
+#: out: nothing is known of what lies there.
+OUTSIDE_BLUR_PX, OUTSIDE_SHARE = 2.0, 1e-3
+
+#: Level from which white is taken to be cut off; compression moves it a little.
+SATURATED = 254.0
+
+#: Side of a marker below which its pixels say too little.
+MIN_SIDE_PX = 12.0
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+class Shown(NamedTuple):
+    """A marker in a photograph: its true pose (3, 3), (3,) m, and where that comes from.
+
+    ``on_board`` is its place on a board, None of a single one; ``size_m`` its side. ``width_px`` is
+    the photograph's.
+    """
+
+    rotation: Floats
+    translation: Floats
+    source: TruthSource
+    lens: Lens
+    width_px: int
+    dictionary: str
+    marker_id: int
+    size_m: float
+    on_board: BoardMarker | None
+
+    def pixels(self, points: Floats) -> Floats:
+        """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side."""
+        flat = (points - 0.5) * self.size_m * [1.0, -1.0]
+        in_plane = np.column_stack([flat, np.zeros(len(flat))])
+        return self.lens.project(in_plane, self.rotation, self.translation)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedMarker:
+    """The pixels of one marker in one photograph, with its true pose and print.
+
+    Attributes
+    ----------
+    shown
+        The marker and its true pose.
+    levels, used
+        (h, w) grey levels of a box, and which pixels are fitted.
+    ends, sides
+        (E, 2, 2) start and end of the print's edges at its true pose, in px of the box,
+        none longer than a module; (E, 2) the areas beside them. Black beyond.
+    ends_at, at
+        (E, 2, 2) of these points and (2, h, w) of the pixels: column and row as shares of the black
+        square's side.
+    corners_px
+        (4, 2) the true corners of the black square in the box: TL, TR, BR, BL.
+    modules, module_px
+        Along the side of the black square, and the mean length of one in the image.
+    reach
+        How far the marker's own print reaches beyond the square, and half a module, as a share of
+        its side.
+    frame_px
+        (2,) first pixel of the box in the frame.
+    ground
+        Median level around the marker and its own quiet zone.
+    """
+
+    shown: Shown
+    levels: Floats
+    used: Masks
+    ends: Floats
+    sides: Integers
+    ends_at: Floats
+    at: Floats
+    corners_px: Floats
+    modules: int
+    module_px: float
+    reach: float
+    frame_px: Integers
+    ground: float
+
+
+#: Number of a photograph -> the markers in it that are fitted.
+Views = dict[int, list[FittedMarker]]
+
+
+def record_of(pipeline: Pipeline) -> PhotographRecord:
+    """Return the record of a pipeline's photographs; of two cameras the left one's."""
+    path = Path(pipeline.folder) / str(pipeline.values_of(PHOTOGRAPHS)[0])
+    return PHOTOGRAPH_RECORDS.read(path)[0]
+
+
+def photograph_views(pipeline: Pipeline, most: int) -> Views:
+    """Return the fitted pixels of each photograph that shows a marker: of at most ``most`` markers.
+
+    They are those farthest from one another, beginning with the one nearest the frame's centre.
+    """
+    record, fixed = record_of(pipeline), pipeline.fixed
+    *view, distortion = (pipeline.values_of(name)[0] for name in (*VIEW, "distortion"))
+    fx, fy, cx, cy = view
+    lens, views = Lens.of(fx, fy, cx, cy, tuple(distortion)), Views()
+    on_board = record.on_board(record.marker_id)
+    sizes = [
+        float(fixed["size_m"]) if each is None
+        else round(marker_frame(each.board.corners_m[each.number])[0], 12) for each in on_board
+    ]
+    for number, (path, digest) in enumerate(zip(record.paths, record.digests, strict=True)):
+        image = photograph_image(reference(Path(pipeline.folder) / path, digest, record.part))
+        every = [
+            Shown(
+                record.rotation[number, k], record.translation[number, k],
+                TruthSource(int(record.source[number, k])), lens, record.width_px,
+                fixed["dictionary"], int(record.marker_id[k]), sizes[k], on_board[k],
+            ) for k in np.flatnonzero(record.shown[number]).tolist()
+        ]
+        markers = [
+            marker_view(shown, image, fixed["quiet_zone_modules"])
+            for shown in _spread(every, image.shape, most)
+        ]
+        views[number] = [each for each in markers if each is not None]
+    return {number: each for number, each in views.items() if each}
+
+
+def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[Shown]:
+    """Return at most ``most`` of the markers in a frame, the farthest from one another."""
+    corners = [each.pixels(SQUARE) for each in every]
+    large = [k for k, quad in enumerate(corners) if side_lengths(quad[None]).min() >= MIN_SIDE_PX]
+    if len(large) <= most:
+        return [every[k] for k in large]
+    centres = np.array([corners[k].mean(axis=0) for k in large])
+    chosen = [int(np.argmin(np.linalg.norm(centres - np.array(shape[::-1]) / 2, axis=1)))]
+    while len(chosen) < most:
+        distance = np.linalg.norm(centres[:, None] - centres[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return [every[large[k]] for k in sorted(chosen)]
+
+
+def marker_view(shown: Shown, image: Grey, margin: float) -> FittedMarker | None:
+    """Return the pixels of a marker in a photograph (height, width); None if they are few.
+
+    ``margin`` is the quiet zone of single markers in modules.
+    """
+    marker = single_marker(shown.dictionary, shown.marker_id, margin)
+    corners, modules = shown.pixels(SQUARE), module_count(shown.dictionary)
+    optics = cameras_of(shown.lens, 1).optics(0)
+    box = photograph_view(
+        marker, shown.on_board, shown.size_m, corners, optics, image, np.zeros(2, dtype=np.int64),
+        toned=False,
+    )
+    if box is None:
+        return None
+    frame_px = np.rint(optics.intrinsics[2:] - box.marker.optics.intrinsics[2:]).astype(np.int64)
+    columns, ring = np.arange(box.levels.shape[1]), ring_modules(marker, shown.on_board)
+    used = (columns >= box.spans[:, :1]) & (columns < box.spans[:, 1:])
+    pieces, sides = _split(box.marker.edges)
+    ends_at = pieces / modules
+    ends = shown.pixels(ends_at.reshape(-1, 2)).reshape(-1, 2, 2) - frame_px
+    if (sides == OUTSIDE).any():
+        used &= drawn(ends, sides, used.shape, OUTSIDE_BLUR_PX)[4] < OUTSIDE_SHARE
+    if used.sum() < MIN_SIDE_PX**2:
+        return None
+    clear = margin if shown.on_board is None else clear_modules(shown.on_board)
+    beyond = SQUARE + (clear + 1.0) / modules * (2.0 * SQUARE - 1.0)
+    return FittedMarker(
+        shown, box.levels, used, ends, sides, ends_at, 0.5 + (0.5 + ring / modules) * box.at,
+        corners - frame_px, modules, float(side_lengths(corners[None]).mean()) / modules,
+        (overhang(shown.dictionary) + 0.5) / modules, frame_px, _along(image, shown.pixels(beyond)),
+    )
+
+
+def _split(edges: MarkerEdges) -> tuple[Floats, Integers]:
+    """Return the pieces (E, 2, 2) of edges, none longer than a module, and their sides (E, 2)."""
+    start, stop = edges.ends[:, :2], edges.ends[:, 2:]
+    count = np.ceil(np.linalg.norm(stop - start, axis=1)).astype(np.int64).clip(min=1)
+    edge = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    t = np.stack([number, number + 1], axis=1) / count[edge, None]
+    pieces = start[edge, None] + t[..., None] * (stop - start)[edge, None]
+    return pieces, np.ascontiguousarray(edges.sides[edge])
+
+
+def _along(image: Grey, outline: Floats) -> float:
+    """Return the median level along an outline (4, 2) in pixels; NaN outside the image."""
+    t = np.linspace(0.0, 1.0, 20, endpoint=False)[:, None, None]
+    points = np.rint((1 - t) * outline + t * np.roll(outline, -1, axis=0)).reshape(-1, 2)
+    inside = ((points >= 0) & (points < image.shape[::-1])).all(axis=1)
+    columns, rows = points[inside].astype(np.int64).T
+    return float(np.median(image[rows, columns])) if inside.any() else np.nan
+
+
+def is_saturated(markers: Sequence[FittedMarker]) -> bool:
+    """Return whether the brightest tenth of a photograph's fitted pixels is cut off at 255."""
+    levels = np.concatenate([each.levels[each.used] for each in markers])
+    return float(np.quantile(levels, 0.9)) >= SATURATED
+
+
+# --------------------------------------------------------------------------------------------------
+# The image of printed edges in pixels, and its slopes.
+
+#: Values of outside, black and white in the image of the share of white.
+WHITE_SHARE = np.array([0.0, 0.0, 1.0])
+
+#: The projection of edges that are given in pixels.
+IN_PIXELS = Projection(
+    np.eye(3), Optics(np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(24), distorted=False)
+)
+
+
+def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float) -> Floats:
+    """Return images (5, height, width) of edges in pixels, (E, 2, 2), through a point spread.
+
+    They are the share of white, its slopes along x, along y and by the point spread's variance,
+    and the share of the area outside the print.
+    """
+    height, width = size
+    space = system(height, width)
+    edges = MarkerEdges(np.ascontiguousarray(ends.reshape(-1, 4)), sides)
+    add_plane(space, edges, WHITE_SHARE, IN_PIXELS, sigma_px, PANEL_PX)
+    rates = np.moveaxis(space.rates.reshape(height, width + 1, 4)[:, :width], 2, 0)
+    white, outside = (
+        np.cumsum(each, axis=1) for each in (rates[0], space.outside[:, :width])
+    )
+    return np.stack([white, *rates[1:], outside])
+
 
 # --------------------------------------------------------------------------------------------------
 # The simulator's own image of one marker in a photograph, its residuals and derivatives.
@@ -116,8 +358,7 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     shifts = parameters[:CORNERS].reshape(4, 2)
     ends = marker.ends + _of_corners(marker.ends_at, marker.reach) @ shifts
     sharp, wide = (
-        np.stack(drawn(ends, marker.sides, used.shape, float(np.sqrt(variance + radius**2)))[:4])[
-            :, used]
+        drawn(ends, marker.sides, used.shape, float(np.sqrt(variance + radius**2)))[:4, used]
         for radius in (0.0, RADIUS_PX)
     )
     # Rounding may lead beyond black and white.
@@ -191,14 +432,11 @@ OUTLIER = 2.5
 MIN_CONTRAST = 5.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotographFit:
+class PhotographFit(NamedTuple):
     """The fit of one photograph.
 
     Attributes
     ----------
-    number
-        The photograph's.
     parameters
         (3,) its parameters. Of those that were moved they are the minimum of the quadratic
         approximation, so that a variance of 0 may be below 0; shifts of parts of markers are
@@ -207,27 +445,26 @@ class PhotographFit:
         Its markers.
     """
 
-    number: int
     parameters: Floats
     states: tuple[MarkerState, ...]
 
 
 def fit_photograph(
-    photograph: FittedPhotograph, moved: Masks, start: Floats = START
+    markers: Sequence[FittedMarker], moved: Masks, start: Floats = START
 ) -> PhotographFit | None:
     """Return the fit of a photograph; None if no marker fits.
 
     Parameters
     ----------
-    photograph
-        The pixels of markers that are fitted.
+    markers
+        The photograph's markers.
     moved
         (3,) which of the photograph's parameters are moved; the others stay as at the start.
     start
         (3,) the parameters at which it starts.
     """
     own, shared = np.arange(ALL) < OWN, start.copy()
-    states = [fresh_state(each, shared) for each in photograph.markers]
+    states = [fresh_state(each, shared) for each in markers]
     states = _good([
         fitted_state(each, np.append(own[:OWN], moved)) for each in states
         if abs(each.levels[1]) > MIN_CONTRAST
@@ -243,7 +480,7 @@ def fit_photograph(
     result = shared.copy()
     if moved.any():
         result[moved] += _shared_step(states, moved, uneven=True)
-    return PhotographFit(photograph.number, result, tuple(states))
+    return PhotographFit(result, tuple(states))
 
 
 def _with_shared(state: MarkerState, shared: Floats, own: Masks) -> MarkerState:
@@ -316,99 +553,3 @@ def photograph_noise(states: Sequence[MarkerState]) -> Floats:
             freedom[k] += area.sum() - explained[area].sum()
     variance = squares / np.maximum(freedom, 1.0) - QUANTISATION_VARIANCE
     return np.where(counts >= MIN_PIXELS, variance, np.nan)
-
-
-# --------------------------------------------------------------------------------------------------
-# Shifts of single edges beside the marker's corners, from the residuals of pixels near edges.
-#
-# A module's edge that is shifted by d along the unit vector n leaves the residuals d (n · slope).
-# Edges of both polarities that are shifted alike are a field of shifts; edges that all move
-# towards white are the marker's own bloom, which is taken off.
-
-#: Half widths across and along the edge of the pixels that say where a module's edge is.
-REACH_MODULES, ALONG_MODULES = 0.5, 0.4
-
-#: Share of the whole step from black to white from which pixels count as an edge.
-STEP_SHARE = 0.6
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeShifts:
-    """Sums of products of the shifts of a photograph's edges, in px².
-
-    Attributes
-    ----------
-    squares, edges
-        Sum of squares less the share of the pixels' noise, and the degrees of freedom.
-    products, pairs
-        Sum of products of two edges on one line of modules that follow on each other, and their
-        number.
-    """
-
-    squares: float
-    edges: float
-    products: float
-    pairs: float
-
-
-def edge_shifts(states: Sequence[MarkerState], noise: Floats) -> EdgeShifts:
-    """Return the shifts of edges; ``noise`` (2,) is the variance on black and on white."""
-    variance = float(np.nanmean(noise)) + QUANTISATION_VARIANCE
-    sums = np.zeros(4)
-    for state in states:
-        shifts = [_edges_along(state, axis) for axis in range(2)]
-        bright = np.concatenate([each[0].ravel() for each in shifts])
-        information = np.concatenate([each[2].ravel() for each in shifts])
-        if np.isfinite(bright).sum() <= OWN:
-            continue
-        own, count = float(np.nanmean(bright)), int(np.isfinite(bright).sum())
-        # Corners and bloom took up as much of the squares as of independent shifts' ones, and,
-        # being smooth, about as much of the products of neighbours.
-        taken = (CORNERS + 1) / count
-        squares = float(np.nansum((bright - own) ** 2 - variance / information))
-        sums[:2] += squares, count * (1 - taken)
-        for towards_white, direction, _ in shifts:
-            shifted = (towards_white - own) * direction
-            products = shifted[:, :-1] * shifted[:, 1:]
-            pairs = np.isfinite(products).sum()
-            sums[2:] += (
-                np.nansum(products) + pairs * taken * squares / (count * (1 - taken)), pairs
-            )
-    return EdgeShifts(*sums.tolist())
-
-
-def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]:
-    """Return the edges on lines of constant column (``axis`` 0) or row of a marker.
-
-    (lines, modules) each, NaN where there is no edge: shifts towards white in px, the sign of that
-    direction along the axis, and the information of the shifts.
-    """
-    marker = state.marker
-    across, along = marker.modules * state.at[axis], marker.modules * state.at[1 - axis]
-    line, module = np.rint(across), np.floor(along)
-    near = (
-        (np.abs(across - line) < REACH_MODULES) & (np.abs(along - module - 0.5) < ALONG_MODULES)
-        & (line >= 0) & (line <= marker.modules) & (module >= 0) & (module < marker.modules)
-    )
-    shape = marker.modules + 1, marker.modules
-    number = (line * marker.modules + module)[near].astype(np.int64)
-    slope, residuals = state.slope[:, near], state.residuals[near]
-
-    def total(values: Floats) -> Floats:
-        return np.asarray(np.bincount(number, values, shape[0] * shape[1]), dtype=np.float64)
-
-    steps = np.stack([total(each) for each in slope])
-    length = np.hypot(*steps)
-    normal = steps / np.maximum(length, 1e-12)
-    by_shift = (normal[:, number] * slope).sum(axis=0)
-    information = total(by_shift**2)
-    whole = abs(state.levels[1]) * 2 * ALONG_MODULES * marker.module_px
-    edge = length > STEP_SHARE * whole
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shifts = np.where(edge, total(by_shift * residuals) / information, np.nan)
-    corners = marker.corners_px
-    positive = corners[1] - corners[0] if axis == 0 else corners[3] - corners[0]
-    return tuple(  # type: ignore[return-value]
-        np.where(edge, each, np.nan).reshape(shape)
-        for each in (shifts, np.sign(positive @ normal), information)
-    )

@@ -13,7 +13,6 @@ them.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -81,12 +80,11 @@ class RunOptions(LocalOptions, total=False):
     yes: bool
 
 
-#: Modules of public names that have all that they need.
+#: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
-    "sweep.experiment.pipeline": ("Pipeline",), "sweep.execution.progress": ("Progress",),
-    "sweep.analysis.dataset": ("decode_flags",), "sweep.diagnosis.detection": ("error_model",),
-    "sweep.diagnosis.diagnosis": ("diagnose",), "sweep.report.reference": ("reference",),
-    "sweep.report.questions": ("measure_tradeoff", "require", "write_report"),
+    "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
+    "diagnose": "diagnosis", "error_model": "detection", "measure_tradeoff": "questions",
+    "reference": "reference", "require": "questions", "write_report": "questions",
 }
 
 
@@ -94,10 +92,9 @@ if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first used."""
-        for module, names in _IMPORTED_ON_USE.items():
-            if name in names:
-                return getattr(importlib.import_module(module), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name not in _IMPORTED_ON_USE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(getattr(library, _IMPORTED_ON_USE[name]), name)
 
 
 def __dir__() -> list[str]:
@@ -182,11 +179,20 @@ def run(
     >>> dict(results.detection.sizes)
     {'side_px': 2, 'trial': 10}
     """
-    return _run(
-        pipeline, store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-        overwrite=overwrite, retry_failed=retry_failed, yes=yes,
-        progress=progress, time_limit_s=time_limit_s,
-    )
+    # The child imports its packages while this process does.
+    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
+        read = _pipeline(pipeline)
+        if store is None and not isinstance(pipeline, library.pipeline.Pipeline | Mapping):
+            store = pipeline if library.lifecycle.names_store(pipeline) else None
+        summary = library.runner.execute(
+            read, store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
+            overwrite=overwrite, retry_failed=retry_failed, yes=yes, time_limit_s=time_limit_s,
+            progress=report, child=child)
+    for line in summary.warnings:
+        notice(line)
+    if summary.advice:
+        notice(f"look at it: {summary.advice}")
+    return open(summary.store)
 
 
 def limit(
@@ -256,45 +262,21 @@ def limit(
     return limits
 
 
-def _run(
-    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
-    *,
-    progress: bool | Callable[[Progress], None] | None = None,
-    **options: Any,
-) -> xr.Dataset:
-
-    # The child imports its packages while this process does.
-    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-
-        read = _pipeline(pipeline)
-        if options.get("store") is None and isinstance(pipeline, (str, os.PathLike)):
-
-            options["store"] = pipeline if library.lifecycle.names_store(pipeline) else None
-        summary = library.runner.execute(read, progress=report, child=child, **options)
-    for line in summary.warnings:
-        notice(line)
-    if summary.advice:
-        notice(f"look at it: {summary.advice}")
-    return open(summary.store)
-
-
 def _pipeline(
     given: library.pipeline.Pipeline | Mapping[str, Any] | str | os.PathLike[str],
 ) -> library.pipeline.Pipeline:
 
-    if isinstance(given, library.pipeline.Pipeline):
-        pipeline = given
-    elif isinstance(given, Mapping):
+    pipeline = given
+    if isinstance(given, Mapping):
         pipeline = library.pipeline.Pipeline.from_dict(given)
     elif isinstance(given, (str, os.PathLike)):
         pipeline = library.lifecycle.read_pipeline(given)
-    else:
+    if not isinstance(pipeline, library.pipeline.Pipeline):
         raise ArgumentError(
             "pipeline", given,
             "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
         )
     if pipeline.requirements:
-
         library.requirements.check_required(pipeline.requirements, pipeline.source)
     return pipeline
 
@@ -385,7 +367,7 @@ def photos(
     )
     for line in prepared.lines:
         notice(line)
-    return _run(
+    return run(
         prepared.pipeline,
         store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
         progress=progress, **options)
@@ -437,7 +419,7 @@ def twins(
     named = "twins" if isinstance(scene, Mapping) else scene
     measured = library.lifecycle.read_pipeline(photographs)
     parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene, measured)
-    return _run(
+    return run(
         library.twins.twin_pipeline(measured, parameters, repeats),
         store=store or library.twins.twin_store(photographs, named), progress=progress, **options)
 
@@ -604,6 +586,8 @@ def compare(
         place = os.fspath(store or library.twins.twin_store(one, other))
         twins(one, other, repeats=repeats, store=place, progress=progress, **options)
         other = place
-    elif store:
-        raise ArgumentError("store", store, "expected photographs and a TOML file to simulate")
+    else:
+        for name, value, unset in (("store", store, None), ("repeats", repeats, 1)):
+            if value != unset:
+                raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
     return library.questions.compare(one, other, bins=bins or None, output=figure)

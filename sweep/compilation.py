@@ -7,25 +7,17 @@ cache folder where the package cannot be written to.
 from __future__ import annotations
 
 import contextlib
-import gc
 import importlib
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from sweep.errors import MachineFaultError, RunError
+import numba
 
-try:
-    import numba
-    import numba.extending
-except (ValueError, TypeError) as error:
-    # Numba interprets its configuration while it is imported.
-    raise RunError(
-        f"Numba cannot be imported with its NUMBA_... variables: {type(error).__name__}: {error}"
-    ) from None
+from sweep.errors import MachineFaultError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -59,22 +51,6 @@ def compiled_inline(function: Function) -> Function:
     return compiled(function, forceinline=True)
 
 
-def choose_when_compiled(
-    function: Callable[..., Any], choices: Mapping[type, Callable[..., Any]]
-) -> None:
-    """Let compiled callers of ``function`` call a choice by the first argument, a NamedTuple."""
-
-    def choose(*args: Any) -> Any:
-        chosen = choices[args[0].instance_class]
-
-        def call(*args: Any) -> Any:
-            return chosen(*args)
-
-        return call
-
-    numba.extending.overload(function)(choose)
-
-
 def is_cached(module: str, name: str) -> bool:
     """Return whether a compiled function of a module is in the cache."""
     stats = getattr(getattr(importlib.import_module(module), name), "stats", None)
@@ -87,11 +63,8 @@ def is_cached(module: str, name: str) -> bool:
 def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature: Any) -> Any:
     """Compile or load a function for a signature.
 
-    Constants of a caller count as integers: not once for each constant. The collector of garbage
-    waits meanwhile: it would take a tenth of the time.
+    Constants of a caller count as integers: not once for each constant.
     """
-    collecting = gc.isenabled()
-    gc.disable()
     try:
         return compile_signature(tuple(map(numba.types.unliteral, signature)))
     except (numba.errors.NumbaError, MachineFaultError):
@@ -102,9 +75,6 @@ def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature
             f"({type(error).__name__}: {error}): delete its .nbi and .nbc files",
             socket.gethostname(),
         ) from error
-    finally:
-        if collecting:
-            gc.enable()
 
 
 def compiled_sources() -> tuple[Path, ...]:

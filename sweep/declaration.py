@@ -18,10 +18,6 @@ from typing import Any, TypeVar
 from sweep.messages import nearest, plain, shown, similar_names
 
 
-def _letters_and_digits(word: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", word.casefold())
-
-
 @dataclass(frozen=True, slots=True)
 class Declared:
     """The declaration of a value: name, types, default, meaning, unit, allowed values.
@@ -58,14 +54,11 @@ class Declared:
         """Return the allowed values in words, as error messages and the reference print them."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
-        low, high = f"{self.low:g}", f"{self.high:g}"
-        if math.isfinite(self.low) and math.isfinite(self.high):
-            return f"above {low} and at most {high}" if self.open_low else f"from {low} to {high}"
-        if math.isfinite(self.low):
-            return f"above {low}" if self.open_low else f"at least {low}"
-        if math.isfinite(self.high):
-            return f"at most {high}"
-        return ""
+        above = f"{'above' if self.open_low else 'at least'} {self.low:g}"
+        below = f"at most {self.high:g}"
+        if math.isinf(self.low) or math.isinf(self.high):
+            return above * math.isfinite(self.low) + below * math.isfinite(self.high)
+        return f"{above} and {below}" if self.open_low else f"from {self.low:g} to {self.high:g}"
 
     def choice(self, word: str) -> str | None:
         """Return the choice that a word names, however OpenCV or the user spells it, or None.
@@ -81,26 +74,21 @@ class Declared:
         """
         if word in self.choices:
             return word
-        bare = self._bare(word.strip().replace("::", ".").rpartition(".")[2])
-        found = next((choice for choice in self.choices if self._bare(choice) == bare), None)
-        return self._abbreviated(bare) if found is None and self.abbreviated else found
+        wanted = self._letters(word.strip().replace("::", ".").rpartition(".")[2])
+        spelled = {self._letters(choice): choice for choice in self.choices}
+        if wanted in spelled or not self.abbreviated or not re.search("[a-z]", wanted):
+            return spelled.get(wanted)
+        # The one choice that ends so, and has its number whole.
+        found = [
+            choice for letters, choice in spelled.items()
+            if letters.endswith(wanted) and re.search("[0-9]", wanted)
+            and not re.search("[0-9]", letters.removesuffix(wanted))]
+        return found[0] if len(found) == 1 else None
 
-    def _abbreviated(self, word: str) -> str | None:
-        """Return the one choice that ends as a word, which has the choice's number whole."""
-        ending = _letters_and_digits(word)
-        found = {
-            choice.casefold(): choice for choice in self.choices
-            for whole in [_letters_and_digits(choice)] if whole.endswith(ending)
-            and not re.search("[0-9]", whole.removesuffix(ending))
-        } if re.search("[0-9]", ending) and not word.isdecimal() else {}
-        return next(iter(found.values())) if len(found) == 1 else None
-
-    def _bare(self, word: str) -> str:
-        return word.casefold().removeprefix(self.prefix.casefold())
-
-    def of_number(self, number: int) -> str:
-        """Return the choice that OpenCV has a number for; empty if there is none."""
-        return next((name for name, constant in self.numbers if constant == number), "")
+    def _letters(self, word: str) -> str:
+        """Return the letters and digits by which a choice is known."""
+        bare = word.casefold().removeprefix(self.prefix.casefold())
+        return re.sub(r"[^a-z0-9]", "", bare)
 
     def admits(self, number: float) -> bool:
         """Return whether a finite number lies in the declared range."""
@@ -110,51 +98,43 @@ class Declared:
     def expected(self) -> str:
         """Return the allowed values in words."""
         if tuple in self.types:
-            if self.list_text:
-                return self.list_text
-            *counts, last = self.lengths
-            return f"a list of {', '.join(map(str, counts))} or {last} finite numbers"
+            *counts, last = self.lengths or (0,)
+            return self.list_text or (
+                f"a list of {', '.join(map(str, counts))} or {last} finite numbers below 1e300")
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
-        kind = " or ".join(words[kind] for kind in self.types)
-        extent = self.range_text()
-        if self.choices:
-            return extent
-        return f"{kind} {extent}".strip()
+        kind = "" if self.choices else " or ".join(words[kind] for kind in self.types)
+        return f"{kind} {self.range_text()}".strip()
 
     def check(self, value: Any) -> Any:
         """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
+        found: Any = None
         if self.reads is not None and value not in self.choices:
             return self.reads(value)
-        if tuple in self.types and isinstance(value, (list, tuple)):
-            numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
-            if numbers and len(value) in self.lengths:
-                return tuple(float(item) for item in value)
-        elif bool in self.types and isinstance(value, bool):
-            return value
-        elif int in self.types and isinstance(value, int) and not isinstance(value, bool):
-            if self.admits(value):
-                return value
-        elif float in self.types and _is_number(value):
-            if abs(value) < 1e300 and self.admits(float(value)):
-                return float(value)
-        elif str in self.types and isinstance(value, str):
-            if self.choices:
-                choice = self.choice(value)
-                if choice is not None:
-                    return choice
-            elif value:
-                return value
-        raise ValueError(self.expected() + self._hint(value))
+        if isinstance(value, (list, tuple)):
+            if len(value) in self.lengths and all(
+                    _is_number(item) and abs(item) < 1e300 for item in value):
+                found = tuple(map(float, value))
+        elif isinstance(value, str):
+            found = (self.choice(value) if self.choices else value or None) if (
+                str in self.types) else None
+        elif isinstance(value, bool):
+            found = value if bool in self.types else None
+        elif _is_number(value) and self.admits(value):
+            if int in self.types and isinstance(value, int):
+                found = value
+            elif float in self.types:
+                found = float(value)
+        if found is None:
+            raise ValueError(self.expected() + self._hint(value))
+        return found
 
     def _hint(self, value: Any) -> str:
         """Return the choice that a wrong value may stand for."""
-        choices = self.choices
-        if isinstance(value, str) and choices:
+        if isinstance(value, str) and self.choices:
             bare = value.removeprefix(self.prefix)
-            return similar_names(bare, choices) or nearest(bare, choices)
-        if isinstance(value, int) and (name := self.of_number(value)):
-            return f"; OpenCV's constant {value} is {name}"
-        return ""
+            return similar_names(bare, self.choices) or nearest(bare, self.choices)
+        name = next((name for name, constant in self.numbers if constant == value), None)
+        return f"; OpenCV's constant {value} is {name}" if name else ""
 
 
 def _is_number(value: Any) -> bool:

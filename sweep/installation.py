@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import multiprocessing
 from functools import cache
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.metadata import Distribution, distributions
 
 from sweep.errors import StoreError
-from sweep.messages import notice
+from sweep.messages import notice, plain
 
 #: The distribution of OpenCV that this project requires.
 OPENCV = "opencv-contrib-python-headless"
 
 #: Other distributions that install the package ``cv2``, into the same files.
 OTHER_OPENCV = ("opencv-contrib-python", "opencv-python", "opencv-python-headless")
-
-#: A distribution of another project, whose package has the same name as this one's.
-NAMESAKE = "sweep"
-
-#: The entry point of this project's distributions, under whichever name.
-COMMAND = "sweep.cli:main"
 
 REMEDY = f"`pip install --force-reinstall {OPENCV}`"
 
@@ -35,8 +29,9 @@ def check_installation() -> None:
     StoreError
         In one line, with the command that mends it.
     """
-    namesake = _installed(NAMESAKE)
-    if namesake is not None and not _is_ours(namesake):
+    namesake = _installed("sweep")  # so was this one's distribution named up to 0.5
+    if namesake is not None and all(
+            each.value != "sweep.cli:main" for each in namesake.entry_points):
         raise StoreError(
             f"another project's package `sweep` ({namesake.version}) is installed, and its files "
             "overwrite those of fiducial-sweep: `pip uninstall sweep`, then "
@@ -58,8 +53,7 @@ def check_opencv() -> None:
     try:
         import cv2  # noqa: PLC0415  (slow to import)
     except ImportError as error:
-        lines = str(error).splitlines() or [type(error).__name__]
-        raise StoreError(f"OpenCV cannot be imported: {lines[0]}; {REMEDY}") from None
+        raise StoreError(f"OpenCV cannot be imported: {plain(error)}; {REMEDY}") from None
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         version = getattr(cv2, "__version__", "of no version")
         raise StoreError(
@@ -70,30 +64,17 @@ def check_opencv() -> None:
 @cache
 def _warn_of_other_opencv() -> None:
     """Write a line to stderr if OpenCV is installed in another way than this project asks for."""
-    others = {
-        name: package.version for name in OTHER_OPENCV
-        if (package := _installed(name)) is not None
-    }
-    required = _installed(OPENCV)
-    if not others and required is not None:
-        return
-    import cv2  # noqa: PLC0415  (slow to import)
+    found = {name: package.version for name in (OPENCV, *OTHER_OPENCV)
+             if (package := _installed(name)) is not None}
+    if [*found] != [OPENCV]:
+        import cv2  # noqa: PLC0415  (slow to import)
 
-    listed = " and ".join(f"{name} {version}" for name, version in others.items())
-    beside = "is missing" if required is None else f"{required.version} is installed, too"
-    notice(
-        f"warning: {listed or 'an unknown distribution'} has installed OpenCV, and {OPENCV} "
-        f"{beside}; OpenCV {cv2.__version__} is loaded and recorded in stores"
-    )
+        listed = " and ".join(f"{name} {version}" for name, version in found.items())
+        notice(
+            f"warning: {listed or 'an unknown distribution'} installed OpenCV, not {OPENCV} alone; "
+            f"OpenCV {cv2.__version__} is loaded and recorded in stores"
+        )
 
 
 def _installed(name: str) -> Distribution | None:
-    try:
-        return distribution(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _is_ours(namesake: Distribution) -> bool:
-    """Return whether a distribution is this project's; it was named ``sweep`` up to 0.5."""
-    return any(entry.value == COMMAND for entry in namesake.entry_points)
+    return next(iter(distributions(name=name)), None)

@@ -39,22 +39,14 @@ if TYPE_CHECKING:
     from sweep.store import lifecycle, locations, lock
     from sweep.tradeoff import choice_search
 
-#: Folders of modules: of two modules of one name it is the one in the first of them.
-ROOMS = (
-    "report", "sampling", "analysis", "conformance", "diagnosis", "evaluation", "exchange",
-    "execution", "experiment", "fitting", "integrity", "photographs", "plugins", "store",
-    "tradeoff",
-)
-
-
 if not TYPE_CHECKING:  # so that mypy knows the names above alone
 
     def __getattr__(name: str) -> ModuleType:
-        """Import a module when it is first used."""
+        """Import a module when it is first used; of two of one name, that of the later room."""
         top = Path(__file__).parent
-        for room in ("", *ROOMS):
-            if (top / room / f"{name}.py").is_file():
-                where = f"sweep.{room}.{name}" if room else f"sweep.{name}"
-                module = globals()[name] = importlib.import_module(where)  # it is found once
-                return module
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found = sorted((*top.glob(f"{name}.py"), *top.glob(f"*/{name}.py")))
+        if not found:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        where = found[-1].relative_to(top.parent).with_suffix("").parts
+        globals()[name] = importlib.import_module(".".join(where))  # it is found once
+        return globals()[name]

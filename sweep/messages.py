@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import difflib
 import enum
+import glob
 import itertools
 import json
 import math
@@ -119,14 +120,10 @@ def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
     """
     if len(word) > MAX_WORD_LENGTH:
         return ""
-    known = [name for name in known if name != word]
-    simple = {_letters(name): name for name in known}
-    close = [name for name in known if _letters(name) == _letters(word)]
-    close = close or [name for name in known if word and name.startswith(word)]
-    close = close or [simple[each] for each in difflib.get_close_matches(
-        _letters(word), list(simple), n=1, cutoff=cutoff)]
-    close = close or difflib.get_close_matches(word, known, n=1, cutoff=cutoff - 0.1)
-    return close[0] if close else ""
+    letters, simple = _letters(word), {_letters(name): name for name in known if name != word}
+    longer = [each for each in simple if letters and each.startswith(letters)]
+    close = longer or difflib.get_close_matches(letters, list(simple), n=1, cutoff=cutoff)
+    return simple[min(close, key=len)] if close else ""
 
 
 def nearest(word: str, known: Collection[str]) -> str:
@@ -158,14 +155,20 @@ def similar_names(word: str, known: Sequence[str]) -> str:
 
 
 def nearest_file(path: str | os.PathLike[str]) -> str:
-    """Return "; did you mean ...?" with the most similar name in a missing path's folder, or ""."""
+    """Return "; did you mean ...?" for a missing path, or "".
+
+    It is the path's name in a folder beside it, or the most similar name in its folder.
+    """
     wanted = Path(path)
     try:
         if wanted.exists():
             return ""
+        below = next(wanted.parent.glob(f"*/{glob.escape(wanted.name)}"), None)
         names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
     except (OSError, ValueError):
         return ""
+    if below is not None:
+        return f"; did you mean {plain(below, 300)}?"
     stems = {Path(name).stem: name for name in names
              if Path(name).suffix.lower() == wanted.suffix.lower()}
     close = stems.get(similar(wanted.stem, stems)) or similar(wanted.name, names, 0.8)
@@ -271,14 +274,9 @@ def duration(seconds: float) -> str:
 
 
 def quoted(*words: str) -> str:
-    r"""Return words of a command, quoted for a shell on one line.
+    """Return words of a command, quoted for a shell on one line.
 
-    >>> print(quoted("a b", "two\nlines"))
-    'a b' $'two\nlines'
+    >>> print(quoted("a b", "c"))
+    'a b' c
     """
-
-    def escaped(word: str) -> str:
-        word = word.replace("\\", "\\\\").replace("'", "\\'")
-        return f"$'{plain(word, len(word))}'"
-
-    return " ".join(shlex.quote(word) if word.isprintable() else escaped(word) for word in words)
+    return shlex.join(plain(word, len(word)) for word in words)

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import choose_when_compiled, compiled
+from sweep.compilation import compiled
 from sweep.declaration import parameter
 from sweep.measure.estimation import covariance_elsewhere, pose_covariance, solve_positive
 from sweep.measure.flags import BoundStatus
@@ -391,7 +392,15 @@ def squared_residuals(
     return MODELS[type(seen)](seen, state, work, information, gradient)
 
 
-choose_when_compiled(squared_residuals, MODELS)
+@numba.extending.overload(squared_residuals)
+def _choose_model(*args: Any) -> Any:
+    """Return the choice of compiled callers, by the first argument, a NamedTuple."""
+    chosen = MODELS[args[0].instance_class]
+
+    def call(*args: Any) -> Any:
+        return chosen(*args)
+
+    return call
 
 
 @compiled

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -86,14 +85,10 @@ def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
 
 def installed(monkeypatch, commands=(), **versions):
     """Have these versions of distributions be installed alone, each with commands."""
-    def distribution(name):
-        if name.replace("-", "_") not in versions:
-            raise PackageNotFoundError(name)
-        return SimpleNamespace(
-            version=versions[name.replace("-", "_")],
-            entry_points=[SimpleNamespace(value=value) for value in commands])
-
-    monkeypatch.setattr(installation, "distribution", distribution)
+    monkeypatch.setattr(installation, "distributions", lambda name: [
+        SimpleNamespace(version=version, entry_points=[
+            SimpleNamespace(value=value) for value in commands])
+        for known, version in versions.items() if known == name.replace("-", "_")])
 
 
 @pytest.mark.parametrize("distributions", [

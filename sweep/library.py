@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sweep.execution import forecast, limit_search, progress, runner, status
     from sweep.experiment import parameters, pipeline, sampling
     from sweep.fitting import folders
-    from sweep.integrity import reproduction, verification
+    from sweep.integrity import verification
     from sweep.photographs import prepare, twins
     from sweep.plugins import declared
     from sweep.report import (

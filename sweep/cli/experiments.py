@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
     from sweep.experiment.sampling import StoppingRule
-    from sweep.integrity.reproduction import Reproduction
+    from sweep.integrity.verification import Reproduction
     from sweep.report.table import Findings
 
 # --------------------------------------------------------------------------------------------------
@@ -322,11 +322,11 @@ def repro(
         if len(chosen) > 1:
             raise ArgumentError("output", output, "expected one --at beside it")
         check_png(output)
-    library.reproduction.check_selection(store, chosen)
+    library.verification.check_selection(store, chosen)
     lines: list[Any] = []
     cells = []
     for each in chosen:
-        again = library.reproduction.reproduce(
+        again = library.verification.reproduce(
             store, each, whole_frame=full, time_limit_s=time_limit_s)
         cells.append(again)
         lines += [""] if lines else []

@@ -24,7 +24,7 @@ from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
-from sweep.integrity.reproduction import compare
+from sweep.integrity.verification import compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.report.report_data import AREA, ReportData, store_errors
 from sweep.report.table import Table, coordinate, number, plural

@@ -24,7 +24,7 @@ import zarr.errors
 from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.dtype import parse_dtype
-from zarr.storage import LocalStore, MemoryStore
+from zarr.storage import MemoryStore
 
 from sweep.errors import StoreError, SweepError
 from sweep.experiment.document import MAX_BYTES, read_document
@@ -191,18 +191,15 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
     sides = pipeline.values_of("side_px")
     if not sides or sides[0] is None:
         return []
-    axes = [
-        axis for axis in pipeline.experiment.scene_axes
-        if axis.columns.keys() & set(DISTANCE_PARAMETERS)
-    ]
+    axes = [axis for axis in pipeline.experiment.scene_axes
+            if axis.columns.keys() & set(DISTANCE_PARAMETERS)]
     values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
-    for k, axis in enumerate(axes):
+    # Each axis' values along a dimension of their own.
+    for axis, index in zip(axes, np.ix_(*(range(len(axis)) for axis in axes)), strict=True):
         for name in axis.columns.keys() & set(DISTANCE_PARAMETERS):
-            column = np.array(axis.columns[name], dtype=np.float64)
-            values[name] = column.reshape([-1 if j == k else 1 for j in range(len(axes))])
+            values[name] = np.array(axis.columns[name], dtype=np.float64)[index]
     distance = np.broadcast_to(
-        np.asarray(distance_of_side(values), dtype=np.float64), tuple(len(axis) for axis in axes)
-    )
+        np.asarray(distance_of_side(values), dtype=np.float64), [len(axis) for axis in axes])
     return [_coordinate(
         "distance_m", tuple(axis.name for axis in axes), distance,
         {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
@@ -325,7 +322,8 @@ def open_unchecked(url: str, mode: str = "r") -> RunStore:
         )
         cut = Blocks(
             tuple(len(axis) for axis in pipeline.experiment.scene_axes), tuple(metadata["block"]))
-        group = locations.open_group(storage, mode)
+        group = zarr.open_group(
+            storage, mode=mode, zarr_format=3, use_consolidated=False)  # type: ignore[arg-type]
         return RunStore(url, group, pipeline, metadata["run_id"], cut)
     except UNREADABLE:
         raise StoreError(locations.not_a_store(url)) from None
@@ -377,31 +375,30 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     }
     root = _sealed(_group_document(root_attributes(pipeline, planned, metadata)))
     contents["zarr.json"] = files.encoded(root)
+    remote = locations.is_remote(url)
     with locations.translate_errors(url, "written"):
-        if locations.is_remote(url):
-            storage = locations.storage_at(url, read_only=False)
-            files.write_files(
-                storage, {f"{run_id}/{key}": content for key, content in contents.items()})
-            try:
-                _check_free(url)
-            except BaseException:
-                files.delete_folder(storage, run_id)
-                raise
-            # The URL points to it once it is complete.
-            files.write_document(storage, "zarr.json", _group_document({locations.POINTER: run_id}))
-        else:
+        path = Path(url).resolve()  # a link may lead there
+        if not remote:
             locations.check_writable(url)
-            path = Path(url).resolve()  # a link may lead there
             for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
                 shutil.rmtree(doomed, ignore_errors=True)  # a killed process began it
-            building = _beside(path, "new")
-            try:
-                files.write_files(LocalStore(building), contents)
-                _check_free(url)
-                building.rename(path)
-            except BaseException:
+        building = f"{url}/{run_id}" if remote else str(_beside(path, "new"))
+        try:
+            files.write_files(locations.storage_at(building, read_only=False), contents)
+            if locations.exists(url):
+                raise StoreError(
+                    f"{url}: another process has made it meanwhile; run it again to continue")
+            if not remote:
+                Path(building).rename(path)
+        except BaseException:
+            if remote:
+                files.delete_folder(locations.storage_at(url, read_only=False), run_id)
+            else:
                 shutil.rmtree(building, ignore_errors=True)
-                raise
+            raise
+        if remote:  # the URL points to it once it is complete
+            files.write_document(locations.storage_at(url, read_only=False), "zarr.json",
+                                 _group_document({locations.POINTER: run_id}))
     return open_store(url, "r+")
 
 
@@ -412,12 +409,6 @@ def _recorded(pipeline: Pipeline) -> dict[str, Any]:
         "name": pipeline.name, "folder": pipeline.folder, "fingerprint": fingerprint(pipeline),
         **({RECORDED: plugins} if plugins else {}),
     }
-
-
-def _check_free(url: str) -> None:
-    """Raise StoreError if another process has created a store meanwhile."""
-    if locations.exists(url):
-        raise StoreError(f"{url}: another process has made it meanwhile; run it again to continue")
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import sys
@@ -21,17 +22,7 @@ from zarr.storage import FsspecStore, LocalStore
 
 from sweep.errors import StoreError
 from sweep.messages import nearest_file, plain
-from sweep.store.files import delete_files, write_document
-
-
-def check_zarr() -> None:
-    """Raise StoreError if Python runs without assertions, which Zarr needs to read groups."""
-    if sys.flags.optimize:
-        raise StoreError(
-            "Zarr cannot read groups where Python leaves out assertions; unset PYTHONOPTIMIZE, and "
-            "run Python without -O"
-        )
-
+from sweep.store.files import delete_files, read_files, write_document
 
 # --------------------------------------------------------------------------------------------------
 # Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
@@ -66,19 +57,12 @@ def translate_errors(url: str, action: str) -> Iterator[None]:
         yield
     except (StoreError, zarr.errors.BaseZarrError):
         raise
-    except FileNotFoundError as error:
-        raise StoreError(f"{url}: cannot be {action}: {error.strerror or error}") from None
-    except OSError as error:
-        raise StoreError(f"{url}: cannot be {action}: {reason_of(error)}") from None
     except Exception as error:
         # The libraries of remote stores raise errors of many kinds that are no OSError.
-        if not is_remote(url) or not _is_foreign(error):
+        own = type(error).__module__.partition(".")[0] in ("sweep", "zarr", "builtins", "numpy")
+        if not isinstance(error, OSError) and (own or not is_remote(url)):
             raise
         raise StoreError(f"{url}: cannot be {action}: {reason_of(error)}") from None
-
-
-def _is_foreign(error: Exception) -> bool:
-    return type(error).__module__.partition(".")[0] not in ("sweep", "zarr", "builtins", "numpy")
 
 
 def reason_of(error: BaseException) -> str:
@@ -97,32 +81,31 @@ def checked_url(url: str) -> str:
         If it holds what must not be recorded or printed, or names a place that other processes
         cannot see or that a path names.
     """
-    if not url.strip():
-        raise StoreError(f"{url!r}: expected the path or URL of a store")
-    if "\0" in url:
-        raise StoreError(f"{url}: a path cannot hold a null character; choose another one")
-    scheme = url.partition(":")[0].lower()
-    if scheme in ("file", "local") and ":" in url:
-        path = unquote(urlsplit(url).path)
-        raise StoreError(f"{url}: a store on this machine is named by its path: {path}")
-    if scheme == "memory" and ":" in url:
+    scheme, colon, _ = url.lower().partition(":")
+    problem = ""
+    if sys.flags.optimize:
+        problem = ("Zarr cannot read groups where Python leaves out assertions; unset "
+                   "PYTHONOPTIMIZE, and run Python without -O")
+    elif not url.strip():
+        problem = "expected the path or URL of a store"
+    elif "\0" in url:
+        problem = "a path cannot hold a null character; choose another one"
+    elif colon and scheme in ("file", "local"):
+        problem = f"a store on this machine is named by its path: {unquote(urlsplit(url).path)}"
+    elif colon and scheme == "memory":
+        problem = "no other process sees this one's memory; choose a path or s3://"
+    elif url.partition("/")[0] == "~":
+        problem = (f"~ is not expanded here; expected {Path(url).expanduser()}, or ./{url} for a "
+                   "folder of that name")
+    if problem:
+        raise StoreError(f"{url if url.strip() else repr(url)}: {problem}")
+    scheme, _, rest = url.partition("://")
+    if rest and ("::" in scheme or any(sign in rest for sign in ("@", "?", "#", "://", "::"))):
         raise StoreError(
-            f"{url}: no other process sees this one's memory; choose a path or s3://"
+            f"{scheme}://...: a store's URL is printed and recorded: expected no credentials "
+            "or options in it; pass them in the environment (AWS_ACCESS_KEY_ID, ...)"
         )
-    if url.partition("/")[0] == "~":
-        raise StoreError(
-            f"{url}: ~ is not expanded here; expected {Path(url).expanduser()}, or ./{url} for a "
-            "folder of that name"
-        )
-    if is_remote(url):
-        scheme, _, rest = url.partition("://")
-        if "::" in scheme or any(sign in rest for sign in ("@", "?", "#", "://", "::")):
-            raise StoreError(
-                f"{scheme}://...: a store's URL is printed and recorded: expected no credentials "
-                "or options in it; pass them in the environment (AWS_ACCESS_KEY_ID, ...)"
-            )
-        return url.rstrip("/")
-    return url
+    return url.rstrip("/") if is_remote(url) else url
 
 
 def absolute_url(url: str) -> str:
@@ -132,7 +115,6 @@ def absolute_url(url: str) -> str:
 
 def storage_at(url: str, *, read_only: bool) -> Store:
     """Return the Zarr storage at a URL, whatever lies there."""
-    check_zarr()
     if not is_remote(url):
         # Absolute: a lazy dataset may be read by another process, in another working folder.
         return LocalStore(Path(url).absolute(), read_only=read_only)
@@ -148,27 +130,22 @@ def storage_at(url: str, *, read_only: bool) -> Store:
         raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
 
 
-def open_group(storage: Store, mode: str) -> zarr.Group:
-    """Open the root group of a storage."""
-    check_zarr()
-    return zarr.open_group(
-        storage, mode=mode, zarr_format=3, use_consolidated=False  # type: ignore[arg-type]
-    )
-
-
 def remote_run_id(url: str) -> str | None:
     """Return the id of the run that a remote store's URL points to; None if there is no store."""
     with translate_errors(url, "reached"):
         try:
-            pointer = open_group(storage_at(url, read_only=True), "r")
-        except (FileNotFoundError, zarr.errors.GroupNotFoundError):
-            return None
+            content = read_files(storage_at(url, read_only=True), ["zarr.json"])[0]
         except (TypeError, ValueError, AttributeError, NotImplementedError) as error:
             raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
-    run_id = pointer.attrs.get(POINTER)
-    if not isinstance(run_id, str) or not re.fullmatch("[0-9a-f]{32}", run_id):
-        raise StoreError(not_a_store(url))
-    return run_id
+    if content is None:
+        return None
+    try:
+        run_id = json.loads(content)["attributes"][POINTER]
+        if re.fullmatch("[0-9a-f]{32}", run_id):
+            return str(run_id)
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise StoreError(not_a_store(url))
 
 
 def exists(url: str) -> bool:
@@ -208,15 +185,10 @@ def open_storage(url: str, mode: str = "r") -> Store:
         raise StoreError(f"{url}: store not found{_similar(url)}")
     if is_remote(url):
         return storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r")
-    try:
+    with translate_errors(url, "read"):
         if not Path(url).is_dir():
             raise StoreError(not_a_store(url))
-        if mode == "r":
-            return storage_at(url, read_only=True)
-        check_zarr()
-        return _HeldStore(_HeldFolder(url))
-    except OSError as error:
-        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
+        return storage_at(url, read_only=True) if mode == "r" else _HeldStore(_HeldFolder(url))
 
 
 def _similar(url: str) -> str:
@@ -267,7 +239,6 @@ def check_writable(url: str) -> None:
     StoreError
         If nothing can be written there, or it is inside another store.
     """
-    check_zarr()
     if is_remote(checked_url(url)):
         if url.partition("://")[0].lower() in ("http", "https"):
             raise StoreError(f"{url}: can only be read; choose a path or s3://")

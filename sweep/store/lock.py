@@ -20,6 +20,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
+from functools import partial
 
 from zarr.abc.store import Store
 from zarr.storage import LocalStore
@@ -39,23 +40,32 @@ SILENCE_S = 120.0
 
 
 @contextlib.contextmanager
-def writing(url: str, storage: Store) -> Iterator[None]:
-    """Have changes of a store refused, while this process writes its blocks."""
-    with _held(url, storage, alone=False):
-        yield
-
-
-@contextlib.contextmanager
-def changing(url: str, storage: Store) -> Iterator[None]:
-    """Hold a store alone, to delete it or to change what others rely on.
+def held(url: str, storage: Store, *, alone: bool) -> Iterator[None]:
+    """Hold the lock of a store: alone, or beside others that do not want it alone.
 
     Raises
     ------
     StoreError
-        If another process writes it.
+        If another process writes it; beside others, if one holds it alone.
     """
-    with _held(url, storage, alone=True):
+    with contextlib.ExitStack() as stack:
+        with translate_errors(url, "written"):
+            try:
+                stack.enter_context(
+                    _folder_locked(storage, WAIT_S, alone=alone)
+                    if isinstance(storage, LocalStore) else _key(storage, alone=alone))
+            except BlockingIOError:
+                raise StoreError(
+                    f"{url}: another process is writing it; wait for it, or choose another --store"
+                ) from None
         yield
+
+
+#: Have changes of a store refused, while this process writes its blocks.
+writing = partial(held, alone=False)
+
+#: Hold a store alone, to delete it or to change what others rely on.
+changing = partial(held, alone=True)
 
 
 def is_written(storage: Store) -> bool:
@@ -65,26 +75,8 @@ def is_written(storage: Store) -> bool:
     try:
         with _folder_locked(storage, 0.0, alone=True):
             return False
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-
-
-@contextlib.contextmanager
-def _held(url: str, storage: Store, *, alone: bool) -> Iterator[None]:
-    """Hold a lock; say in a line if it cannot be had."""
-    local = isinstance(storage, LocalStore)
-    held = _folder_locked(storage, WAIT_S, alone=alone) if local else _key(storage, alone=alone)
-    with contextlib.ExitStack() as stack:
-        with translate_errors(url, "written"):
-            try:
-                stack.enter_context(held)
-            except BlockingIOError:
-                raise StoreError(
-                    f"{url}: another process is writing it; wait for it, or choose another --store"
-                ) from None
-        yield
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sweep.experiment.draws import SAMPLINGS
+from sweep.experiment.grid import Axis
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import not_continued
 from sweep.installation import check_installation
@@ -156,31 +157,21 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     stored
         The store's fingerprint.
     """
+    there, here = (pipeline.fixed | pipeline.distributions for pipeline in (theirs, ours))
+    names = [", ".join(axis.name for axis in each.axes) or "none" for each in (theirs, ours)]
+    pairs = [
+        *changes(stored, fingerprint(ours)),
+        ("axes", *names),
+        *((f"axes.{axis.name}", theirs.axis(axis.name), axis) for axis in ours.axes
+          if theirs.axis(axis.name)),
+        # An axis of one of the two alone is in the list of its axes.
+        *((name, there.get(name), here.get(name)) for name in sorted({*there, *here})
+          if not (ours.axis_of(name) or theirs.axis_of(name))),
+    ]
     lines = [
-        f"{key}: the store has {stored_value}, this run {own_value}"
-        for key, stored_value, own_value in changes(stored, fingerprint(ours))
+        f"{name}: the store has {_shown(other)}, this run {_shown(own)}"
+        for name, other, own in pairs if _values(other) != _values(own)
     ]
-    if [axis.name for axis in ours.axes] != [axis.name for axis in theirs.axes]:
-        lines.append(f"axes: the store has {_names(theirs)}, this run {_names(ours)}")
-    lines += [
-        f"axes.{axis.name}: the store has {excerpt(other.values)}, "
-        f"this run {excerpt(axis.values)}"
-        for axis in ours.axes
-        if (other := theirs.axis(axis.name)) is not None
-        and not (
-            axis.columns.keys() == other.columns.keys()
-            and all(same_values(axis.columns[name], other.columns[name]) for name in axis.columns)
-        )
-    ]
-    for our_values, their_values in (
-        (ours.fixed, theirs.fixed), (ours.distributions, theirs.distributions),
-    ):
-        lines += [
-            f"{name}: the store has {their_values.get(name)}, this run {our_values.get(name)}"
-            for name in sorted({*our_values, *their_values})
-            if ours.axis_of(name) is None and theirs.axis_of(name) is None
-            and their_values.get(name) != our_values.get(name)
-        ]
     if problem := not_continued(ours.stopping, theirs.stopping):
         lines.append(problem)
     if any(line.startswith("sensor_") for line in lines):
@@ -188,15 +179,15 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     return lines
 
 
-def same_values(a: Any, b: Any) -> bool:
-    """Return whether two axes have the same values in the same order."""
-    if isinstance(a, range) and isinstance(b, range):
-        return a == b
-    return len(a) == len(b) and all(x == y for x, y in zip(a, b, strict=True))
+def _values(value: Any) -> Any:
+    """Return a value to be compared: of an axis the values of each of its parameters."""
+    if not isinstance(value, Axis):
+        return value
+    return {name: list(column) for name, column in value.columns.items()}
 
 
-def _names(pipeline: Pipeline) -> str:
-    return ", ".join(axis.name for axis in pipeline.axes) or "none"
+def _shown(value: Any) -> str:
+    return excerpt(value.values) if isinstance(value, Axis) else str(value)
 
 
 def excerpt(values: Any) -> str:

@@ -20,8 +20,7 @@ from sweep.execution.runner import execute
 from sweep.execution.status import close
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.reproduction import compare
-from sweep.integrity.verification import repair, verify
+from sweep.integrity.verification import compare, repair, verify
 from sweep.store.blocks import MAX_CHARACTERS, MAX_PER_BLOCK, recorded
 
 TEXT = """

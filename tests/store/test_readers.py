@@ -20,8 +20,7 @@ from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
-from sweep.integrity.reproduction import reproduce
-from sweep.integrity.verification import verify
+from sweep.integrity.verification import reproduce, verify
 from sweep.measure.flags import EstimateStatus, present_values
 from sweep.processor import processor
 from sweep.store.blocks import committed, drop_block, missing_chunks, receipts

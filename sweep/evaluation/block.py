@@ -127,7 +127,8 @@ def detections_for(
         found.square, size / scenes.size_m, found.chessboard_px, (), result.poses.rotation,
         result.poses.translation, on_board,
     )
-    return dataclasses.replace(everything.take(rows), images=images, beside=beside)
+    some = everything if len(rows) == len(scenes) else everything.take(rows)
+    return dataclasses.replace(some, images=images, beside=beside)
 
 
 def estimates_of(

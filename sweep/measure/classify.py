@@ -186,13 +186,14 @@ def classify(
     corners[at.owner[order]] = at.corners_px[order]
     marker_flags[visible], marker_corners[visible] = flags, corners
     missing = (marker_flags == DetectionStatus.no_candidate).any(axis=1)
-    rejected = _in_frame([
-        (row, each.rejected, np.full(len(each.rejected), -1)) for row, each in searched.items()
-        if missing[row] and len(each.rejected)
-    ], origin)
-    missed = _at_squares(rejected, first, number, true_px).owner
-    flags[missed[flags[missed] == DetectionStatus.no_candidate]] = DetectionStatus.rejected
-    marker_flags[visible] = flags
+    if missing.any():
+        rejected = _in_frame([
+            (row, each.rejected, np.full(len(each.rejected), -1)) for row, each in searched.items()
+            if missing[row] and len(each.rejected)
+        ], origin)
+        missed = _at_squares(rejected, first, number, true_px).owner
+        flags[missed[flags[missed] == DetectionStatus.no_candidate]] = DetectionStatus.rejected
+        marker_flags[visible] = flags
     of_targets = np.full(len(visible), DetectionStatus.not_visible, dtype=np.uint8)
     for flag in reversed(_NEAREST):
         of_targets[(marker_flags == flag).any(axis=1)] = flag

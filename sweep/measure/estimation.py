@@ -188,6 +188,8 @@ class Estimates:
     @staticmethod
     def concatenate(parts: Sequence[Estimates]) -> Estimates:
         """Return the estimates of several parts as one."""
+        if len(parts) == 1:
+            return parts[0]
         names = [field.name for field in dataclasses.fields(Estimates)]
         return Estimates(
             *(np.concatenate([getattr(part, name) for part in parts]) for name in names)

@@ -523,11 +523,14 @@ def _add_spread_slopes(
     normal = 1.0 / (sigma * math.sqrt(2.0 * math.pi))
     first = np.zeros(2, dtype=np.int64)
     last = np.zeros(2, dtype=np.int64)
+    moving = np.empty(POSE)
     for panel in range(panels):
         for node in range(3):
             weight = WEIGHTS[node] / panels
             t = (panel + NODES[node]) / panels
             at = (xa + t * dx, ya + t * dy)
+            for k in range(POSE):
+                moving[k] = at_a[k] + t * (at_b[k] - at_a[k])
             for axis in range(2):
                 size = width if axis == 0 else height
                 first[axis] = max(math.floor(at[axis] - reach), 0)
@@ -547,7 +550,7 @@ def _add_spread_slopes(
                     count = max(count, slot + 1)
                     share = jump * weight * near[0, j] * near[1, i]
                     for k in range(POSE):
-                        slopes[slot, k] -= share * (at_a[k] + t * (at_b[k] - at_a[k]))
+                        slopes[slot, k] -= share * moving[k]
                     slopes[slot, POSE] += jump * weight * sigma * (
                         near[0, j] * slope[1, i] * dx - slope[0, j] * near[1, i] * dy
                     )

@@ -227,8 +227,10 @@ def _exposed(levels: Floats, patch: Patch) -> Floats:
 
 def _noisy(levels: Floats, patch: Patch) -> Floats:
     """Return levels with plain grey noise, which may be correlated."""
-    noise = patch.noise(patch.noise_key, sensor.GREY_NOISE_DRAW, levels)
-    return np.asarray(levels + patch.values["noise_grey"] * noise)
+    noisy = patch.noise(patch.noise_key, sensor.GREY_NOISE_DRAW, levels)
+    noisy *= patch.values["noise_grey"]
+    noisy += levels
+    return noisy
 
 
 def _demosaiced(levels: Floats, patch: Patch) -> Floats:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -75,40 +74,37 @@ POWERS = 4
 
 @dataclass(frozen=True)
 class BinSums:
-    """Sums over the poses of bins.
+    """Sums over the poses of the bins that have any.
 
     Attributes
     ----------
     count
         Poses (bins,).
     at
-        Their mean ln(distance), ln(side) and viewing angle (bins, 3); any number where there is no
-        pose.
-    powers
-        Sums of the errors' powers 1 to 4, (bins, 4).
+        Their mean ln(distance), ln(side) and viewing angle (bins, 3).
+    means
+        Means of an error's powers 1 to 4, (bins, 4).
     """
 
     count: Floats
     at: Floats
-    powers: Floats
+    means: Floats
 
     @classmethod
     def of(cls, moments: Floats, quantity: int) -> BinSums:
-        """Return the sums of an error, of the bins that have poses.
-
-        ``moments`` (bins, columns) are the numbers of poses, sums of their three coordinates, and
-        of the powers of each error.
-        """
+        """Return the sums of an error; ``moments`` (bins, columns) are those of `moments_of`."""
         some = moments[moments[:, 0] > 0]
-        start = 4 + POWERS * quantity
-        return cls(some[:, 0], some[:, 1:4] / some[:, :1], some[:, start : start + POWERS])
+        start, count = 4 + POWERS * quantity, some[:, :1]
+        return cls(count[:, 0], some[:, 1:4] / count, some[:, start : start + POWERS] / count)
 
-    def power_mean(self, centre: Floats, power: int) -> Floats:
-        """Return the mean 2nd or 4th power of the errors minus ``centre`` (bins,)."""
-        n = np.maximum(self.count, 1.0)
-        s1, s2, s3, s4 = self.powers.T / n
-        if power == 2:
-            return np.asarray(np.maximum(s2 - 2.0 * centre * s1 + centre**2, FLOOR))
+    def square(self, centre: Floats) -> Floats:
+        """Return the mean squares of the errors minus ``centre`` (bins,)."""
+        s1, s2, _, _ = self.means.T
+        return np.asarray(np.maximum(s2 - 2.0 * centre * s1 + centre**2, FLOOR))
+
+    def fourth_power(self, centre: Floats) -> Floats:
+        """Return the mean fourth powers of the errors minus ``centre`` (bins,)."""
+        s1, s2, s3, s4 = self.means.T
         return np.asarray(np.maximum(
             s4 - 4.0 * centre * s3 + 6.0 * centre**2 * s2 - 4.0 * centre**3 * s1 + centre**4,
             FLOOR**2))
@@ -126,30 +122,21 @@ class Fit:
     def score(self, sums: BinSums, basis: Floats) -> float:
         """Return the log-likelihood of normal errors of other poses, up to a constant."""
         log_variance = basis @ self.log_variance
-        square = sums.power_mean(basis @ self.bias, 2)
+        square = sums.square(basis @ self.bias)
         return float(-0.5 * (sums.count * (log_variance + square * np.exp(-log_variance))).sum())
 
-    def at(self, basis: Floats) -> Fit:
-        """Return the fit at other points: ``basis`` (points, coefficients) are the functions there.
+    def at(self, basis: Floats) -> Floats:
+        """Return bias, ln(variance) and their standard errors, (4, points).
+
+        ``basis`` (points, coefficients) are the functions there.
 
         >>> fit = Fit(*np.array([[0.0, 2.0], [1.0, 1.0]]), np.eye(2), np.eye(2))
-        >>> fit.at(np.array([[0.5, 0.5]])).bias.tolist(), fit.bias_error.tolist()
-        ([1.0], [1.0, 1.0])
+        >>> fit.at(np.array([[0.5, 0.5]])).round(3).tolist()
+        [[1.0], [1.0], [0.707], [0.707]]
         """
-        return Fit(
-            basis @ self.bias, basis @ self.log_variance,
-            basis @ self.bias_covariance @ basis.T,
-            basis @ self.log_variance_covariance @ basis.T)
-
-    @property
-    def bias_error(self) -> Floats:
-        """Standard errors of the bias."""
-        return np.sqrt(np.maximum(np.diag(self.bias_covariance), 0.0))
-
-    @property
-    def log_variance_error(self) -> Floats:
-        """Standard errors of ln(variance)."""
-        return np.sqrt(np.maximum(np.diag(self.log_variance_covariance), 0.0))
+        errors = (np.sqrt(np.maximum(np.diag(basis @ each @ basis.T), 0.0))
+                  for each in (self.bias_covariance, self.log_variance_covariance))
+        return np.stack([basis @ self.bias, basis @ self.log_variance, *errors])
 
 
 def hat_basis(at: Floats, knots: Sequence[Floats]) -> Floats:
@@ -208,22 +195,23 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     A⁻¹ M A⁻¹ with the bins' own fourth moments, so that tails need not be normal: White, "Maximum
     likelihood estimation of misspecified models", Econometrica 50, 1982.
     """
-    count = sums.count
-    mean = sums.powers[:, 0] / np.maximum(count, 1.0)
+    count, mean = sums.count, sums.means[:, 0]
+
+    def squares(bias: Floats) -> Floats:
+        return sums.square(basis @ bias)
+
     bias = _weighted(basis, penalty, count, mean)
-    square = sums.power_mean(basis @ bias, 2)
-    log_variance = _weighted(basis, penalty, count, np.log(square))
+    log_variance = _weighted(basis, penalty, count, np.log(squares(bias)))
     for _ in range(ITERATIONS):
-        ratio = sums.power_mean(basis @ bias, 2) * np.exp(-(basis @ log_variance))
+        ratio = squares(bias) * np.exp(-(basis @ log_variance))
         step = np.clip(_weighted(basis, penalty, count, ratio - 1.0, log_variance), -2.0, 2.0)
         log_variance = log_variance + step
-        bias = _bias(basis, penalty, count, mean, log_variance)[0]
+        bias, bias_covariance = _bias(basis, penalty, count, mean, log_variance)
         if np.abs(step).max() < CONVERGED:
             break
     fitted = basis @ log_variance
-    bias, bias_covariance = _bias(basis, penalty, count, mean, log_variance)
-    kurtosis = sums.power_mean(basis @ bias, 4) * np.exp(-2.0 * fitted)
-    ratio = sums.power_mean(basis @ bias, 2) * np.exp(-fitted)
+    kurtosis = sums.fourth_power(basis @ bias) * np.exp(-2.0 * fitted)
+    ratio = squares(bias) * np.exp(-fitted)
     bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
     # Mean of (residual² / variance - 1)². A bin's own is too small as often as it has not seen
     # its tails: it is at least the variance of all.
@@ -297,7 +285,7 @@ def select_knots(
     counts = [[count for count in KNOTS if count < len(each)] + (
         [len(each)] if len(each) <= KNOTS[-1] else []) for each in values]
 
-    def tried(numbers: Sequence[int]) -> tuple[float, list[int], list[Floats]]:
+    def tried(numbers: tuple[int, ...]) -> tuple[float, tuple[int, ...], list[Floats]]:
         """Return how well numbers of knots, by their indices in ``counts``, describe the poses."""
         knots = [choose_knots(each, some[k])
                  for each, some, k in zip(values, counts, numbers, strict=True)]
@@ -305,15 +293,15 @@ def select_knots(
         a, b = (hat_basis(each.at, knots) for each in (first, second))
         total = fit_error(first, a, penalty).score(second, b)
         total += fit_error(second, b, penalty).score(first, a)
-        return total - gain * len(penalty), [*numbers], knots
+        return total - gain * len(penalty), numbers, knots
 
-    best = tried([0] * len(values))
+    best = tried((0,) * len(values))
     while True:
-        chosen = best[1]
-        steps = [tried([*chosen[:axis], number, *chosen[axis + 1:]])
-                 for axis, some in enumerate(counts)
-                 for number in range(chosen[axis] + 1, min(chosen[axis] + 3, len(some)))]
-        if not steps or (better := max(steps, key=itemgetter(0)))[0] <= best[0]:
+        steps = [best, *(tried((*best[1][:axis], number, *best[1][axis + 1 :]))
+                         for axis, some in enumerate(counts)
+                         for number in range(best[1][axis] + 1, min(best[1][axis] + 3, len(some))))]
+        better = max(steps, key=lambda step: step[0])
+        if better is best:
             return best[2]
         best = better
 
@@ -373,6 +361,11 @@ class Condition:
     bins: int = 0
     cells: int = 0
 
+    @property
+    def same(self) -> float:
+        """Difference of scaled values that counts as none."""
+        return math.log(self.tolerance) if self.logarithmic else self.tolerance
+
     def scaled(self, values: ArrayLike) -> Floats:
         """Return values as the model is linear in them."""
         return np.asarray(np.log(values) if self.logarithmic else values, dtype=np.float64)
@@ -386,6 +379,13 @@ class Condition:
     def varies(self, values: Floats) -> bool:
         """Return whether the last of the sorted values is another than the first."""
         return bool(values[-1] > self.wider(values[0], values[0])[1])
+
+    def distinct(self, values: Floats) -> Floats:
+        """Return the sorted values, those that differ by rounding once."""
+        values = np.unique(values[np.isfinite(values)])
+        least = SAME * values[1:] if self.logarithmic else 100 * SAME
+        first = np.ones(len(values[:1]), dtype=bool)
+        return np.asarray(values[np.concatenate([first, np.diff(values) > least])])
 
     def middles(self, groups: Sequence[Floats] | Floats) -> Floats:
         """Return the values between neighbouring groups of sorted values."""
@@ -422,8 +422,7 @@ class Condition:
         """
         groups: Sequence[Floats] = list(values[:, None])
         if len(values) > MAX_VALUES:
-            same = math.log(self.tolerance) if self.logarithmic else self.tolerance
-            jumps = np.diff(self.scaled(values)) > same
+            jumps = np.diff(self.scaled(values)) > self.same
             groups = np.split(values, np.flatnonzero(jumps) + 1)
             if len(groups) > MAX_VALUES or any(map(self.varies, groups)):
                 return None
@@ -445,6 +444,84 @@ CONDITIONS = {
 PREDICTORS = ("distance_m", "side_px", "viewing_angle_deg")
 
 
+# --------------------------------------------------------------------------------------------------
+# Poses of a model in blocks, and their sums in bins.
+
+#: Errors in the sight frame: of the position (m), and the rotation vector (rad).
+QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+
+#: The even trials and the odd ones.
+HALVES = 2
+
+#: Names of a block's arrays: the half, fx times the marker's side.
+HALF, FOCAL_SIZE = "half", "focal_size"
+
+
+@dataclass(frozen=True)
+class Sights:
+    """Some poses of a model that were looked for.
+
+    Attributes
+    ----------
+    conditions
+        `CONDITIONS`, (4, n); the side is fx · size / distance.
+    half
+        Which half of the trials, (n,).
+    solved, flipped
+        Masks (n,).
+    position_m
+        True positions (n, 3).
+    errors
+        Errors (n, 6) along and about the camera's axes; positions over the distance.
+    """
+
+    conditions: Floats
+    half: Integers
+    solved: Masks
+    flipped: Masks
+    position_m: Floats
+    errors: Floats
+
+    @classmethod
+    def of(cls, poses: Poses, _: tuple[slice, ...]) -> Sights:
+        """Return those of a block."""
+        used = poses.looked_for & (poses[DEPTH] > 0)
+
+        def rows(values: NDArray[Any]) -> NDArray[Any]:
+            return np.broadcast_to(values, (*used.shape, *values.shape[used.ndim :]))[used]
+
+        position, rotation, focal_size, moved, turned = (
+            rows(poses[name]).astype(np.float64) for name in (
+                "true_tvec_m", "true_rvec", FOCAL_SIZE, "translation_error_m",
+                "rotation_error_rad"))
+        distance = position[:, 2]
+        conditions = np.stack([distance, focal_size / distance,
+                               viewing_angle_of(rotation, position), bearing_of(position)])
+        return cls(conditions, rows(poses[HALF]), rows(poses.solved), rows(poses.flipped), position,
+                   np.concatenate([moved / distance[:, None], turned], axis=-1))
+
+    @property
+    def used(self) -> Masks:
+        """Solved poses that are not flipped (n,)."""
+        return self.solved & ~self.flipped
+
+    @cached_property
+    def at(self) -> Floats:
+        """Return ln(distance), ln(side), viewing angle and bearing, (n, 4)."""
+        return np.stack([condition.scaled(values) for condition, values in zip(
+            CONDITIONS.values(), self.conditions, strict=True)], axis=-1)
+
+    @cached_property
+    def in_sight(self) -> Floats:
+        """The errors in the sight frame, (n, 6)."""
+        return np.concatenate([in_sight_frame(part, self.position_m)
+                               for part in np.split(self.errors, 2, axis=-1)], axis=-1)
+
+
+#: The poses of each model, in blocks.
+Models = Sequence[Sequence[Sights]]
+
+
 @dataclass(frozen=True)
 class Bins:
     """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
@@ -459,17 +536,57 @@ class Bins:
         """Numbers of bins."""
         return tuple(len(each) - 1 for each in self.edges)
 
-    def numbers(self, values: Sequence[Floats]) -> tuple[Integers, Masks]:
-        """Return the flat numbers of the bins of points, and which points are in a bin."""
-        inside = np.ones(values[0].shape, dtype=bool)
-        flat = np.zeros(values[0].shape, dtype=np.int64)
-        for each, edges in zip(values, self.edges, strict=False):
-            number = np.searchsorted(edges, each, side="right") - 1
-            number = np.where(each == edges[-1], len(edges) - 2, number)
-            inside &= (number >= 0) & (number < len(edges) - 1)
-            flat = flat * (len(edges) - 1) + np.clip(number, 0, len(edges) - 2)
-        return flat, inside
+    def sums(self, poses: Sights, used: Masks, columns: Iterable[ArrayLike] = (1.0,)) -> Floats:
+        """Return sums (halves, bins, columns) of columns (n,) over the used poses in each bin."""
+        inside, at = used.copy(), poses.half
+        for values, edges, count in zip(poses.conditions, self.edges, self.shape, strict=False):
+            number = np.searchsorted(edges, values, side="right") - 1
+            number = np.where(values == edges[-1], count - 1, number)
+            inside &= (number >= 0) & (number < count)
+            at = at * count + np.clip(number, 0, count - 1)
+        size = math.prod(self.shape)
+        found = [np.bincount(at[inside], np.broadcast_to(column, at.shape)[inside], HALVES * size)
+                 for column in columns]
+        return np.stack(found, axis=-1).reshape(HALVES, size, -1).astype(np.float64)
 
+
+def moments_of(bins: Bins, poses: Sights) -> Floats:
+    """Return sums (halves, bins, columns): poses, coordinates, and powers 1 to 4 of each error."""
+    def columns() -> Iterable[ArrayLike]:
+        yield 1.0
+        yield from poses.at[:, :3].T
+        for error in poses.in_sight.T:
+            yield from (error, error**2, error**2 * error, (error**2) ** 2)
+
+    return bins.sums(poses, poses.used, columns())
+
+
+def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights) -> Floats:
+    """Return sums (halves, bins, 16) of how many errors lie within two sigma of the bias.
+
+    The first four columns are poses looked for, solved, flipped and judged; then follow those
+    within, for each error in the sight frame, and along and about the camera's axes. Each half of
+    the trials is judged by the model of the other: ``fitted`` (halves, knots, quantities, 2) are
+    bias and ln(variance).
+    """
+    basis = hat_basis(poses.at[:, :3], knots)
+    of_halves = np.tensordot(basis, fitted, axes=(1, 1))[np.arange(len(basis)), 1 - poses.half]
+    bias, sigma = of_halves[..., 0], np.exp(0.5 * of_halves[..., 1])
+    within = [np.abs(poses.in_sight - bias) <= 2.0 * sigma]
+    turn = sight_rotation(poses.position_m)
+    for part in (slice(0, 3), slice(3, 6)):
+        mean = np.einsum("nij,nj->ni", turn, bias[:, part])
+        spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
+        within.append(np.abs(poses.errors[:, part] - mean) <= 2.0 * spread)
+    everywhere = np.ones_like(poses.solved)
+    counts = [bins.sums(poses, mask)
+              for mask in (everywhere, poses.solved, poses.flipped, poses.used)]
+    return np.concatenate(
+        [*counts, bins.sums(poses, poses.used, np.concatenate(within, axis=-1).T)], axis=-1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Bins of a dataset, and the joint region of the conditions that was seen.
 
 def focal_size_of(results: xr.Dataset) -> xr.DataArray:
     """Return fx times the side of the black square, px · m, over the dimensions that it has.
@@ -502,7 +619,7 @@ def bins_and_cells(
     Parameters
     ----------
     found
-        The `distinct_values`.
+        The distinct values of each condition.
     poses
         Scenes of the dataset.
     collinear
@@ -511,9 +628,8 @@ def bins_and_cells(
     varying = [name for name in PREDICTORS if CONDITIONS[name].varies(found[name])]
     if collinear and "distance_m" in varying:
         varying = [name for name in varying if name != "side_px"]
-    few = [name for name in varying if len(found[name]) <= MAX_VALUES]
-    others = math.prod(len(found[name]) for name in few)
-    many = max(2, int((poses / (POSES_A_CELL * others)) ** (
+    few = [len(found[name]) for name in varying if len(found[name]) <= MAX_VALUES]
+    many = max(2, int((poses / (POSES_A_CELL * math.prod(few))) ** (
         1.0 / max(len(varying) - len(few), 1))))
 
     def bins(count: Callable[[Condition], int]) -> Bins:
@@ -553,65 +669,47 @@ def region_directions(found: Mapping[str, Floats]) -> Floats:
     In ln(distance), ln(side), viewing angle and bearing. The fifth is ln(fx size); then follow, of
     two conditions that vary, sum and difference in units of their ranges.
     """
-    unit, rows = np.eye(len(found)), [*np.eye(len(found)), np.eye(len(found))[:2].sum(axis=0)]
-    ranges = [np.ptp(CONDITIONS[name].scaled(values)) for name, values in found.items()]
-    varying = [k for k, (name, values) in enumerate(found.items())
-               if CONDITIONS[name].varies(values)]
-    for a, b in itertools.combinations(varying, 2):
+    unit = np.eye(len(found))
+    rows = [*unit, unit[:2].sum(axis=0)]
+    ranges = {k: np.ptp(CONDITIONS[name].scaled(values))
+              for k, (name, values) in enumerate(found.items()) if CONDITIONS[name].varies(values)}
+    for a, b in itertools.combinations(ranges, 2):
         rows += [unit[a] / ranges[a] + sign * unit[b] / ranges[b] for sign in (1.0, -1.0)]
     return np.stack(rows)
 
 
-def region_ends(directions: Floats, reach: Floats, draws: Floats) -> tuple[Floats, Floats]:
-    """Return the ends (models, directions) of the region along directions, from `error_models`.
+def region_ends(directions: Floats, low: Floats, high: Floats, draws: Floats) -> tuple[Any, Any]:
+    """Return the ends (models, directions) of the region along directions.
 
     An end has a margin for rounding; where there is hardly an extent, as wide as what counts as
     the same; of sums and differences `SLACK` and what so many ``draws`` (models,) in each cell of
     the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
+
+    Parameters
+    ----------
+    directions
+        Of `region_directions`.
+    low, high
+        Extremes (models, directions) of the poses that were looked for.
+    draws
+        Fewest poses (models,) of a cell of the grid.
     """
-    high, low = np.split(reach * np.repeat([1.0, -1.0], len(directions)), 2, axis=-1)
-    logarithmic = np.array([each.logarithmic for each in CONDITIONS.values()])
-    same = np.array([math.log(each.tolerance) if each.logarithmic else each.tolerance
-                     for each in CONDITIONS.values()])
-    # Knots at the ends lie 2e-6 outside the poses.
-    rounding = np.where(logarithmic, 3.0 * SAME, 200.0 * SAME)
-    alone = [*range(len(same)), 0]  # ln(fx size) has the tolerance of ln(distance)
-    count = len(alone)
+    listed = list(CONDITIONS.values())
+    axes, alone = slice(0, len(listed)), slice(0, len(listed) + 1)
+    angles = np.array([not each.logarithmic for each in listed])
+    # Knots at the ends lie 2e-6 outside the poses; ln(fx size) has the tolerance of ln(distance).
+    same = np.array([each.same for each in (*listed, listed[0])])
+    rounding = np.where([*angles, False], 200.0 * SAME, 3.0 * SAME)
     margin = np.repeat(SLACK + np.sqrt(CORNER / draws)[:, None], low.shape[1], axis=1)
-    margin[:, :count] = np.where(
-        high[:, :count] - low[:, :count] <= same[alone], same[alone], rounding[alone])
-    margin[:, count - 1] = np.maximum(margin[:, count - 1], 2.0 * rounding[0])  # of two ends
-    wider = (low - margin)[:, : len(same)]
-    ends = np.where(~logarithmic & (wider <= FRONTAL_DEG), 0.0, wider)
+    margin[:, alone] = np.where(high[:, alone] - low[:, alone] <= same, same, rounding)
+    margin[:, len(listed)] = np.maximum(margin[:, len(listed)], 2.0 * rounding[0])  # of two ends
+    ends = (low - margin)[:, axes]
+    ends = np.where(angles & (ends <= FRONTAL_DEG), 0.0, ends)
     # Where an angle begins at 0, its sums and differences reach as much farther.
-    margin[:, count:] += (low[:, : len(same)] - ends) @ np.abs(directions[count:]).T
+    margin[:, alone.stop :] += (low[:, axes] - ends) @ np.abs(directions[alone.stop :]).T
     low, high = low - margin, high + margin
-    low[:, : len(same)] = ends
+    low[:, axes] = ends
     return low, high
-
-
-def distinct_values(columns: Columns[SightErrors]) -> dict[str, Floats]:
-    """Return the sorted values (n,) of each condition among the poses looked for, the same once.
-
-    Raises
-    ------
-    DatasetError
-        If no pose was looked for.
-    """
-    def of_block(poses: SightErrors, _: tuple[slice, ...]) -> list[Floats]:
-        used = poses.looked_for & (poses.distance_m > 0)
-        return [np.unique(poses.used(each, used)) for each in poses.conditions]
-
-    found = {}
-    for (name, condition), parts in zip(
-            CONDITIONS.items(), zip(*columns.map(of_block), strict=True), strict=True):
-        values = np.unique(np.concatenate(parts))
-        values = values[np.isfinite(values)]
-        if not len(values):
-            raise DatasetError("no pose was looked for: there are no errors to model")
-        least = SAME * values[1:] if condition.logarithmic else 100 * SAME
-        found[name] = values[np.concatenate([[True], np.diff(values) > least])]
-    return found
 
 
 def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
@@ -675,6 +773,33 @@ class Use(Flag):
     rarely_solved = flag(6, "Less than 90 % of the poses are solved: must not be used.")
 
 
+AT_KNOTS = ("quantity", *PREDICTORS)
+CELLS = tuple(f"cell_{name}" for name in PREDICTORS)
+OF_CELLS = ("quantity", *CELLS)
+
+#: Variables of the models: dimensions beside those that keep models apart, meaning, units.
+VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "sigma": (AT_KNOTS, "standard deviation of the error", "m, radian"),
+    "bias": (AT_KNOTS, "mean error, estimated minus true", "m, radian"),
+    "exponent": (
+        ("quantity",),
+        "power of the distance (of the side, if only that varies) with which sigma goes", "1"),
+    "coverage": (OF_CELLS, "share of held-out errors within two sigma of the bias", "1"),
+    "camera_coverage": (OF_CELLS, "the same along and about the camera's own axes", "1"),
+    "use": (OF_CELLS, "whether the model may be used", ""),
+    "judged": (CELLS, "held-out poses that were judged", "1"),
+    "looked_for": (CELLS, "poses looked for", "1"),
+    "solved_rate": (CELLS, "solved of the poses looked for", "1"),
+    "flip_rate": (CELLS, "nearer to the mirror of the truth, of the solved", "1"),
+    "region_low": (("direction",), "smallest weighted sum of a direction in the region", ""),
+    "region_high": (("direction",), "largest weighted sum of a direction in the region", ""),
+    "region_seen": (tuple(f"region_{name}" for name in CONDITIONS),
+                    "whether a cell of the conditions has poses", "1"),
+    "knots": (("quantity", "predictor"), "knots that the error needs", "1"),
+}
+
+#: Values of variables (models, ...), by name.
+Values = dict[str, NDArray[Any]]
 
 
 def error_models(results: xr.Dataset) -> xr.Dataset:
@@ -736,16 +861,22 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     >>> [Use(flag).name for flag in models["use"].sel(quantity="z")[0].values.ravel()]
     ['too_narrow', 'rarely_solved', 'rarely_solved']
     """
-    kept = [name for name in axes_of(results) if is_kept(name, results)]
+    kept = [name for name in axes_of(results)
+            if name != DRAWS and (name == "dictionary" or not is_grid_axis(name, results))]
     kept_dimensions(results, kept)
     inputs = pose_arrays(results, SIGNED_INPUTS)
     _check_drawn(results, kept)
     focal_size = focal_size_of(results)
-    inputs |= {
-        HALF: (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS),
-        FOCAL_SIZE: focal_size}
-    columns = Columns(arranged(results, inputs, kept)[0], SightErrors)
-    found = distinct_values(columns)
+    halves = (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS)
+    columns = arranged(results, {**inputs, HALF: halves, FOCAL_SIZE: focal_size}, kept)[0]
+    models: Models = [
+        Columns({name: each[k : k + 1] for name, each in columns.items()}, Poses).map(Sights.of)
+        for k in range(math.prod(results.sizes[name] for name in kept))]
+    found = {name: condition.distinct(np.concatenate(
+        [block.conditions[k] for model in models for block in model]))
+        for k, (name, condition) in enumerate(CONDITIONS.items())}
+    if not all(map(len, found.values())):
+        raise DatasetError("no pose was looked for: there are no errors to model")
     poses = math.prod(
         size for name, size in results["true_tvec_m"].sizes.items() if name != "xyz")
     least, most = float(focal_size.min()), float(focal_size.max())
@@ -753,7 +884,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         found, poses, collinear=most <= least * CONDITIONS["side_px"].tolerance)
     region, drawn = region_cells(found, poses, results.sizes[DRAWS])
     directions = region_directions(found)
-    moments = columns.sums(functools.partial(_moments, bins))
+    moments = _totals(functools.partial(moments_of, bins), models)
     _check_solved(moments, results, kept)
     values = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
     selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), values)
@@ -762,71 +893,75 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     # All errors are given at the knots of all: what is linear between some is so between all.
     knots = [np.unique(np.concatenate(each)) for each in zip(
         shown, *(own for model in selected for own in model), strict=True)]
-    # The model of each half, by which the other is judged:
-    # (models, halves, knots, quantities, 2).
-    fitted = np.array([
-        [[(fit.bias, fit.log_variance) for fit in _fits(half, own, knots)] for half in model]
-        for model, own in zip(moments, selected, strict=True)]).transpose(0, 1, 4, 2, 3)
-    judged = columns.sums(functools.partial(_within, cells, knots, fitted))
-    seen = columns.sums(lambda poses, _: _add(region, poses, poses.looked_for, [1.0]))
-    reach = columns.sums(lambda poses, _: _reach(directions, poses), np.maximum)
+    # The model of each half, by which the other is judged: (halves, knots, quantities, 2).
+    judged = np.stack([
+        sum(within_of(cells, knots, np.stack(
+            [_at_knots(half, own, knots)[:2].transpose(2, 1, 0) for half in of_model]), block)
+            for block in model)
+        for model, own, of_model in zip(models, selected, moments, strict=True)])
     whole = moments.sum(axis=1)
-    table = {
-        **_knot_variables([_fits(*each, knots) for each in zip(whole, selected, strict=True)],
-                          knots),
-        **_exponents(whole), **_cell_variables(judged, cells),
-        **_region_variables(region, drawn, directions, seen.sum(axis=(1, 3)), reach),
-        "knots": (("quantity", "predictor"), np.array(
-            [[[*map(len, own)] for own in model] for model in selected]),
-            cf_attributes("knots that the error needs", "1"))}
-    shape = tuple(results.sizes[name] for name in kept)
-    variables: dict[str, Any] = {
-        name: ((*kept, *dims), array.reshape((*shape, *array.shape[1:])), attributes)
-        for name, (dims, array, attributes) in table.items()}
-    variables["direction_weight"] = (("direction", "condition"), directions, cf_attributes(
-        "weights of ln(distance), ln(side), viewing angle and bearing", ""))
+    arrays = {
+        **_of_knots(np.stack([_at_knots(sums, own, knots)
+                              for sums, own in zip(whole, selected, strict=True)]), knots),
+        **_exponents(whole), **_of_cells(judged, cells),
+        **_of_region(models, region, drawn, directions),
+        "knots": np.array([[[*map(len, own)] for own in model] for model in selected])}
+    variables: dict[str, Any] = {"direction_weight": (
+        ("direction", "condition"), directions,
+        cf_attributes("weights of ln(distance), ln(side), viewing angle and bearing", ""))}
+    for name, array in arrays.items():
+        ending = next((each for each in INTERVAL if each and name.endswith(each)), "")
+        ending = ending if name not in VARIABLES else ""
+        dims, meaning, units = VARIABLES[name.removesuffix(ending)]
+        variables[name] = (
+            (*kept, *dims),
+            array.reshape(*(results.sizes[each] for each in kept), *array.shape[1:]),
+            cf_attributes(INTERVAL[ending] + meaning, units, flags=Use if name == "use" else None))
     coordinates: dict[str, Any] = {
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
 
-    def described(name: str, words: str) -> dict[str, str]:
-        return {"units": CONDITIONS[name].units, "long_name": f"{words} {CONDITIONS[name].words}"}
+    def add(name: str, condition: str, numbers: Floats, words: str) -> None:
+        dim = name.removesuffix("_low").removesuffix("_high")
+        coordinates[name] = dim, numbers, {
+            "units": CONDITIONS[condition].units,
+            "long_name": f"{words} {CONDITIONS[condition].words}"}
 
     for name, at_knots, edges in zip(PREDICTORS, knots, cells.edges, strict=True):
         # A knot at an end must not leave the domain by the rounding of its logarithm.
-        plain = np.clip(np.exp(at_knots), edges[0], edges[-1]) if (
-            CONDITIONS[name].logarithmic) else at_knots
-        coordinates[name] = name, plain, described(name, "knots of")
-        for ending, ends in (("low", edges[:-1]), ("high", edges[1:])):
-            coordinates[f"cell_{name}_{ending}"] = (
-                f"cell_{name}", ends, described(name, f"{ending} end of cells of"))
+        add(name, name, np.clip(np.exp(at_knots), edges[0], edges[-1])
+            if CONDITIONS[name].logarithmic else at_knots, "knots of")
+        add(f"cell_{name}_low", name, edges[:-1], "low end of cells of")
+        add(f"cell_{name}_high", name, edges[1:], "high end of cells of")
     for name, edges in zip(CONDITIONS, region.edges, strict=True):
-        coordinates[f"region_{name}"] = (
-            f"region_{name}", edges[:-1], described(name, "low end of cells of the region of"))
+        add(f"region_{name}", name, edges[:-1], "low end of cells of the region of")
     return with_sampling(xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),
         "focal_size_varies": int(most > least * (1 + 1e-9)),
     }), results)
 
 
-def _fits(
+def _totals(of_block: Callable[[Sights], Floats], models: Models) -> Floats:
+    """Return the sums over the blocks of each model, (models, ...)."""
+    return np.stack([functools.reduce(np.add, map(of_block, model)) for model in models])
+
+
+def _at_knots(
     moments: Floats, own: Sequence[Sequence[Floats]], knots: Sequence[Floats]
-) -> list[Fit]:
-    """Return the fits of the errors with their own knots, at the knots of all."""
-    # Points of the grid of all knots, the last axis fastest.
+) -> Floats:
+    """Return the fits of the errors with their own knots, at the knots of all.
+
+    Bias, ln(variance) and their standard errors, (4, quantities, knots); the last axis' knots vary
+    fastest.
+    """
     points = np.stack([each.ravel() for each in np.meshgrid(*knots, indexing="ij")], axis=-1)
     fits = []
     for quantity, of_error in enumerate(own):
         sums = BinSums.of(moments, quantity)
         fit = fit_error(sums, hat_basis(sums.at, of_error), differences(of_error))
         fits.append(fit.at(hat_basis(points, of_error)))
-    return fits
-
-
-def is_kept(name: str, results: xr.Dataset) -> bool:
-    """Return whether an axis keeps models apart."""
-    return name != DRAWS and (name == "dictionary" or not is_grid_axis(name, results))
+    return np.stack(fits, axis=1)
 
 
 def _check_drawn(results: xr.Dataset, kept: Sequence[str]) -> None:
@@ -841,10 +976,6 @@ def _check_drawn(results: xr.Dataset, kept: Sequence[str]) -> None:
             f"{DRAWS} has {'1 value' if trials == 1 else 'no even or no odd values'}: an error "
             "model is fitted to some random draws and checked on others; run with 50 trials or "
             "more, and with something drawn, such as azimuth_deg = { uniform = [0, 360] }")
-
-
-#: Variables of one model: dimensions, values, attributes.
-Table = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
 
 
 def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:
@@ -866,57 +997,43 @@ def _metres(distance_m: Floats) -> Floats:
     return np.asarray(scale * distance_m + (1.0 - scale))
 
 
-def _region_variables(
-    region: Bins, drawn: Sequence[int], directions: Floats, counts: Floats, reach: Floats
-) -> Table:
-    """Return the joint region of the conditions that was seen.
-
-    ``counts`` (models, cells) are the poses looked for, ``reach`` their projections.
-    """
-    cells = counts.reshape(-1, *region.shape)
+def _of_region(
+    models: Models, region: Bins, drawn: Sequence[int], directions: Floats
+) -> Values:
+    """Return the joint region of the conditions that was seen."""
+    seen = _totals(lambda poses: region.sums(poses, np.ones_like(poses.solved)), models)
+    cells = seen.sum(axis=(1, 3)).reshape(-1, *region.shape)
     of_grid = cells.sum(axis=tuple(1 + k for k in drawn)).reshape(len(cells), -1)
     draws = np.where(of_grid > 0, of_grid, np.inf).min(axis=1)
-    low, high = region_ends(directions, reach, draws)
-    return {
-        "region_low": (("direction",), low, cf_attributes(
-            "smallest weighted sum of a direction in the region", "")),
-        "region_high": (("direction",), high, cf_attributes(
-            "largest weighted sum of a direction in the region", "")),
-        "region_seen": (tuple(f"region_{name}" for name in CONDITIONS), cells > 0, cf_attributes(
-            "whether a cell of the conditions has poses", "1")),
-    }
+    projected = [np.concatenate([block.at for block in model]) @ directions.T for model in models]
+    low, high = (np.stack([extreme(each, axis=0) for each in projected])
+                 for extreme in (np.min, np.max))
+    low, high = region_ends(directions, low, high, draws)
+    return {"region_low": low, "region_high": high, "region_seen": cells > 0}
 
 
-def _knot_variables(fits: Sequence[Sequence[Fit]], knots: Sequence[Floats]) -> Table:
-    """Return sigma and bias of each error at the knots, with their intervals."""
-    shape = (-1, len(QUANTITIES), *map(len, knots))
+def _of_knots(fits: Floats, knots: Sequence[Floats]) -> Values:
+    """Return sigma and bias at the knots; ``fits`` are (models, 4, quantities, knots)."""
     metres = _metres(np.exp(knots[0]))[:, :, None, None]
-    bias, bias_error, log_variance, error = np.moveaxis(np.array([
-        [(fit.bias, fit.bias_error, fit.log_variance, fit.log_variance_error) for fit in model]
-        for model in fits]), 2, 0)
-    table: Table = {}
-    for (ending, words), side in zip(INTERVAL.items(), (0.0, -1.0, 1.0), strict=True):
-        for name, meaning, values in (
-            ("sigma", "standard deviation of the error",
-             np.exp(0.5 * (log_variance + side * DEVIATIONS * error))),
-            ("bias", "mean error, estimated minus true", bias + side * DEVIATIONS * bias_error),
-        ):
-            table[f"{name}{ending}"] = (
-                ("quantity", *PREDICTORS), values.reshape(shape) * metres,
-                cf_attributes(f"{words}{meaning}", "m, radian"))
-    return table
+    bias, log_variance, bias_error, error = np.moveaxis(fits.reshape(
+        *fits.shape[:3], *map(len, knots)), 1, 0)
+    values = {}
+    for ending, side in zip(INTERVAL, (0.0, -1.0, 1.0), strict=True):
+        values[f"sigma{ending}"] = metres * np.exp(
+            0.5 * (log_variance + side * DEVIATIONS * error))
+        values[f"bias{ending}"] = metres * (bias + side * DEVIATIONS * bias_error)
+    return values
 
 
-def _cell_variables(halves: Floats, bins: Bins) -> Table:
+def _of_cells(halves: Floats, bins: Bins) -> Values:
     """Return whether models may be used in cells; ``halves`` (models, halves, cells, columns)."""
-    sums = halves.sum(axis=1)
     looked_for, solved, flipped, n = np.moveaxis(
-        np.rint(sums[..., : len(COUNTS)]).astype(np.int64), -1, 0)
+        np.rint(halves[..., :4].sum(axis=1)).astype(np.int64), -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        within, camera = np.split(halves[..., len(COUNTS):], 2, axis=-1)
+        within, camera = np.split(halves[..., 4:], 2, axis=-1)
         coverage, in_camera = (each.sum(axis=1) / n[..., None] for each in (within, camera))
         flip_rate, solved_rate = flipped / solved, solved / looked_for
-        judged = halves[..., [COUNTS.index("judged")]]
+        judged = halves[..., [3]]
         spread, spread_of_half = (
             np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[..., None], judged))
         of_half = within / judged
@@ -931,26 +1048,15 @@ def _cell_variables(halves: Floats, bins: Bins) -> Table:
          low, high],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
         Use.holds).astype(np.uint8)
-    cells = tuple(f"cell_{name}" for name in PREDICTORS)
-    table: Table = {
-        name: (("quantity", *cells), np.moveaxis(values, -1, 1).reshape(
-            -1, len(QUANTITIES), *bins.shape), attributes)
-        for name, values, attributes in (
-            ("coverage", coverage, cf_attributes(
-                "share of held-out errors within two sigma of the bias", "1")),
-            ("camera_coverage", in_camera, cf_attributes(
-                "the same along and about the camera's own axes", "1")),
-            ("use", use, cf_attributes("whether the model may be used", "", flags=Use)))}
-    return table | {
-        name: (cells, values.reshape(-1, *bins.shape), cf_attributes(meaning, "1"))
-        for name, values, meaning in (
-            ("judged", n, "held-out poses that were judged"),
-            ("looked_for", looked_for, "poses looked for"),
-            ("solved_rate", solved_rate, "solved of the poses looked for"),
-            ("flip_rate", flip_rate, "nearer to the mirror of the truth, of the solved"))}
+    of_quantities = {"coverage": coverage, "camera_coverage": in_camera, "use": use}
+    values = {name: np.moveaxis(each, -1, 1).reshape(len(n), len(QUANTITIES), *bins.shape)
+              for name, each in of_quantities.items()}
+    return values | {name: each.reshape(-1, *bins.shape) for name, each in (
+        ("judged", n), ("looked_for", looked_for), ("solved_rate", solved_rate),
+        ("flip_rate", flip_rate))}
 
 
-def _exponents(moments: Floats) -> Table:
+def _exponents(moments: Floats) -> Values:
     """Return the power of the distance, or of the side, with which sigma goes."""
     values = np.full((3, len(moments), len(QUANTITIES)), np.nan)
     for model, k in np.ndindex(*values.shape[1:]):
@@ -962,137 +1068,9 @@ def _exponents(moments: Floats) -> Table:
         design = np.concatenate([sums.at[:, [axis]], hat_basis(sums.at[:, [2]], [angles])], axis=1)
         fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
         metres = 1.0 if axis == 0 and k < 3 else 0.0
-        half = DEVIATIONS * 0.5 * fit.log_variance_error[0]
+        half = DEVIATIONS * 0.5 * math.sqrt(max(fit.log_variance_covariance[0, 0], 0.0))
         values[:, model, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
-    words = "power of the distance (of the side, if only that varies) with which sigma goes"
-    return {f"exponent{ending}": (("quantity",), each, cf_attributes(text + words, "1"))
-            for (ending, text), each in zip(INTERVAL.items(), values, strict=True)}
-
-
-# --------------------------------------------------------------------------------------------------
-# Sums of a block's poses, in bins: moments of errors, and how many lie within two sigma.
-
-#: Errors in the sight frame: of the position (m), and the rotation vector (rad).
-QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
-
-#: The even trials and the odd ones.
-HALVES = 2
-
-#: Names of a block's arrays: the half, fx times the marker's side.
-HALF, FOCAL_SIZE = "half", "focal_size"
-
-#: Columns that are judged before the shares.
-COUNTS = ("looked_for", "solved", "flipped", "judged")
-
-
-class SightErrors(Poses):
-    """Poses with their errors in the sight frame."""
-
-    @cached_property
-    def distance_m(self) -> Floats:
-        """True z of the marker's centre (...)."""
-        return np.asarray(self[DEPTH], dtype=np.float64)
-
-    @cached_property
-    def conditions(self) -> tuple[Floats, ...]:
-        """`CONDITIONS`, each (...); the side is fx · size / distance."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            side = np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
-        return (self.distance_m, side, viewing_angle_of(self["true_rvec"], self["true_tvec_m"]),
-                bearing_of(self["true_tvec_m"]))
-
-    @cached_property
-    def in_camera(self) -> Floats:
-        """Errors (..., 6) along and about the camera's axes; positions over the distance."""
-        position = self["translation_error_m"].astype(np.float64) / self.distance_m[..., None]
-        return np.concatenate(
-            [position, self["rotation_error_rad"].astype(np.float64)], axis=-1)
-
-    @cached_property
-    def in_sight(self) -> Floats:
-        """The same in the sight frame."""
-        parts = (self.in_camera[..., :3], self.in_camera[..., 3:])
-        return np.concatenate(
-            [in_sight_frame(part, self["true_tvec_m"]) for part in parts], axis=-1)
-
-    def at(self, used: Masks) -> Floats:
-        """Return ln(distance), ln(side), viewing angle and bearing of the used poses, (n, 4)."""
-        distance, side, *angles = (self.used(each, used) for each in self.conditions)
-        return np.stack([np.log(distance), np.log(side), *angles], axis=-1)
-
-    @staticmethod
-    def used(values: NDArray[Any], used: Masks) -> NDArray[Any]:
-        """Return the values (n, ...) of the used poses."""
-        return np.broadcast_to(values, (*used.shape, *values.shape[used.ndim:]))[used]
-
-
-def _add(bins: Bins, poses: SightErrors, used: Masks, columns: Sequence[Any]) -> Floats:
-    """Return sums (groups, halves, bins, columns) over the used poses that lie in a bin.
-
-    ``used`` has the shape of the poses' flags; columns are (n,) of all used ones, or 1 each.
-    """
-    number, inside = bins.numbers(poses.conditions)
-    groups, size = len(poses.detection), math.prod(bins.shape)
-    flat = (np.arange(groups).reshape(-1, 1, 1, 1) * HALVES + poses[HALF]) * size + number
-    at = np.broadcast_to(flat, used.shape)[used]
-    within = np.broadcast_to(inside, used.shape)[used]
-    sums = [np.bincount(at, np.where(within, each, 0.0), groups * HALVES * size)
-            for each in columns]
-    return np.stack(sums, axis=-1).reshape(groups, HALVES, size, len(columns)).astype(float)
-
-
-def _reach(directions: Floats, poses: SightErrors) -> Floats:
-    """Return how far the poses looked for reach, (groups, 2 x directions).
-
-    That is the largest projection on each direction (directions, 4) in ln(distance), ln(side),
-    viewing angle and bearing, then on its opposite.
-    """
-    shape = poses.looked_for.shape
-    counted = poses.looked_for & (poses.distance_m > 0)
-    of_group = np.broadcast_to(np.arange(shape[0]).reshape(-1, 1, 1, 1), shape)[counted]
-    projected = poses.at(counted) @ directions.T
-    reach = np.full((shape[0], 2 * len(directions)), -np.inf)
-    np.maximum.at(reach, of_group, np.concatenate([projected, -projected], axis=-1))
-    return reach
-
-
-def _moments(bins: Bins, poses: SightErrors, _: slice) -> Floats:
-    """Return numbers of poses, sums of their coordinates and of the powers of each error."""
-    used = poses.unflipped & poses.looked_for
-    errors = poses.used(poses.in_sight, used)
-    columns = [1.0, *poses.at(used)[:, :3].T]
-    for error in errors.T:
-        columns += [error, error**2, error**2 * error, (error**2) ** 2]
-    return _add(bins, poses, used, columns)
-
-
-def _within(
-    bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: SightErrors, groups: slice
-) -> Floats:
-    """Return how many errors lie within two standard deviations of the bias.
-
-    The columns are `COUNTS`; those within, for each error in the sight frame; the same along and
-    about the camera's axes. Each half of the trials is judged by the model of the other: ``fitted``
-    (models, halves, knots, quantities, 2) are bias and ln(variance).
-    """
-    used = poses.unflipped & poses.looked_for
-    half = poses.used(poses[HALF], used)
-    model = poses.used(
-        groups.start + np.arange(len(poses.detection)).reshape(-1, 1, 1, 1), used)
-    basis = hat_basis(poses.at(used)[:, :3], knots)
-    bias, log_variance = np.moveaxis(
-        np.einsum("nk,nkqv->nqv", basis, fitted[model, 1 - half]), -1, 0)
-    sigma = np.exp(0.5 * log_variance)
-    sight, camera = (poses.used(each, used) for each in (poses.in_sight, poses.in_camera))
-    turn = sight_rotation(poses.used(poses["true_tvec_m"], used))
-    columns = [*(np.abs(sight - bias) <= 2.0 * sigma).T]
-    for part in (slice(0, 3), slice(3, 6)):
-        mean = np.einsum("nij,nj->ni", turn, bias[:, part])
-        spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
-        columns += [*(np.abs(camera[:, part] - mean) <= 2.0 * spread).T]
-    counts = [_add(bins, poses, mask & poses.looked_for, [1.0])
-              for mask in (poses.looked_for, poses.solved, poses.flipped, poses.unflipped)]
-    return np.concatenate([*counts, _add(bins, poses, used, columns)], axis=-1)
+    return {f"exponent{ending}": each for ending, each in zip(INTERVAL, values, strict=True)}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1145,8 +1123,8 @@ def model_errors(
     >>> found["sigma"].sel(quantity="z").round(5).values.tolist()
     [0.00076, nan]
     """
-    if model["sigma"].dims != ("quantity", *PREDICTORS):
-        others = [str(dim) for dim in model["sigma"].dims if dim not in ("quantity", *PREDICTORS)]
+    if model["sigma"].dims != AT_KNOTS:
+        others = [str(dim) for dim in model["sigma"].dims if dim not in AT_KNOTS]
         raise ArgumentError("model", f"models for each {', '.join(others)}",
                             "expected one model; choose one with models.isel(...)")
     if side_px is None:
@@ -1159,28 +1137,26 @@ def model_errors(
     with np.errstate(divide="ignore", invalid="ignore"):
         at = np.stack([condition.scaled(each) for condition, each in zip(
             CONDITIONS.values(), values, strict=True)], axis=-1)
-    cell = np.ravel_multi_index(tuple(
-        np.searchsorted(cell_edges(model, name)[1:-1], each, side="right")
-        for name, each in zip(PREDICTORS, values, strict=False)), model["flip_rate"].shape)
+    cell = tuple(np.searchsorted(cell_edges(model, name)[1:-1], each, side="right")
+                 for name, each in zip(PREDICTORS, values, strict=False))
+    use = np.moveaxis(model["use"].values, 0, -1)[cell]
+    inside = _seen(model, at, any_bearing=bearing_deg is None) & (use != Use.no_poses).all(axis=1)
     basis = hat_basis(at[:, : len(PREDICTORS)], [
         CONDITIONS[name].scaled(model[name].values) for name in PREDICTORS])
-    flat = (len(QUANTITIES), -1)
-    use = model["use"].values.reshape(flat)[:, cell].T
-    inside = _seen(model, at, any_bearing=bearing_deg is None) & (use != Use.no_poses).all(axis=1)
+
+    def interpolated(values: NDArray[Any]) -> Floats:
+        return np.asarray(basis @ values.reshape(len(QUANTITIES), -1).T)
+
     bias = model["bias"].values / _metres(model["distance_m"].values)[:, :, None, None]
-    found = {
-        "sigma": np.exp(basis @ np.log(model["sigma"].values).reshape(flat).T),
-        "bias": basis @ bias.reshape(flat).T * _metres(values[0]).T,
-    }
-    out: dict[str, Any] = {
-        name: (("pose", "quantity"), np.where(inside[:, None], each, np.nan),
-               {"units": "m, radian"}) for name, each in found.items()}
-    out["use"] = (("pose", "quantity"), np.where(inside[:, None], use, Use.no_poses),
-                  model["use"].attrs)
-    for name in ("flip_rate", "solved_rate"):
-        rate = model[name].values.ravel()[cell]
-        out[name] = ("pose", np.where(inside, rate, np.nan), model[name].attrs)
-    return xr.Dataset(out, {"quantity": list(QUANTITIES)})
+    units = {"units": "m, radian"}
+    found = xr.Dataset({
+        "sigma": (("pose", "quantity"), np.exp(interpolated(np.log(model["sigma"].values))), units),
+        "bias": (("pose", "quantity"), interpolated(bias) * _metres(values[0]).T, units),
+        **{name: ("pose", model[name].values[cell], model[name].attrs)
+           for name in ("flip_rate", "solved_rate")},
+    }, {"quantity": list(QUANTITIES)}).where(xr.DataArray(inside, dims="pose"))
+    return found.assign(use=(("pose", "quantity"), np.where(
+        inside[:, None], use, Use.no_poses), model["use"].attrs))
 
 
 def model_covariance(

@@ -113,21 +113,6 @@ class Columns(Generic[ViewT]):
         with ThreadPoolExecutor(min(MAX_THREADS, len(os.sched_getaffinity(0)))) as threads:
             return list(threads.map(of_block, range(len(self._blocks))))
 
-    def sums(
-        self, function: Callable[[ViewT, slice], Floats], total: Callable[..., Any] = np.add
-    ) -> Floats:
-        """Return the sums (groups, ...) of arrays (groups of a block, ...) over all blocks.
-
-        ``function`` gives the array of a block's view and its groups. ``total`` may be another
-        ufunc, such as `numpy.maximum`.
-        """
-        found = self.map(lambda view, cut: (cut[0], function(view, cut[0])))
-        shape = self.shape[0], *found[0][1].shape[1:]
-        out = np.zeros(shape) if total is np.add else np.full(shape, -np.inf)
-        for groups, part in found:
-            out[groups] = total(out[groups], part)
-        return out
-
     def _view_of(self, number: int) -> ViewT:
         """Return the view of a block; of few poses all statistics share it, and what it keeps."""
         if number not in self._views:

@@ -23,7 +23,8 @@ TESTS = Path(__file__).parent
 def added(folder, *changes):
     """Copy the package to a folder; each change (file, anchor, text) puts text after an anchor.
 
-    An anchor stands once in its file; without one, the file is new.
+    An anchor stands once in its file; without one, the file is new, and without a text the anchor
+    goes.
     """
     shutil.copytree(PACKAGE, folder / "sweep")  # with its compiled code, for unchanged sources
     for file, anchor, text in changes:
@@ -33,7 +34,8 @@ def added(folder, *changes):
             continue
         source = path.read_text(encoding="utf-8")
         assert source.count(anchor) == 1, f"{file}: {anchor!r} stands {source.count(anchor)} times"
-        path.write_text(source.replace(anchor, anchor + text), encoding="utf-8")
+        path.write_text(
+            source.replace(anchor, "" if text is None else anchor + text), encoding="utf-8")
     return folder
 
 
@@ -94,6 +96,15 @@ FUNCTION = """    "range_error": lambda results: (
     ),
 """
 
+#: OpenCV's fields are all declared: one goes, and comes back by the recipe.
+DECLARED = """    minOtsuStdDev: float = parameter(
+        5.0, "smallest standard deviation at which Otsu's threshold is taken", 0,
+        unit="grey level",
+    )
+"""
+SETTING = """    minOtsuStdDev: float = parameter(5.0, "least deviation", 0, unit="grey level")
+"""
+
 SCRIPT = """
 import json
 import numpy as np
@@ -107,7 +118,7 @@ from sweep.evaluation.search import detections_of, scenes_at, search_windows
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import SCHEMA, VARIABLES
-from sweep.measure.flags import BoundStatus, EstimateStatus, Flipped
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.renderers import marker_levels
 from sweep.report.reference import TABLES
 
@@ -146,6 +157,17 @@ def solver():
         "rotation": [column.tolist() for column in columns["rotation_error_deg"]],
         "grey": columns["reprojection_error_px"][0].tolist(),
         "table": TABLES["solvers"]().rows,
+    }
+
+def setting():
+    pipeline = Pipeline.from_dict({
+        "marker": {"size_m": 0.05}, "pose": {"distance_m": 0.5},
+        "axes": {"minOtsuStdDev": [5, 200]},
+    })
+    flags = run_cells(pipeline.experiment, []).columns["detection"]
+    return {
+        "detection": [DetectionStatus(int(flag)).name for flag in flags[:, 0]],
+        "table": TABLES["detector"]().rows,
     }
 
 def flag():
@@ -187,7 +209,7 @@ def variable():
         "table": [row[:2] for row in TABLES["variables"]().rows],
     }
 
-print(json.dumps({each.__name__: each() for each in (effects, solver, flag, variable)}))
+print(json.dumps({each.__name__: each() for each in (effects, solver, setting, flag, variable)}))
 """
 
 pytestmark = pytest.mark.system
@@ -205,6 +227,8 @@ def results(tmp_path_factory):
         ("measure/estimators.py", ", PoseEstimator, credible_estimates\n",
          "from sweep.measure.frontal import FrontalSolver\n"),
         ("measure/estimators.py", "SOLVERS: dict[str, Solver] = {", SOLVER_RECORD),
+        ("measure/detectors.py", DECLARED, None),
+        ("measure/detectors.py", "OpenCV's own name and default.\"\"\"\n", SETTING),
         ("measure/flags.py", f'"{highest.meaning}")\n',
          f'    unlikely = flag({FLAG}, "{SENTENCE}", present=True)\n'),
         ("experiment/schema.py", "             flags=flags.Flipped),\n", VARIABLE),
@@ -249,6 +273,13 @@ def test_a_solver_is_one_class_and_one_record(results):
     assert max(got["rotation"][1]) < 15
     assert all(0 < grey < 255 for grey in got["grey"])
     assert ["frontal", "a frontal pose", "pixels", "no"] in got["table"]
+
+
+def test_a_detector_setting_is_one_field(results):
+    got = results["setting"]
+    assert got["detection"] == ["detected", "rejected"]
+    (row,) = [row for row in got["table"] if "minOtsuStdDev" in row[0]]
+    assert "least deviation" in str(row)
 
 
 def test_a_flag_is_one_member(results):

@@ -52,9 +52,11 @@ if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.folders import FittedScene
-    from sweep.report.questions import measure_tradeoff, require, write_report
+    from sweep.report.cost_tables import measure_tradeoff
+    from sweep.report.decisions import require
     from sweep.report.reference import reference
     from sweep.report.table import Findings
+    from sweep.report.write_report import write_report
     from sweep.tradeoff.choice_search import Choice
 
 __all__ = [
@@ -83,8 +85,8 @@ class RunOptions(LocalOptions, total=False):
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "measure_tradeoff": "questions",
-    "reference": "reference", "require": "questions", "write_report": "questions",
+    "diagnose": "diagnosis", "error_model": "detection", "measure_tradeoff": "cost_tables",
+    "reference": "reference", "require": "decisions", "write_report": "write_report",
 }
 
 
@@ -590,4 +592,4 @@ def compare(
         for name, value, unset in (("store", store, None), ("repeats", repeats, 1)):
             if value != unset:
                 raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
-    return library.questions.compare(one, other, bins=bins or None, output=figure)
+    return library.comparison_tables.compare(one, other, bins=bins or None, output=figure)

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
         error_model_file,
         figure,
         output_file,
-        questions,
         report_data,
         scenes,
         table,

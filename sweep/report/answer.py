@@ -10,47 +10,14 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
+from sweep.analysis import requirements as judged
 from sweep.analysis.dataset import each_cell
 from sweep.analysis.decisions import requirement_limits
-from sweep.analysis.requirements import (
-    Decision,
-    Verdict,
-    check_requirements,
-    combined,
-    described,
-    verdicts,
-)
+from sweep.analysis.requirements import Decision, Verdict
 from sweep.errors import DatasetError, StoreError
-from sweep.report.comparison import CARDS, COUNTED, Comparison, comparison
-from sweep.report.decisions import (
-    WORDS,
-    condition_table,
-    decision_table,
-    limit_interval,
-    limit_table,
-    limit_text,
-    limits_as_json,
-    valued,
-    values_met,
-)
-from sweep.report.error_model_file import error_model_tables
-from sweep.report.figures import (
-    board_tables,
-    errors_table,
-    interval_note,
-    precision_tables,
-    sentences,
-    signed_errors_table,
-    threshold_tables,
-)
-from sweep.report.report_data import (
-    CONFIGURATION,
-    Configurations,
-    ReportData,
-    configurations,
-    course_of,
-    notes_of,
-)
+from sweep.report import decisions, figures
+from sweep.report.comparison import CARDS, comparison
+from sweep.report.report_data import CONFIGURATION, ReportData, configurations, course_of, notes_of
 from sweep.report.table import Column, Table, interval_text, number
 
 
@@ -97,9 +64,9 @@ class Answer:
     headline: str
     paragraph: str
     of: str
-    tiles: tuple[Tile, ...]
-    tables: tuple[Table, ...]
-    details: tuple[Table, ...]
+    tiles: Sequence[Tile]
+    tables: Sequence[Table]
+    details: Sequence[Table]
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
@@ -132,15 +99,23 @@ def answer(data: ReportData) -> Answer:
     compared = comparison(data, None if decided is None else (decided.best,))
     known = compared.known
     one = known.summary.isel({CONFIGURATION: compared.best})
-    tiles = tuple(_tile(one, card) for card in CARDS)
+    tiles = [_tile(one, card) for card in CARDS]
     name = compared.name if known.several else ""
-    tables, details, numbers = ((), (), {}) if decided is None else decided[2:]
+    line = decided.line if decided else f"{compared.line}." if compared.line else _in_numbers(tiles)
+    if not int(known.summary["looked_for"].sum()):
+        line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
+                "modelled in none.")
+    warnings = [f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings]
+    notes = figures.sentences(
+        *warnings,
+        "A board counts as detected if at least one of its markers is."
+        if data.pipeline.shows_boards else "",
+        figures.interval_note(data), notes_of(data, {}), data.pooled(*known.axes))
     return Answer(
-        _headline(data, decided, compared, tiles), _notes(data, known), name, tiles,
-        (*tables, compared.table()),
-        (*details, *board_tables(data), errors_table(one, name), signed_errors_table(data),
-         *threshold_tables(data), *precision_tables(data), *error_model_tables(data)),
-        {"comparison": compared.as_json(), **numbers})
+        line, notes, name, tiles,
+        [*(decided.tables if decided else ()), compared.table()],
+        [*(decided.details if decided else ()), *figures.tables_of(data, one, name)],
+        {"comparison": compared.as_json(), **(decided.numbers if decided else {})})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -170,8 +145,8 @@ class Required(NamedTuple):
 
     line: str
     best: int
-    tables: tuple[Table, ...]
-    details: tuple[Table, ...]
+    tables: Sequence[Table]
+    details: Sequence[Table]
     numbers: Mapping[str, Any]
 
 
@@ -188,9 +163,11 @@ def required(data: ReportData) -> Required:
     """
     known = configurations(data, targets=False)
     results, positions = data.results.isel(known.axes), known.combinations
-    table = data.once("required", lambda: check_requirements(results, data.require, data.per))
-    found = [verdicts(table.isel({name: [k] for name, k in at.items()})) for at in positions]
-    decisions = [combined(each) for each in found]
+    table = data.once("required", lambda: judged.check_requirements(
+        results, data.require, data.per))
+    found = [judged.verdicts(table.isel({name: [k] for name, k in at.items()}))
+             for at in positions]
+    combined = [judged.combined(each) for each in found]
     along, others = course_of(data)
     # At all other conditions together, and at each of them.
     courses = [((), others), *([(others, ())] if others else [])] if along else []
@@ -200,83 +177,69 @@ def required(data: ReportData) -> Required:
         for per, at_all in courses]
 
     def rank(k: int) -> tuple[object, ...]:
-        return (bool(known.wrong[k]), ORDER.index(decisions[k]),
-                *(-values_met(part.isel(positions[k])) for part in limits))
+        return (bool(known.wrong[k]), ORDER.index(combined[k]),
+                *(-decisions.values_met(part.isel(positions[k])) for part in limits))
 
     first = min(map(rank, range(len(known.names))))
     equal = [k for k in range(len(known.names)) if rank(k) == first]
     best = comparison(data, tuple(equal)).best if len(equal) > 1 else equal[0]
     whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
-    line = f"{' and '.join(data.require)}: {_decided(found[best], decisions[best])}"
+    line = f"{' and '.join(data.require)}: {_decided(found[best], combined[best])}"
     if limits:
         line += _reached([part.isel(positions[best]) for part in limits], others)
-    every = verdicts(table)
+    every = judged.verdicts(table)
     return Required(
-        f"{line}{whose}.", best, (*map(limit_table, limits), decision_table(every)),
-        (condition_table(found[best], table, every=True),),
-        {"decision": decisions[best], "requirements": every,
-         "limits": limits_as_json(limits[0]) if limits else None})
+        f"{line}{whose}.", best,
+        [*map(decisions.limit_table, limits), decisions.decision_table(every)],
+        [decisions.condition_table(found[best], table, every=True)],
+        {"decision": combined[best], "requirements": every,
+         "limits": decisions.limits_as_json(limits[0]) if limits else None})
 
 
 def _decided(found: Sequence[Verdict], decision: Decision) -> str:
     """Return the decision, at how many conditions, and the value that decides a single one."""
     one = next((each for each in found if each.decision is decision), found[0])
-    words = WORDS[decision]
+    words = decisions.WORDS[decision]
     if one.conditions > 1:
-        count = one.counts.get(one.decision, 0)
-        words += " at all " if decision is Decision.met else f" at {count:,} of "
+        words += " at all " if decision is Decision.met else (
+            f" at {one.counts.get(one.decision, 0):,} of ")
         words += f"{one.conditions:,} conditions"
     elif one.decision is not Decision.not_applicable:
-        words += f" ({valued(one.value, one.low, one.high, one.units)})"
-    if math.isinf(one.draws_needed):
-        words += "; no number of draws would tell"
-    elif math.isfinite(one.draws_needed):
-        words += f"; {one.draws:,} draws, about {one.draws_needed:,.0f} would tell"
-    return words
+        words += f" ({decisions.valued(one.value, one.low, one.high, one.units)})"
+    return "; ".join(filter(None, (words, decisions.needs(one))))
 
 
 def _reached(limits: Sequence[xr.Dataset], others: Sequence[str]) -> str:
     """Return how far along the axis: at all conditions, else at the one that reaches farthest."""
     def met(one: xr.Dataset) -> str:
-        return limit_text(one) + (f" ({limit_interval(one)})" if values_met(one) else "")
+        interval = f" ({decisions.limit_interval(one)})" if decisions.values_met(one) else ""
+        return f"{decisions.limit_text(one)}{interval}"
 
     one, *by_condition = limits
     together = f" at all values of {', '.join(others)}" if others else ""
     line = f"; along {one.attrs['along']}{together}: {met(one)}"
-    if not by_condition or values_met(one):
+    if not by_condition or decisions.values_met(one):
         return line
-    at, farthest = max(each_cell(by_condition[0], others), key=lambda cell: values_met(cell[1]))
-    return f"{line}; at {described(at)}: {met(farthest)}" if values_met(farthest) else line
+    at, farthest = max(each_cell(by_condition[0], others),
+                       key=lambda cell: decisions.values_met(cell[1]))
+    return f"{line}; at {judged.described(at)}: {met(farthest)}" if (
+        decisions.values_met(farthest)) else line
 
 
 # --------------------------------------------------------------------------------------------------
-# The line, the notes, and the numbers in the cards.
+# The numbers in the cards, and the line that they make where there is nothing to compare.
 
-def _headline(
-    data: ReportData, decided: Required | None, compared: Comparison, tiles: Sequence[Tile]
-) -> str:
-    """Return the answer in one line."""
-    if not int(compared.known.summary["looked_for"].sum()):
-        return (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
-                "modelled in none.")
-    if decided is not None:
-        return decided.line
-    if compared.line:
-        return f"{compared.line}."
+#: Share -> the number of poses that it is of.
+COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_rate": "solved"}
+
+
+def _in_numbers(tiles: Sequence[Tile]) -> str:
+    """Return the answer of a single configuration in one line."""
     detected, _, median, _, rmse, *_ = tiles
     errors = "".join(
         f"; {tile.heading} {tile.value}{f' ({tile.detail})' if tile.detail else ''}"
-        for tile in (median, rmse) if tile.numbers["value"] == tile.numbers["value"])
+        for tile in (median, rmse) if not math.isnan(tile.numbers["value"]))
     return f"Detected in {detected.value} ({detected.detail}){errors}."
-
-
-def _notes(data: ReportData, known: Configurations) -> str:
-    """Return warnings, and what the numbers do not tell, as sentences."""
-    warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
-    return warnings + sentences(
-        "A board counts as detected if at least one of its markers is."
-        if data.pipeline.shows_boards else "",
-        interval_note(data), notes_of(data, {}), data.pooled(*known.axes))
 
 
 def _tile(one: xr.Dataset, column: Column) -> Tile:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -26,13 +27,10 @@ CARDS = (
     Column("detected, %", "detection_rate", 100), Column("solved, %", "solved_rate", 100),
     Column("rotation median, deg", "rotation_median_deg"),
     Column("rotation RMSE, deg", "rotation_rmse_deg"),
-    Column("range RMSE, %", "range_rmse_percent"), Column("range bias, %", "range_bias_percent"),
+    Column("range RMSE, %", "range_rmse_percent"),
+    Column("range bias without flips, %", "range_bias_percent"),
     Column("flips, %", "flip_rate", 100),
 )
-
-#: Share -> what it is of.
-COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_rate": "solved"}
-
 
 # Of two equal configurations differences are 0, where large is good, and ratios 1.
 DETECTION = Column("detection difference, points", "detection_difference", 100.0, 0.0)
@@ -122,36 +120,35 @@ class Comparison:
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
             next((each for each in pair[2:] if not np.isnan(each.value)), pair[0])]
-        line = f"{self.name} against {known.names[rival]}: " + "; ".join(
-            each.text for each in shown)
-        if len(others) > 1:
-            counts = {verdict: sum(self.verdict(k) == verdict for k in others)
-                      for verdict in VERDICTS}
-            line += f" (of {len(others)} others: " + ", ".join(
-                f"{VERDICTS[verdict]} {'against' if not verdict else 'than'} {count}"
-                for verdict, count in counts.items() if count) + ")"
-        return line
+        counts = Counter(map(self.verdict, others))
+        words = ", ".join(f"{VERDICTS[verdict]} {counts[verdict]}" for verdict in VERDICTS
+                          if counts[verdict])
+        return (f"{self.name} against {known.names[rival]}: "
+                + "; ".join(each.text for each in shown)
+                + (f" (of {len(others)} others: {words})" if len(others) > 1 else ""))
 
     def table(self) -> Table:
         """Return a row for each configuration, with the best one's paired differences."""
-        known, columns = self.known, (Column("n", "looked_for"), *CARDS)
-        headings = [each.heading for each in (*columns, *PAIRED)]
-        rows = [[name, *cells] for name, *cells in zip(
-            known.names, *(each.cells(known.summary) for each in columns), strict=True)]
-        caption = "Configurations, with 95 % intervals"
-        if not known.several:
-            return Table.of(caption, [CONFIGURATION, *headings[: len(columns)]], rows)
-        best = all(self.verdict(k) > 0 or known.wrong[k]
-                   for k in range(len(rows)) if k != self.best)
-        for k, pair in enumerate(self.differences):
-            rows[k] += [each.numbers for each in pair] or [None] * len(PAIRED)
-            rows[k].insert(1, verdict_words(pair) if k != self.best else
-                           "best" if best else "named")
-        few = any(each.quantity == UNFLIPPED.heading for pair in self.differences for each in pair)
-        return Table.of(
-            f"{caption}; differences, ratios and verdict: {self.name} against each, on the same "
-            f"images{'; rotation without flips where few poses differ by them' if few else ''}",
-            [CONFIGURATION, "verdict", *headings], rows, stub=2)
+        known, columns = self.known, [Column("n", "looked_for"), *CARDS]
+        caption, headings = "Configurations, with 95 % intervals", [CONFIGURATION]
+        cells = [each.cells(known.summary) for each in columns]
+        if known.several:
+            best = all(self.verdict(k) > 0 or known.wrong[k]
+                       for k in range(len(known.names)) if k != self.best)
+            verdicts = [verdict_words(pair) for pair in self.differences]
+            verdicts[self.best] = "best" if best else "named"
+            nothing = [None] * len(PAIRED)
+            pairs = [[each.numbers for each in pair] or nothing for pair in self.differences]
+            headings.append("verdict")
+            cells = [verdicts, *cells, *map(list, zip(*pairs, strict=True))]
+            columns += PAIRED
+            few = any(each.quantity == UNFLIPPED.heading
+                      for pair in self.differences for each in pair)
+            caption += (
+                f"; differences, ratios and verdict: {self.name} against each, on the same images"
+                + "; rotation without flips where few poses differ by them" * few)
+        return Table.of(caption, [*headings, *(each.heading for each in columns)],
+                        list(zip(known.names, *cells, strict=True)), stub=len(headings))
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the differences of the best configuration from each, as JSON values."""
@@ -197,7 +194,13 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
 def _comparison(data: ReportData, among: Sequence[int] | None) -> Comparison:
     known = configurations(data, targets=among is None)
     usable = [k for k in range(len(known.names)) if among is None or k in among]
+    results = data.results.isel(known.axes)
     tried: dict[int, list[tuple[Difference, ...]]] = {}
+
+    def differences(k: int, best: int) -> tuple[Difference, ...]:
+        one, other = (results.isel(known.combinations[at], drop=True) for at in (k, best))
+        return () if k == best else data.once(
+            ("differences", *known.axes, k, best), lambda: differences_of(one, other))
 
     def better_than(best: int) -> list[int]:
         return [k for k in usable
@@ -206,7 +209,7 @@ def _comparison(data: ReportData, among: Sequence[int] | None) -> Comparison:
     left, best = list(usable), usable[0]
     while known.several and left:
         best = left.pop(0)
-        tried[best] = _against_each(data, known, best)
+        tried[best] = [differences(k, best) for k in range(len(known.names))]
         better = better_than(best)
         if not better:
             break
@@ -215,20 +218,6 @@ def _comparison(data: ReportData, among: Sequence[int] | None) -> Comparison:
         # In a circle each is worse than another one: the one that is worse than the fewest.
         best = min(tried, default=best, key=lambda k: len(better_than(k)))
     return Comparison(known, best, tried.get(best, [()]))
-
-
-def _against_each(
-    data: ReportData, known: Configurations, best: int
-) -> list[tuple[Difference, ...]]:
-    """Return the differences of one configuration from each, of no quantity from itself."""
-    results = data.results.isel(known.axes)
-
-    def against(k: int) -> tuple[Difference, ...]:
-        one, other = (results.isel(known.combinations[at], drop=True) for at in (k, best))
-        return () if k == best else data.once(
-            ("differences", *known.axes, k, best), lambda: differences_of(one, other))
-
-    return [against(k) for k in range(len(known.names))]
 
 
 def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, ...]:
@@ -274,9 +263,7 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
         keep = {name: np.flatnonzero(results[name].values == value) for name, value in at.items()}
         here = dataclasses.replace(data, results=results.isel(keep), made={})
         known = configurations(here, targets=False)
-        costs = dict(zip(part["treatment"].values.tolist(), part["cost_ms"].values.tolist(),
-                         strict=True))
-        cost = [costs.get(name, np.nan) for name in known.names]
+        cost = part["cost_ms"].reindex(treatment=known.names).values.tolist()
         usable = [k for k, name in enumerate(known.names)
                   if WRONG not in name and np.isfinite(cost[k])]
         within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]

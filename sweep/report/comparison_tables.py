@@ -1,25 +1,32 @@
-"""Photographs beside their simulation, calibrations, two stores: tables and a figure."""
+"""Photographs beside their simulation, two stores, calibrations: tables and a figure."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 
+from sweep.analysis import simulation_gap
 from sweep.analysis.comparisons import (
     GAP_RATES,
     GAP_STATISTICS,
     SOURCES,
     ComparedRate,
     SolvedQuantile,
+    is_measured,
     matched_sides,
+    store_differences,
 )
 from sweep.analysis.dataset import each_cell
 from sweep.analysis.estimator import Bins
 from sweep.analysis.poses import QUANTITIES
-from sweep.report.figure import Figure
+from sweep.errors import ArgumentError
+from sweep.messages import quoted
+from sweep.report.decisions import selected_store
+from sweep.report.figure import Figure, write_figure
+from sweep.report.output_file import figure_file
 from sweep.report.table import (
     Column,
     Findings,
@@ -32,6 +39,37 @@ from sweep.report.table import (
 )
 from sweep.tradeoff.pareto import configuration_label
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# How two stores differ: photographs and their simulation, or two versions.
+
+
+def compare(
+    first: str, second: str, *, bins: Mapping[str, Sequence[float]] | None = None,
+    output: str | None = None,
+) -> Findings:
+    """Compare photographs with a simulation, or two stores of one pipeline; as `sweep.compare`."""
+    figure = figure_file(output)
+    one, other = (selected_store(url)[0] for url in (first, second))
+    then = (f"sweep report {quoted(second)}", "")
+    if is_measured(one) == is_measured(other):
+        for name, value in (("bins", bins), ("output", output)):
+            if value:
+                raise ArgumentError(name, "", "expected a store of photographs and a simulation")
+        table = store_differences(one, other)
+        tables = store_difference_tables(table)
+        return Findings([*tables.values()], {
+            "first": first, "second": second,
+            **{name: each.as_json()["rows"] for name, each in tables.items()}}, table, 0, then)
+    gap = simulation_gap(one, other, bins).load()
+    if figure is not None:
+        write_figure(gap_figures(one, other, bins), figure)
+    found = gap_table(gap)
+    return Findings(
+        [found, *gap_lines(gap)],
+        {"photographs": first, "simulated": second, "paired": bool(gap.attrs["paired"]),
+         **found.as_json()}, gap, 0, then)
+
 
 # --------------------------------------------------------------------------------------------------
 # Photographs beside their simulation.

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Sequence
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
+from sweep.analysis import requirements as judged
+from sweep.analysis.comparisons import regressions
 from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes, each_cell, is_replicated
 from sweep.analysis.decisions import CONFIDENCE, Reach
 from sweep.analysis.requirements import Cause, Decision, Verdict, described
@@ -17,24 +21,13 @@ from sweep.errors import ArgumentError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, quoted
+from sweep.report import table as tables
 from sweep.report.figure import Figure
-from sweep.report.table import (
-    UNDECIDED,
-    Column,
-    Findings,
-    Table,
-    axis_label,
-    coordinate,
-    coordinates,
-    interval_text,
-    number,
-    plural,
-    table_of,
-)
+from sweep.report.table import UNDECIDED, Column, Findings, Table, coordinate, interval_text, number
+from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.typing import Masks
 
 if TYPE_CHECKING:
-    from sweep.analysis.comparisons import Regression
     from sweep.analysis.decisions import Answer
     from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
@@ -46,6 +39,102 @@ UNITS = {"": "", "1": "", "percent": " %", "degree": "\u00b0"}
 
 #: Conditions that JSON lists.
 MAX_ROWS = 500
+
+# --------------------------------------------------------------------------------------------------
+# Whether requirements are met: a row for each with its worst condition, and rows for conditions.
+
+
+def require(
+    store: str | PathLike[str], requirements: Sequence[str] = (), *,
+    per: Sequence[str] | None = None, at: Sequence[str] = (), pipeline: str | None = None,
+    against: str | PathLike[str] | None = None, every: bool = True,
+) -> Findings:
+    """Decide whether a store's results meet requirements.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    requirements
+        Such as "detection >= 0.95" (default: the section [require] of the store's pipeline).
+    per
+        Axes whose values are conditions, at each of which all must hold; others are pooled
+        (default: those of [require], else the axes of size, angle and boards).
+    at
+        "name=value": only these values of axes.
+    pipeline
+        A TOML file whose section [require] is taken.
+    against
+        An older store, with which it is compared pose by pose: significantly worse is not met.
+    every
+        Whether the table of conditions has all of them, or those that fail.
+
+    Returns
+    -------
+    Findings
+        The decisions as tables and numbers; ``numbers["decision"]`` is that on all together, and
+        ``data`` the dataset of `sweep.analysis.check_requirements`.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, and stores that cannot be read.
+
+    Examples
+    --------
+    >>> found = sweep.require(folder / "two_sizes.zarr", ["detection >= 0.01"], per=[])
+    >>> found.numbers["decision"].name
+    'met'
+    """
+    results, stored = selected_store(store, at)
+    if pipeline is not None:
+        stored = read_pipeline(pipeline)
+        judged.check_required(stored.requirements, pipeline)
+    texts = list(requirements) or list(stored.requirements)
+    axes = list(judged.conditions(results, per, stored.require_per))
+    if not texts and against is None:
+        raise ArgumentError(
+            "requirements", "[]", "the pipeline has no section [require]; give some, such as "
+            "'detection >= 0.95' 'range_error_p95_percent <= 1'")
+    required = judged.parse_requirements(texts) if texts else ()
+    table = judged.check_requirements(results, required, axes) if required else None
+    found = [] if table is None else judged.verdicts(table)
+    worse = [] if against is None else regressions(
+        selected_store(against, at)[0], results, [each.variable for each in required], axes)
+    decision = judged.combined(found) if found else Decision.met
+    if any(each.worse for each in worse):
+        decision = Decision.not_met
+    named = {*axes, DRAWS, *configuration_axes(results)}
+    pooled = [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
+    parts: list[Table | str] = [decision_table(found), Table.of(
+        "Compared with the older store pose by pose, new minus old",
+        ("", "quantity", "configuration", "difference", "condition"),
+        [["worse" if each.worse else "not worse", each.quantity, described(each.configuration),
+          valued(each.difference, each.low, each.high, each.units), described(each.condition)]
+         for each in worse], words=True)]
+    if table is not None:
+        parts.append(condition_table(found, table, every=every))
+    if per is None and list(stored.require_per) != axes and axes:
+        parts.append(f"at each value of {', '.join(axes)}; --per '' pools all")
+    if pooled:
+        parts.append(f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions")
+    return Findings(
+        parts, {
+            "decision": decision, "per": axes, "pooled": pooled,
+            "requirements": [
+                {**dataclasses.asdict(each), "failing": [] if table is None else
+                 conditions_of(each, table)[:MAX_ROWS]} for each in found],
+            "against": worse},
+        table, {Decision.met: 0, Decision.not_met: 1}.get(decision, UNDECIDED),
+        (more_draws(found, results, os.fspath(store)), ""))
+
+
+def selected_store(
+    url: str | PathLike[str], at: Sequence[str] = ()
+) -> tuple[xr.Dataset, Pipeline]:
+    """Return a finished store's results at some values of axes, and its pipeline."""
+    store = open_finished(os.fspath(url))
+    return selected(open_dataset(url), at, store.pipeline), store.pipeline
 
 
 def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.Dataset:
@@ -77,15 +166,6 @@ def _is_same(one: Any, other: Any) -> bool:
     return math.isclose(one, other, rel_tol=1e-9) if numbers else bool(one == other)
 
 
-def pooled_axes(results: xr.Dataset, per: Sequence[str]) -> list[str]:
-    """Return the axes of the scene that are pooled."""
-    named = {*per, DRAWS, *configuration_axes(results)}
-    return [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
-
-
-# --------------------------------------------------------------------------------------------------
-# Requirements: a row for each, with its worst condition, and rows for conditions.
-
 def conditions_of(
     each: Verdict, table: xr.Dataset, *, every: bool = False
 ) -> list[dict[str, Any]]:
@@ -98,11 +178,11 @@ def conditions_of(
         return []
     one = table.isel(requirement=table["requirement"].values.tolist().index(each.requirement))
     one = one.sel({name: value for name, value in each.configuration.items() if name in one.dims})
-    dims = [str(dim) for dim in one["decision"].dims]
     found = [
         {"condition": at, "decision": Decision(int(cell["decision"])),
          **{name: cell[name].item() for name in ("value", "low", "high", "draws")}}
-        for at, cell in each_cell(one, dims) if every or cell["decision"] == each.decision]
+        for at, cell in each_cell(one, [str(dim) for dim in one["decision"].dims])
+        if every or cell["decision"] == each.decision]
     sign = -1 if one["relation"].item() in (">=", ">") else 1
     return sorted(found, key=lambda row: -sign * np.nan_to_num(row["value"], nan=sign * np.inf))
 
@@ -126,20 +206,9 @@ def condition_table(found: Sequence[Verdict], table: xr.Dataset, *, every: bool)
         "All conditions" if every else "Conditions that fail, the worst first",
         ("", "requirement", "configuration", "condition", "value", "draws"),
         [[WORDS[row["decision"]], each.requirement, described(each.configuration),
-          described(row["condition"]),
-          valued(row["value"], row["low"], row["high"], each.units),
+          described(row["condition"]), valued(row["value"], row["low"], row["high"], each.units),
           f"{np.nan_to_num(row['draws']):,.0f}"]
          for each, rows in listed for row in rows if every or len(rows) > 1], words=True)
-
-
-def regression_table(worse: Sequence[Regression]) -> Table:
-    """Return how results differ from an older store's, pose by pose."""
-    return Table.of(
-        "Compared with the older store pose by pose, new minus old",
-        ("", "quantity", "configuration", "difference", "condition"),
-        [["worse" if one.worse else "not worse", one.quantity, described(one.configuration),
-          valued(one.difference, one.low, one.high, one.units), described(one.condition)]
-         for one in worse], words=True)
 
 
 def valued(value: float, low: float, high: float, units: str) -> str:
@@ -164,14 +233,12 @@ def needs(each: Cause) -> str:
 
 def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str:
     """Return the command that makes about as many draws as are needed."""
-    trials = results.sizes.get(DRAWS, 1)
-    factors = [each.draws_needed / each.draws for each in found
-               if each.draws > 0 and math.isfinite(each.draws_needed)]
-    if not factors or max(factors) <= 1.0:
+    factor = max((each.draws_needed / each.draws for each in found
+                  if each.draws > 0 and math.isfinite(each.draws_needed)), default=0.0)
+    if factor <= 1.0:
         return f"sweep report {quoted(store)}"
-    count = math.ceil(trials * max(factors))
-    if is_replicated(results):
-        count = math.ceil(count / REPLICATES) * REPLICATES
+    unit = REPLICATES if is_replicated(results) else 1
+    count = math.ceil(results.sizes.get(DRAWS, 1) * factor / unit) * unit
     return (f"sweep run {quoted(store)} --set trial={count} --store more.zarr "
             f"--reuse {quoted(store)}")
 
@@ -180,46 +247,24 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
 # Output of ``sweep size``: the answer in a line, a table of the alternatives, JSON.
 
 def headline(choice: Choice) -> str:
-    """Return the line on the choice; without one, on the nearest alternative."""
+    """Return the decision on a choice in a line: the choice, or what comes nearest to one."""
     rule = choice.rule
-    wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
-    what = (f"{plural(len(rule.requirements), 'requirement')} at "
-            f"{plural(choice.conditions, 'condition')}, with {100 * CONFIDENCE:g} % "
-            "confidence")
     if choice.best is not None:
-        answer, cost = choice.answers[choice.best], choice.costs[choice.best]
-        ms = "" if cost is None else f", {number(cost.ms)} ms a frame"
-        name = _name(choice, answer, answer.value)
+        best = choice.answers[choice.best]
+        name = _name(choice, best, best.value)
         if not choice.is_undecided:
-            return f"{name} is the {wish} choice{ms}: it meets {what}"
+            wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
+            return f"{name} is the {wish} choice"
         bound = f"{'at least' if rule.largest else 'at most'} " if rule.along else ""
-        return f"not decided: {bound}{name}{ms}: it meets {what}; a better one may, too"
-    start = f"no choice meets {what}" if not choice.is_undecided else (
-        f"not decided: no choice is known to meet {what}")
-    if any(answer.met for answer in choice.answers):
-        return f"{start}, within {choice.budget_ms:g} ms a frame"
+        return f"not decided: {bound}{name}; a better choice may meet everything, too"
+    within = "" if choice.budget_ms is None else f" within {choice.budget_ms:g} ms a frame"
+    line = ("not decided: no choice is known to meet" if choice.is_undecided else
+            "no choice meets") + f" everything{within}"
     near = [(answer.nearest, answer) for answer in choice.answers if answer.nearest is not None]
     if not near:
-        return start
-    nearest, answer = min(near, key=lambda each: each[0].excess)
-    return f"{start}; nearest is {_name(choice, answer, nearest.value)}: {reason(nearest.cause)}"
-
-
-def _why(choice: Choice, k: int) -> str:
-    """Return why no better value of an alternative is chosen, or why the alternative is not."""
-    answer, cost = choice.answers[k], choice.costs[k]
-    out = []
-    if answer.next_cause is not None:
-        out.append(reason(answer.next_cause))
-    if answer.passing:
-        beyond = ", ".join(map(coordinate, answer.passing))
-        out.append(f"beyond {coordinate(answer.next)}, {beyond} keep all limits by estimate")
-    if answer.met and cost is not None and not choice.within_budget(k):
-        at = f" at {described(cost.condition)}" if cost.condition else ""
-        state = "not within" if cost.low > (choice.budget_ms or 0.0) else "not decided: within"
-        out.append(f"takes {number(cost.ms)} ms ({number(cost.low)} to {number(cost.high)}){at}: "
-                   f"{state} {choice.budget_ms:g} ms")
-    return "; ".join(out)
+        return line
+    one, answer = min(near, key=lambda each: each[0].excess)
+    return f"{line}; nearest is {_name(choice, answer, one.value)}: {reason(one.cause)}"
 
 
 def _name(choice: Choice, answer: Answer, value: float | None) -> str:
@@ -228,8 +273,10 @@ def _name(choice: Choice, answer: Answer, value: float | None) -> str:
     return described({**along, **answer.alternative})
 
 
-def reason(cause: Cause) -> str:
+def reason(cause: Cause | None) -> str:
     """Return why a choice fails: the requirement, its value with interval, the condition."""
+    if cause is None:
+        return ""
     at = f" at {described(cause.condition)}" if cause.condition else ""
     draws = f"; {text}: raise search.max_trials" if (text := needs(cause)) else ""
     return (f"{cause.requirement} is {WORDS[cause.decision]}: "
@@ -238,26 +285,24 @@ def reason(cause: Cause) -> str:
 
 def alternatives(choice: Choice) -> Table:
     """Return a row for each alternative: those that meet all first, the best of them before."""
-    def rank(k: int) -> tuple[bool, float, float]:
-        answer, cost = choice.answers[k], choice.costs[k]
-        value = 0.0 if answer.value is None else answer.value
-        return (not answer.met, -value if choice.rule.largest else value,
-                math.inf if cost is None else cost.ms)
-
-    along = choice.rule.along
+    along, budget = choice.rule.along, choice.budget_ms
     rows = []
-    for k in sorted(range(len(choice.answers)), key=rank):
+    for k in sorted(range(len(choice.answers)), key=lambda k: (
+            not choice.answers[k].met, choice.rank(k))):
         answer, cost = choice.answers[k], choice.costs[k]
-        value = ["none" if each is None else coordinate(each)
-                 for each in (answer.value, answer.next)] if along else [
-                     "yes" if answer.met else "no"]
-        ms = "" if cost is None else f"{number(cost.ms)}{'*' * (k in choice.front)}"
-        rows.append([*map(str, answer.alternative.values()), *value, ms, _why(choice, k)])
-    front = "; * no other is as good and cheaper" if choice.front else ""
+        within = None if cost is None or budget is None else "yes" if choice.within_budget(k) else (
+            "no" if cost.low > budget else "not decided")
+        rows.append([
+            *map(str, answer.alternative.values()),
+            *(["none" if each is None else coordinate(each) for each in (answer.value, answer.next)]
+              if along else [answer.met]),
+            cost and tables.Value(cost.ms, cost.low, cost.high), within, k in choice.front,
+            reason(answer.next_cause), ", ".join(map(coordinate, answer.passing))])
     return Table.of(
-        headline(choice) + front,
+        headline(choice),
         [*choice.rule.among, *([along, "next"] if along else ["meets all"]), "ms a frame",
-         "why not better" if along else "why not"], rows, stub=len(choice.rule.among), words=True)
+         "within the budget", "on the front", "why not better" if along else "why not",
+         "kept beyond, by estimate"], rows, stub=len(choice.rule.among), words=True)
 
 
 def choice_findings(choice: Choice) -> Findings:
@@ -289,9 +334,7 @@ def as_json(choice: Choice) -> dict[str, Any]:
         {choice.rule.along: best.value} if choice.rule.along else {})}
     return {
         "answer": known if choice.decision is Decision.met else None, "known": known,
-        "decision": choice.decision,
-        "sentences": [headline(choice), *filter(None, (
-            _why(choice, k) for k in range(len(choice.answers))))],
+        "decision": choice.decision, "sentences": [headline(choice)],
         "best": choice.best, "next": choice.next, "along": choice.rule.along,
         "confidence": CONFIDENCE, "conditions": choice.conditions,
         "budget_ms": choice.budget_ms, "alternatives": listed,
@@ -307,16 +350,24 @@ def as_json(choice: Choice) -> dict[str, Any]:
 def limit_table(limits: xr.Dataset) -> Table:
     """Return a row for each configuration and condition of `sweep.analysis.requirement_limits`."""
     dims = dimensions(limits)
-    rows = [[*map(coordinate, at.values()), limit_text(one), limit_interval(one),
-             bool(one["settled"]), *_failure_texts(one), int(one["poses"])]
-            for at, one in each_cell(limits, dims)]
-    required = " and ".join(map(str, limits.attrs["require"]))
+    rows = []
+    for at, one in each_cell(limits, dims):
+        fails = ""
+        if name := str(one["limited_by"].item()):
+            where = str(one["fails_where"].item())
+            fails = (f"{_place(one, float(one['fails_at']))}: {name.split(maxsplit=1)[0]} "
+                     f"{number(float(one['failing_value']))}{f' ({where})' if where else ''}")
+        beyond = float(one["farthest_beyond"])
+        rows.append([
+            *map(coordinate, at.values()), limit_text(one), limit_interval(one),
+            bool(one["settled"]), fails,
+            "" if math.isnan(beyond) else _place(one, beyond), int(one["poses"])])
     at_all = ", ".join(limits.attrs["at_all"])
     return Table.of(
-        f"How far along {limits.attrs['along']}: {required}"
+        f"How far along {limits.attrs['along']}: {' and '.join(map(str, limits.attrs['require']))}"
         + (f", at all values of {at_all}" if at_all else ""),
-        [*dims, "met", "95 % interval", "decided", "fails first", "beyond", "poses"], rows,
-        stub=len(dims), words=True)
+        [*dims, "met", "95 % interval", "decided", "fails first",
+         "kept again by estimate, farthest at", "poses"], rows, stub=len(dims), words=True)
 
 
 def dimensions(limits: xr.Dataset) -> list[str]:
@@ -332,60 +383,44 @@ def limit_text(one: xr.Dataset) -> str:
     An undecided limit is called so, whatever the estimates are.
     """
     reach, start, value = Reach(int(one["reach"])), float(one["start"]), float(one["value"])
-    bound = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
-    low, high = sorted((start, value))
-    text = {
-        Reach.not_run: "nothing to judge", Reach.never: "at no value", Reach.found: bound,
-        Reach.always: f"at all values, {bound}",
-        Reach.within: f"only at {_place(one, value)}" if low == high else
-                      f"{_place(one, low, unit=False)} to {_place(one, high)}"}[reach]
-    if bool(one["settled"]) or reach is Reach.not_run:
-        return text
-    if value != met_to(one):
-        return f"not decided: {text}"
-    return text if reach is Reach.always else f"{text}, not decided beyond"
+    if reach is Reach.not_run:
+        return "nothing to judge"
+    text = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
+    if reach is Reach.always:
+        text = f"at all values, {text}"
+    elif reach is Reach.never:
+        text = "at no value"
+    elif reach is Reach.within:
+        low, high = sorted((start, value))
+        text = f"{_place(one, low, unit=False)} to {_place(one, high)}"
+    return text if are_decided(one) else f"not decided: {text}"
 
 
-def met_to(one: xr.Dataset) -> float:
-    """Return the value up to which all is decided to be met; infinite for none."""
-    return float(one["low" if one.attrs["harder"] == "upwards" else "high"])
+def met_to(limits: xr.Dataset) -> xr.DataArray:
+    """Return the values up to which all is decided to be met; infinite for none."""
+    return limits["low" if limits.attrs["harder"] == "upwards" else "high"]
 
 
 def limit_interval(one: xr.Dataset) -> str:
     """Return the interval of the limit: ``1.1 to 1.3``; an open end is the grid's."""
-    low, high = float(one["low"]), float(one["high"])
-    if math.isnan(low) or math.isnan(high):
-        return "none"
     values = one[one.attrs["along"]].values
-    beyond = {-math.inf: f"below {_place(one, float(values.min()), unit=False)}",
-              math.inf: f"beyond {_place(one, float(values.max()), unit=False)}"}
-    texts = [beyond.get(end) or _place(one, end, unit=False) for end in (low, high)]
-    return " to ".join(dict.fromkeys(texts))
-
-
-def _failure_texts(one: xr.Dataset) -> tuple[str, str]:
-    """Return the requirement that fails first beyond, and where estimates keep all again, if so.
-
-    ``1.3 m: detection_rate 0.874 (tilt_deg = 60)``
-    """
-    cause = beyond = ""
-    if name := str(one["limited_by"].item()):
-        where = str(one["fails_where"].item())
-        cause = (f"{_place(one, float(one['fails_at']))}: {name.split(maxsplit=1)[0]} "
-                 f"{number(float(one['failing_value']))}{f' ({where})' if where else ''}")
-    if float(one["met_beyond"]) > 0:
-        beyond = ("kept again by estimate, farthest at "
-                  f"{_place(one, float(one['farthest_beyond']))}")
-    return cause, beyond
+    open_ends = {-math.inf: f"below {_place(one, float(values.min()), unit=False)}",
+                 math.inf: f"beyond {_place(one, float(values.max()), unit=False)}",
+                 math.nan: "none"}
+    ends = [float(one[name]) for name in ("low", "high")]
+    if any(map(math.isnan, ends)):
+        return "none"
+    return " to ".join(dict.fromkeys(
+        open_ends.get(end) or _place(one, end, unit=False) for end in ends))
 
 
 def _place(one: xr.Dataset, value: float, *, unit: bool = True) -> str:
     """Return a value of the axis with its unit."""
     axis = one[one.attrs["along"]]
     values: list[float] = axis.values.astype(float).tolist()
-    text = dict(zip(values, coordinates(values), strict=True)).get(value, coordinate(value))
+    texts = dict(zip(values, tables.coordinates(values), strict=True))
     units = str(axis.attrs.get("units", ""))
-    return text + UNITS.get(units, f" {units}") if unit else text
+    return texts.get(value, "") + (UNITS.get(units, f" {units}") if unit else "")
 
 
 def values_met(one: xr.Dataset) -> int:
@@ -401,10 +436,9 @@ def are_decided(limits: xr.Dataset) -> Masks:
     Where nothing could be judged there is nothing to decide, unless that is so everywhere.
     """
     reach = limits["reach"].values
-    met = limits["value"].values == limits[
-        "low" if limits.attrs["harder"] == "upwards" else "high"].values
     judged = reach != Reach.not_run
-    decided = limits["settled"].values | ((reach == Reach.always) & met)
+    decided = limits["settled"].values | (
+        (reach == Reach.always) & (limits["value"].values == met_to(limits).values))
     return np.asarray(decided & judged | ~judged & judged.any())
 
 
@@ -427,36 +461,34 @@ def limits_as_json(limits: xr.Dataset) -> dict[str, Any]:
     ``value`` and ``reach`` are by the estimates; ``met_to`` is the value up to which all is decided
     to be met, ``decided`` whether the interval is that single value.
     """
-    dims = dimensions(limits)
     names = ("value", "low", "high", "start", "fails_at", "failing_value", "limited_by",
              "fails_where", "met_beyond", "farthest_beyond", "settled", "poses")
     listed = [
         {"condition": at, "reach": Reach(int(one["reach"])).name,
-         "decided": bool(one["settled"]), "met_to": met_to(one),
-         **{name: one[name].item() for name in names}} for at, one in each_cell(limits, dims)]
-    return {"along": limits.attrs["along"], "harder": limits.attrs["harder"],
-            "require": list(limits.attrs["require"]), "at_all": list(limits.attrs["at_all"]),
+         "decided": bool(one["settled"]), "met_to": met_to(one).item(),
+         **{name: one[name].item() for name in names}}
+        for at, one in each_cell(limits, dimensions(limits))]
+    return {**{name: limits.attrs[name] for name in ("along", "harder", "require", "at_all")},
             "units": str(limits[limits.attrs["along"]].attrs.get("units", "")), "limits": listed}
 
 
-# --------------------------------------------------------------------------------------------------
-# The figure of limits: against the first axis of conditions that has numbers.
-
-
 def limit_figure(limits: xr.Dataset) -> Figure:
-    """Return the figure of limits, as `sweep.analysis.requirement_limits` returns them."""
+    """Return the figure of limits, as `sweep.analysis.requirement_limits` returns them.
+
+    They are drawn against the first axis of conditions that has numbers.
+    """
     along, dims = str(limits.attrs["along"]), dimensions(limits)
     varying = [name for name in dims if limits.sizes[name] > 1]
     limits = limits.isel({name: 0 for name in dims if name not in varying})
     axis = next((name for name in varying if limits[name].dtype.kind in "fiu"), None)
     ordered = [*(name for name in varying if name != axis), *([axis] if axis else [])]
     # At no value there is no limit, and no interval is drawn.
-    never = limits["reach"] == Reach.never
-    drawn = limits[["value", "low", "high"]].where(~never)
+    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never)
     drawn = drawn.rename({"low": "value_low", "high": "value_high"}).assign_coords(limits.coords)
-    column = Column(f"limit of {axis_label(limits, along)}", "value")
+    column = Column(f"limit of {tables.axis_label(limits, along)}", "value")
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
     return Figure(
-        "limit", title, "", table_of(drawn.drop_vars(along), title, ordered, [column], limits),
-        [column], axis_label(limits, axis) if axis else "",
-        axis_label(limits, ordered[-2]) if axis and len(ordered) > 1 else "")
+        "limit", title, "",
+        tables.table_of(drawn.drop_vars(along), title, ordered, [column], limits),
+        [column], tables.axis_label(limits, axis) if axis else "",
+        tables.axis_label(limits, ordered[-2]) if axis and len(ordered) > 1 else "")

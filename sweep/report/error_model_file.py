@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,8 @@ from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Findings, Table, Value, interval_text, number
+from sweep.report.table import Column, Findings, Table, Value, table_of
+from sweep.typing import Integers
 from sweep.version import __version__
 
 SCHEMA = "sweep-error-model/3"
@@ -79,8 +79,8 @@ def check_error_model_file(path: str) -> None:
             "Python, and sweep.analysis.model_covariance gives covariances for ROS")
 
 
-def error_model_text(models: xr.Dataset, facts: Mapping[str, Any]) -> str:
-    """Return the content of a file.
+def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a file; NaN and infinities are null.
 
     Parameters
     ----------
@@ -89,11 +89,6 @@ def error_model_text(models: xr.Dataset, facts: Mapping[str, Any]) -> str:
     facts
         Source of the models: ``store``, ``title``, ``fingerprint``, ``camera``, ``pipeline``.
     """
-    return to_json(document(models, facts), indent=1) + "\n"
-
-
-def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the file; NaN and infinities are null."""
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     knots = {name: models[name].values.tolist() for name in PREDICTORS}
     return {
@@ -190,8 +185,10 @@ def warnings_of(models: xr.Dataset) -> list[str]:
     return [*lines, *ALWAYS]
 
 
-def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
-    """Write the error models of a store into files, and return them.
+def written_error_models(
+    data: ReportData, paths: Sequence[str]
+) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Write the error models of a store; return them, and the content of the files.
 
     Parameters
     ----------
@@ -212,36 +209,26 @@ def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
     for path in paths:
         check_error_model_file(path)
         check_output_file(Path(path))
-    models = models_of(data)
-    content = error_model_text(models, facts_of(data)).encode()
-    for path in paths:
-        write_output_file(Path(path), content)
-    return models
-
-
-def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
-    """Write the error models of a store into files; return their table and warnings."""
-    models = written_error_models(data, paths)
-    return Findings(
-        [error_model_table(models),
-         *(f"- {line}" for line in (*exponent_lines(models), *warnings_of(models)))],
-        document(models, facts_of(data)), models, 0,
-        (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
-
-
-def models_of(data: ReportData) -> xr.Dataset:
-    """Return the error models of a store; they are made once."""
-    return data.once(error_models.__name__, lambda: error_models(data.results))
-
-
-def facts_of(data: ReportData) -> dict[str, Any]:
-    """Return the source of the models."""
-    return {
+    models = error_models(data.results)
+    content = document(models, {
         "store": data.store, "title": data.pipeline.heading,
         "camera": data.pipeline.facts.camera_line,
         "fingerprint": dict(data.run_metadata.get("fingerprint", {})),
         "pipeline": data.pipeline.text,
-    }
+    })
+    for path in paths:
+        write_output_file(Path(path), f"{to_json(content, indent=1)}\n".encode())
+    return models, content
+
+
+def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
+    """Write the error models of a store into files; return their table and warnings."""
+    models, content = written_error_models(data, paths)
+    return Findings(
+        [error_model_table(models),
+         *(f"- {line}" for line in (*exponent_lines(models), *warnings_of(models)))],
+        content, models, 0,
+        (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
 
 
 # The table.
@@ -250,77 +237,41 @@ CAPTION = (
     "Standard deviation (95 % interval) and bias of the error of poses without flips, in the sight "
     "frame: z along the line of sight"
 )
-MAX_DISTANCES, MAX_SIDES = 4, 3
-#: The table has the knots nearest to these.
-ANGLES_DEG = (0.0, 30.0, 60.0)
-
-
-def error_model_tables(data: ReportData) -> tuple[Table, ...]:
-    """Return the table of a store's error models if they were made, as `--error-model` does."""
-    models = data.made.get(error_models.__name__)
-    return () if models is None else (error_model_table(models),)
+#: Most knots of each condition that the table shows.
+SHOWN = dict(zip(PREDICTORS, (4, 3, 3), strict=True))
 
 
 def error_model_table(models: xr.Dataset) -> Table:
-    """Return a table with a row for some distances and viewing angles of each configuration."""
-    apart = names_apart(models)
-    several = ["configuration"] if len(apart) > 1 else []
-    sided = ["side, px"] if models.sizes["side_px"] > 1 else []
-    rows = [[*([name] if several else []), number(distance), *([number(side)] if sided else []),
-             *rest] for name, model in apart for distance, side, *rest in _rows(model)]
-    headings = [
-        *several, "distance, m", *sided, "viewing angle, deg",
-        "held-out check", "x, mm", "y, mm", "z, mm",
-        "rotation x, deg", "rotation y, deg", "rotation z, deg",
-        "bias of z, mm", "0.02 d² / sigma z",
-    ]
-    return Table.of(CAPTION, headings, rows, stub=len(several) + 2 + len(sided))
+    """Return a table with a row for some knots at which each configuration has poses."""
+    places = {name: np.unique(np.linspace(0, models.sizes[name] - 1, most).round().astype(int))
+              for name, most in SHOWN.items()}
+    some = models.isel(places)
+    cells = {f"cell_{name}": (name, np.searchsorted(
+        cell_edges(models, name)[1:-1], some[name].values, side="right")) for name in PREDICTORS}
+    use = some["use"].isel({name: xr.DataArray(at, dims=dim) for name, (dim, at) in cells.items()})
+    # Positions in mm, rotations in degrees.
+    scale = xr.DataArray([1e3] * 3 + [float(np.degrees(1.0))] * 3, dims="quantity")
+    columns = {f"{quantity}{end}": (scale * some[f"sigma{end}"]).sel(quantity=quantity, drop=True)
+               for quantity in QUANTITIES for end in INTERVAL}
+    sigma_z, bias_z = (some[name].sel(quantity="z", drop=True) for name in ("sigma", "bias"))
+    table = xr.Dataset(columns).assign(
+        bias=1e3 * bias_z, rule=RULE_M * some["distance_m"]**2 / sigma_z,
+        seen=(use != Use.no_poses).any("quantity").astype(int),
+        use=xr.apply_ufunc(_use, use, input_core_dims=[["quantity"]], vectorize=True,
+                           output_dtypes=[object]))
+    kept = [str(dim) for dim in models["exponent"].dims if dim != "quantity"]
+    return table_of(
+        table, CAPTION, [*kept, *PREDICTORS],
+        [Column("held-out check", "use"), *(
+            Column(f"{quantity.replace('_', ' ')}, {'deg' if 'rotation' in quantity else 'mm'}",
+                   quantity) for quantity in QUANTITIES),
+         Column("bias of z, mm", "bias"), Column("0.02 d² / sigma z", "rule")],
+        models, counted="seen")
 
 
-def _rows(model: xr.Dataset) -> Iterator[list[Any]]:
-    """Yield distance, side and cells of some knots at which the store has poses."""
-    knots = [model[name].values for name in PREDICTORS]
-    inner = [cell_edges(model, name)[1:-1] for name in PREDICTORS]
-    angles = sorted({int(np.abs(knots[2] - each).argmin()) for each in ANGLES_DEG})
-    places = {}
-    for place in itertools.product(*(range(len(each)) for each in knots[:2]), angles):
-        cell = {f"cell_{name}": int(np.searchsorted(ends, values[k], side="right"))
-                for name, ends, values, k in zip(PREDICTORS, inner, knots, place, strict=True)}
-        use = model["use"].isel(cell).values
-        if not (use == Use.no_poses).all():
-            places[place] = use
-    shown = [_spread({place[k] for place in places}, most)
-             for k, most in enumerate((MAX_DISTANCES, MAX_SIDES))]
-    scales = [1e3] * 3 + [float(np.degrees(1.0))] * 3
-    for place, use in places.items():
-        if place[0] in shown[0] and place[1] in shown[1]:
-            point = model.isel(dict(zip(PREDICTORS, place, strict=True)))
-            distance, side, angle = (values[k] for values, k in zip(knots, place, strict=True))
-            ends = zip(*(point[f"sigma{end}"].values for end in INTERVAL), strict=True)
-            sigma_z = float(point["sigma"].sel(quantity="z"))
-            yield [float(distance), float(side), number(angle), _use(use), *(
-                Value(*(scale * float(end) for end in each))
-                for scale, each in zip(scales, ends, strict=True)),
-                Value(1e3 * float(point["bias"].sel(quantity="z"))),
-                Value(RULE_M * distance**2 / sigma_z)]
-
-
-def _spread(values: set[int], most: int) -> list[int]:
-    """Return at most so many of some indices, evenly spaced."""
-    ordered = sorted(values)
-    places = np.linspace(0, len(ordered) - 1, min(len(ordered), most)).round().astype(int)
-    return [ordered[k] for k in places.tolist()]
-
-
-def _use(use: Iterable[int]) -> str:
-    """Return whether the models of a cell hold, and of which errors they do not."""
-    by_flag: dict[int, list[str]] = {}
-    for flag, name in zip(use, QUANTITIES, strict=True):
-        by_flag.setdefault(int(flag), []).append(name.replace("_", " "))
-    if len(by_flag) == 1:
-        return Use(next(iter(by_flag))).name.replace("_", " ")
-    return "; ".join(f"{', '.join(names)} {Use(flag).name.replace('_', ' ')}"
-                     for flag, names in by_flag.items() if flag != Use.holds)
+def _use(flags: Integers) -> str:
+    """Return the flags of the six errors in words."""
+    return ", ".join(Use(int(flag)).name.replace("_", " ") for flag in np.unique(flags))
 
 
 def exponent_lines(models: xr.Dataset) -> list[str]:
@@ -329,11 +280,9 @@ def exponent_lines(models: xr.Dataset) -> list[str]:
     lines = []
     for name, model in names_apart(models):
         z = model.sel(quantity="z")
-        power, low, high = (float(z[f"exponent{end}"]) for end in INTERVAL)
-        if np.isfinite(power):
-            fits = (z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all()
-            lines.append(
-                f"{name}: sigma of z goes with the {of} to the power {number(power)} "
-                f"({interval_text(low, high)})"
-                + ("" if fits else "; a power law does not describe it, the knots do"))
+        power = Value(*(float(z[f"exponent{end}"]) for end in INTERVAL))
+        fits = (z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all()
+        if np.isfinite(power.value):
+            lines.append(f"{name}: sigma of z goes with the {of} to the power {power}" + (
+                "" if fits else "; a power law does not describe it, the knots do"))
     return lines

@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
 
 from sweep.report.output_file import write_output_file
@@ -77,8 +76,11 @@ MAX_OWN_TICKS = 7
 #: Up to this many points that are not on the front have their names beside them.
 MAX_NAMED = 8
 
-#: Size of the names beside points; a letter is about 0.6 of it wide.
+#: Size of the names beside points.
 NAME_PT = 8
+
+#: Ends of an axis of shares, %.
+SHARES = (-3.0, 103.0)
 
 #: A line that marks a reference, such as a bound.
 REFERENCE: dict[str, Any] = {
@@ -137,8 +139,9 @@ class Figure:
         rows = self.table.frame.to_dict("records")
         by = [self.by] if self.by else []
         if not self.x or any(isinstance(row[self.x], str) for row in rows):
-            names = [", ".join(cell_text(row[name]) for name in stub) for row in rows[: self.rows]]
-            dots = [{**row, PLACE: k} for k, row in enumerate(rows[: self.rows])]
+            rows = rows[: self.rows]
+            names = [", ".join(cell_text(row[name]) for name in stub) for row in rows]
+            dots = [{**row, PLACE: k} for k, row in enumerate(rows)]
             by = [] if self.by in stub else by
             return [Panel(heading_title(curve), self._lines(curve, dots, PLACE, by), "", curve,
                           names) for curve in curves]
@@ -155,13 +158,11 @@ class Figure:
         for label, part in itertools.islice(_groups(rows, by).items(), MAX_LINES):
             known = sorted((row for row in part if not math.isnan(value_of(row[curve.heading])[0])),
                            key=lambda row: position(row[x]))
-            style = "points" if x == PLACE else "line"
-            if self.labels:
-                style = "steps" if label == self.by else "points"
             numbers = np.array([(position(row[x]), *value_of(row[curve.heading])) for row in known])
             at, values, low, high = numbers.reshape(-1, 4).T
             texts = [cell_text(row[self.labels]) for row in known] if self.labels else []
-            lines.append(Line(label, at, values, low, high, texts, style))
+            lines.append(Line(label, at, values, low, high, texts, joined=(
+                x != PLACE and (not self.labels or label == self.by))))
         return lines
 
 
@@ -172,7 +173,7 @@ PLACE = "place"
 class Line(NamedTuple):
     """Values (n,) along a line, or in rows of dots, with the ends of their intervals or NaN.
 
-    ``style`` is "line", "points" or "steps".
+    ``texts`` are the names of the points; of a line whose points have names the joins are steps.
     """
 
     label: str
@@ -181,7 +182,7 @@ class Line(NamedTuple):
     low: Floats
     high: Floats
     texts: Sequence[str]
-    style: str
+    joined: bool
 
 
 def _groups(
@@ -202,8 +203,7 @@ def _named(heading: str, cell: Any) -> str:
     if isinstance(cell, str):
         return cell
     words, _, unit = heading.rpartition(", ")
-    text = cell_text(cell)
-    return f"{words} {text}\u00b0" if unit == "deg" else f"{words or heading} {text}"
+    return f"{words or heading} {cell_text(cell)}" + "\u00b0" * (unit == "deg")
 
 
 def position(cell: Any) -> float:
@@ -275,11 +275,7 @@ class Panel:
     def draw(self, axes: Axes) -> None:
         """Draw it on empty axes; infinite values stand at the edge."""
         rows, curve = bool(self.names), self.curve
-        logarithmic, limits = value_scale(self.lines, share=curve.share, level=curve.level)
-        along = "x" if rows else "y"
-        axes.set(**{f"{along}scale": "log" if logarithmic else "linear", f"{along}lim": limits,
-                    f"{along}label": curve.heading})
-        plain_ticks(axes.xaxis if rows else axes.yaxis, logarithmic=logarithmic, share=curve.share)
+        limits = set_scale(axes, "x" if rows else "y", self.lines, curve)
         if rows:
             axes.set_ylim(len(self.names) - 0.4, -0.6)
             axes.set_yticks(range(len(self.names)), [
@@ -288,10 +284,8 @@ class Panel:
             axes.tick_params(axis="y", length=0)
         else:
             x = np.unique(np.concatenate([line.at for line in self.lines]))
-            logarithmic = is_logarithmic(x)
-            axes.set(xscale="log" if logarithmic else "linear", xlabel=self.place,
-                     xlim=value_limits(x, logarithmic=logarithmic, margin=0.05))
-            plain_ticks(axes.xaxis, logarithmic=logarithmic)
+            set_ends(axes, "x", x, margin=0.05, logarithmic=is_logarithmic(x))
+            axes.set_xlabel(self.place)
             if 0 < x.size <= MAX_OWN_TICKS and not any(line.texts for line in self.lines):
                 axes.set_xticks(x, coordinates(x.tolist()))
         axes.grid(visible=True, axis="x" if rows else "both")
@@ -305,10 +299,13 @@ class Panel:
                       va="center", color=FAINT)
         for artist in (*axes.lines, *axes.collections):
             artist.set_in_layout(False)  # the labels alone are laid out
-        _name_points(axes, [
-            (x, min(y, limits[1]), text) for line in self.lines
-            if line.style == "steps" or len(line.texts) <= MAX_NAMED
-            for x, y, text in zip(line.at, line.values, line.texts, strict=False)])
+        for line in self.lines:
+            if line.joined or len(line.texts) <= MAX_NAMED:
+                for k, (x, y, text) in enumerate(zip(
+                        line.at, line.values, line.texts, strict=False)):
+                    # Names of neighbours stand on either side of their points.
+                    axes.annotate(text, (x, min(y, limits[1])), (5, (-11, 4)[k % 2]),
+                                  textcoords="offset points", fontsize=NAME_PT, color=INK)
         if len(self.lines) < 2:
             axes.set_title(self.title)
             return
@@ -325,47 +322,28 @@ def _draw_line(
 ) -> None:
     """Draw one line with its intervals, moved by some points; ``rows`` exchanges x and y."""
     shape = "oD"[number % 2] if rows else SHAPES[number % len(SHAPES)]
-    moved = offset_copy(axes.transData, axes.get_figure(root=True), shift, 0, "points")
+    look: dict[str, Any] = {
+        "color": COLOURS[number % len(COLOURS)],
+        "transform": offset_copy(
+            axes.transData, axes.get_figure(root=True), shift, 0, "points")}
     finite = np.isfinite(line.values)
     # If only one end is known, the other lies beyond all draws, at the edge.
     low = np.where(np.isnan(line.low) & ~np.isnan(line.high), -np.inf, line.low)
     high = np.where(np.isnan(line.high) & ~np.isnan(line.low), np.inf, line.high)
-    look: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)], "transform": moved}
     (axes.hlines if rows else axes.vlines)(
         line.at[finite], np.clip(low, *limits)[finite], np.clip(high, *limits)[finite],
         linewidth=1, alpha=0.8, zorder=2, **look)
     # Infinite values are gaps of a line, and hollow points at the edge.
-    clipped, joined = np.clip(line.values, *limits), line.style != "points"
     for part, values, options in (
-        (finite | joined, np.where(finite, clipped, np.nan), {
+        (finite | line.joined, np.where(finite, np.clip(line.values, *limits), np.nan), {
             "label": line.label, "markeredgecolor": PAPER, "markeredgewidth": 0.4, "zorder": 3,
-            "linestyle": DASHES[number % len(DASHES)] if joined else "",
-            "drawstyle": "steps-post" if line.style == "steps" else "default"}),
-        (np.isposinf(line.values), clipped, {
+            "linestyle": DASHES[number % len(DASHES)] if line.joined else "",
+            "drawstyle": "steps-post" if line.joined and line.texts else "default"}),
+        (np.isposinf(line.values), np.full_like(line.values, limits[1]), {
             "linestyle": "", "markerfacecolor": PAPER, "clip_on": False, "zorder": 4}),
     ):
-        at, shown = line.at[part], values[part]
-        axes.plot(*((shown, at) if rows else (at, shown)), marker=shape, markersize=5, **look,
-                  **options)
-
-
-def _name_points(axes: Axes, named: Sequence[tuple[float, float, str]]) -> None:
-    """Write names beside points, below or above, as near as other names leave room."""
-    written: list[tuple[float, float, float]] = []  # left end, right end, base line in points
-    scale = 72 / axes.figure.dpi
-    floor = axes.transAxes.transform((0, 0))[1] * scale
-    for x, y, text in named:
-        left, base = axes.transData.transform((x, y)) * scale + (5, 0)
-        right = left + 0.6 * NAME_PT * len(text)
-        offset = next(
-            (each for each in (-11, 4, -22, 15, -33, 26)
-             # The layout, which comes later, takes some of the height for legend and labels.
-             if base + each > floor and all(
-                 right < start or end < left or abs(base + each - line) > 1.6 * NAME_PT
-                 for start, end, line in written)), 4)
-        written.append((left, right, base + offset))
-        axes.annotate(text, (x, y), (5, offset), textcoords="offset points", fontsize=NAME_PT,
-                      color=INK)
+        points = line.at[part], values[part]
+        axes.plot(*points[:: -1 if rows else 1], marker=shape, markersize=5, **look, **options)
 
 
 def write_figure(figures: Sequence[Figure], path: Path) -> None:
@@ -416,64 +394,57 @@ def is_logarithmic(values: Floats) -> bool:
     return bool(np.std(factors) / np.mean(factors) <= np.std(steps) / np.mean(steps))
 
 
-def value_limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[float, float]:
-    """Return the ends of an axis with the finite values on it, and a margin (share of its length).
+def set_scale(
+    axes: Axes, name: str, lines: Sequence[Line], curve: Column
+) -> tuple[float, float]:
+    """Set the axis of a chart's values, with their intervals and the reference; return its ends.
 
-    On a logarithmic axis, values that are not positive are left out.
+    ``name``: "x" or "y".
+
+    Shares in percent have always the same axis. One with a reference at 0 is linear.
     """
-    finite = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
-    if not finite.size:
-        return 0.0, 1.0
-    if logarithmic:
-        low, high = np.log10(finite.min()), np.log10(finite.max())
-        spare = margin * max(high - low, 0.3)
-        return 10.0 ** (low - spare), 10.0 ** (high + spare)
-    low, high = float(finite.min()), float(finite.max())
-    spare = margin * (high - low) or 0.5 * abs(high) or 0.5
-    return low - spare, high + spare
-
-
-def value_scale(
-    lines: Sequence[Line], *, share: bool, level: float | None = None
-) -> tuple[bool, tuple[float, float]]:
-    """Return whether the axis of a chart's values is logarithmic, and its ends.
-
-    Parameters
-    ----------
-    lines
-        Values with their intervals.
-    share
-        Whether the values are shares in percent, whose axis is always the same.
-    level
-        A reference that must lie on the axis, too; with 0 the axis is linear.
-    """
-    if share:
-        return False, (-3.0, 103.0)
-    values = np.concatenate(
-        [line.values for line in lines] + [[] if level is None else [level]])
+    axes.set(**{f"{name}label": curve.heading})
+    if curve.share:
+        axes.set(**{f"{name}lim": SHARES, f"{name}ticks": [0, 25, 50, 75, 100]})
+        return SHARES
+    level = [] if curve.level is None else [curve.level]
+    values = np.concatenate([*(line.values for line in lines), level])
     ends = np.concatenate([end for line in lines for end in (line.low, line.high)])
-    logarithmic = spans(values, LOGARITHMIC_FROM) and (level is None or level > 0)
+    logarithmic = spans(values, LOGARITHMIC_FROM) and level != [0]
     if logarithmic:
         positive = values[np.isfinite(values) & (values > 0)]
         lowest = max(positive.min(), FLOOR_RATIO * positive.max())
         values = values[values >= lowest]
         # Long intervals are cut off, so that they do not compress everything else.
         ends = ends[(ends > lowest / 10) & (ends < positive.max() * 10)]
-    everything = np.concatenate([values, ends])
-    low, high = value_limits(everything, logarithmic=logarithmic, margin=0.08)
-    if not logarithmic and everything[np.isfinite(everything)].min(initial=0) >= 0:
-        low = 0.0
-    return logarithmic, (low, high)
+    return set_ends(axes, name, np.concatenate([values, ends]), margin=0.08,
+                    logarithmic=logarithmic, from_zero=True)
 
 
-def plain_ticks(axis: Axis, *, logarithmic: bool, share: bool = False) -> None:
-    """Give an axis few ticks at round values, written without powers of ten."""
-    if share:
-        axis.set_ticks([0, 25, 50, 75, 100])
-    if not logarithmic:
-        return
-    low, high = axis.get_view_interval()
-    subs = (1, 2, 5) if high < 60 * low else (1, 3) if high < 1000 * low else (1,)
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+def set_ends(
+    axes: Axes, name: str, values: Floats, *, margin: float, logarithmic: bool,
+    from_zero: bool = False,
+) -> tuple[float, float]:
+    """Set the scale of an axis, its ends around the finite values, and few plain ticks.
+
+    ``margin`` is a share of its length. ``from_zero``: a linear axis without negative values begins
+    there.
+    """
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        low, high = 0.0, 1.0
+    elif logarithmic:
+        spare = max(finite.max() / finite.min(), 2.0) ** margin
+        low, high = float(finite.min() / spare), float(finite.max() * spare)
+    else:
+        low, high = float(finite.min()), float(finite.max())
+        spare = margin * (high - low) or 0.5 * abs(high) or 0.5
+        low, high = 0.0 if from_zero and low >= 0 else low - spare, high + spare
+    axes.set(**{f"{name}scale": "log" if logarithmic else "linear", f"{name}lim": (low, high)})
+    if logarithmic:
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        subs = (1, 2, 5) if high < 60 * low else (1, 3) if high < 1000 * low else (1,)
+        axis.set_major_locator(LogLocator(subs=subs))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter("{x:g}")
+    return low, high

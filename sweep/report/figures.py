@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import (
-    ambiguity,
-    detection_rate,
-    efficiency,
-    error_statistics,
-    failure_composition,
-    marker_ranking,
-    per_marker,
-    precision_reached,
-)
+from sweep import analysis
 from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.dataset import of_photographs
 from sweep.analysis.decisions import Reached
@@ -30,21 +20,12 @@ from sweep.experiment.experiment import used_settings
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.report import report_data
 from sweep.report.comparison import trade_lines
+from sweep.report.cost_tables import trade_figure
 from sweep.report.figure import MAX_LINES, Figure
-from sweep.report.report_data import (
-    AREA,
-    CONFIGURATION,
-    IDS,
-    Groups,
-    ReportData,
-    configurations,
-    course_of,
-    grouped,
-    notes_of,
-)
+from sweep.report.report_data import AREA, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.table import Column, Table, table_of
-from sweep.report.tradeoff_figure import trade_figure
 from sweep.tradeoff.pareto import configuration_label
 
 # --------------------------------------------------------------------------------------------------
@@ -59,7 +40,7 @@ ROTATION_MEDIAN = Column("rotation median, deg", "rotation_median_deg")
 ROTATION_P95 = Column("rotation p95, deg", "rotation_p95_deg")
 RANGE_MEDIAN = Column("range median, %", "range_median_percent")
 RANGE_P95 = Column("range p95, %", "range_p95_percent")
-RANGE_BIAS = Column("range bias, %", "range_bias_percent", level=0.0)
+RANGE_BIAS = Column("range bias without flips, %", "range_bias_percent", level=0.0)
 RATES = (LOOKED_FOR, DETECTED)
 ERROR_CURVES = (ROTATION_MEDIAN, ROTATION_P95, RANGE_MEDIAN, RANGE_P95)
 ERRORS = (
@@ -143,7 +124,8 @@ def figure(
             text,
             f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
             "over the whole grid; the table has all." if dims and count > MAX_LINES else "",
-            notes_of(data, groups), data.pooled(*dims, *configurations(data).axes)),
+            report_data.notes_of(data, groups),
+            data.pooled(*dims, *report_data.configurations(data).axes)),
         configuration_table(data, summary, dims, caption, columns, counted), curves,
         data.label(dims[-1]) if dims else "", by, covers=covers)
 
@@ -170,7 +152,7 @@ def _along(data: ReportData, name: str) -> Figure:
         most = MAX_ANGLE_PANELS if several else MAX_ANGLES
         groups = {**data.along(data.angle_axis, most), **groups}
     return figure(
-        data, grouped(data, error_statistics, groups), groups, f"by-{name}",
+        data, grouped(data, analysis.error_statistics, groups), groups, f"by-{name}",
         f"Rates and errors by {data.words(name)}",
         f"Share of the poses looked for in which the {target} is detected"
         + (", by at least one marker" * (target != "marker")) + ", median and 95 % quantile (p95) "
@@ -185,12 +167,12 @@ def signed_error_statistics(
     results: xr.Dataset, per: Sequence[str], bins: Bins
 ) -> xr.Dataset:
     """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
-    return error_statistics(results, per, bins, SIGNED_GROUPS)
+    return analysis.error_statistics(results, per, bins, SIGNED_GROUPS)
 
 
 def _bias(data: ReportData) -> Figure | None:
     """Return the figure of bias along sizes, other numbers, or angles."""
-    along = course_of(data)[0]
+    along = report_data.course_of(data)[0]
     if along in (None, data.angle_axis):
         along = data.size or data.angle_axis
     if along is None:
@@ -211,7 +193,7 @@ MIN_DRAWN = 3
 
 
 def _configurations(data: ReportData) -> Figure | None:
-    known = configurations(data)
+    known = report_data.configurations(data)
     if not known.several:
         return None
     axes = {axis.name: axis for axis in data.pipeline.axes}
@@ -242,7 +224,7 @@ def _outcomes(data: ReportData) -> Figure:
              if name is not None and name != IDS
              and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
     groups = data.along(names[0], MAX_BARS) if names else {}
-    summary = grouped(data, failure_composition, groups)
+    summary = grouped(data, analysis.failure_composition, groups)
     counts = summary["count"].sum([name for name in summary["count"].dims if name != "outcome"])
     count_of = {name: count for name, count in zip(
         counts["outcome"].values.tolist(), counts.values.tolist(), strict=True) if count}
@@ -263,38 +245,32 @@ def _outcomes(data: ReportData) -> Figure:
 # The place in the frame.
 
 ACROSS, DOWN = "frame_u_percent", "frame_v_percent"
-FRAME_COLUMNS, FRAME_ROWS = 8, 4
-#: From this range of places on, in percent of the frame's width, there is a figure.
-MIN_RANGE_PERCENT = 10.0
-
-TRUE = "true_tvec_m"
+#: Parts of the frame along each of the two, in percent of its sides.
+PARTS = {DOWN: 4, ACROSS: 8}
 
 
 def _frame(data: ReportData) -> Figure | None:
     """Return the figure of the detection rate over the frame of a single camera without a lens."""
-    fixed = data.pipeline.fixed
-    if (TRUE not in data.results or fixed.get("distortion")
-            or any(name not in fixed for name in VIEW_PARAMETERS)):
+    pipeline, fixed = data.pipeline, data.pipeline.fixed
+    moved = any(pipeline.axis_of(name) or name in pipeline.distributions
+                for name in ("bearing_x_deg", "bearing_y_deg"))
+    if not moved or fixed.get("distortion") or any(name not in fixed for name in VIEW_PARAMETERS):
         return None
     fx, fy, cx, cy = map(float, intrinsics(*(fixed[name] for name in VIEW_PARAMETERS)))
-    x, y, z = (data.results[TRUE].isel(xyz=k, drop=True) for k in range(3))
+    x, y, z = (data.results["true_tvec_m"].isel(xyz=k, drop=True) for k in range(3))
     ahead = z.where(z > 0)
     place = {ACROSS: 100 * (fx * x / ahead + cx + 0.5) / fixed["width_px"],
              DOWN: 100 * (fy * y / ahead + cy + 0.5) / fixed["height_px"]}
-    ranges = data.once("ranges in the frame", lambda: xr.Dataset(
-        {name: share.max() - share.min() for name, share in place.items()}))
-    if not max(float(each) for each in ranges.values()) >= MIN_RANGE_PERCENT:
-        return None
 
     def over_frame(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-        return detection_rate(results.assign(place), per, bins)
+        return analysis.detection_rate(results.assign(place), per, bins)
 
     cells = {name: (*np.linspace(0, 100, count + 1)[:-1].tolist(), float(np.nextafter(100, 101)))
-             for name, count in ((DOWN, FRAME_ROWS), (ACROSS, FRAME_COLUMNS))}
+             for name, count in PARTS.items()}
     return figure(
         data, grouped(data, over_frame, cells, (Stage.detection,)), dict.fromkeys(cells), "frame",
         "Detection by place in the frame",
-        f"Detection rate by the place of the {data.pipeline.target_word}'s centre in the frame, "
+        f"Detection rate by the place of the {pipeline.target_word}'s centre in the frame, "
         "in percent of its width and height from the top left corner.", "Detection rate by place",
         RATES, [DETECTED], by=data.label(DOWN))
 
@@ -307,40 +283,37 @@ def _ranking(data: ReportData) -> Figure | None:
     """Return the weakest marker IDs of the first configuration's detector."""
     if data.length(IDS) < 2:
         return None
-    known = configurations(data)
+    known = report_data.configurations(data)
     settings = {axis.name for axis in data.pipeline.axes_of(Stage.detection)} & known.axes.keys()
     index = {name: known.axes[name][k] for name, k in known.combinations[0].items()
              if name in settings}
     values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
     whose = f": {configuration_label(used_settings(data.pipeline, values))}" if index else ""
-    summary = data.once("marker_ranking", lambda: marker_ranking(data.results.isel(index)))
+    summary = data.once(
+        "marker_ranking", lambda: analysis.marker_ranking(data.results.isel(index)))
     dims = [name for name in ("dictionary", IDS) if name in summary["detection_rate"].dims]
-    ranked = summary.stack(marker=dims, create_index=False)
-    ranked = ranked.isel(marker=ranked["looked_for"].values > 0)
-    ranked = ranked.isel(marker=np.lexsort(
-        (ranked[IDS].values, ranked["detection_rate"].values, ~ranked["weak"].values)))
-    names = [" ".join(map(str, each)) for each in zip(
-        *(ranked[dim].values.tolist() for dim in dims), strict=True)]
-    columns = (*RATES, Column("expected, %", "expected_rate", 100),
-               Column("p, adjusted", "p_adjusted"), Column("weak", "weak"))
-    table = table_of(ranked.assign_coords(marker=names), "IDs by detection rate, with 95 % "
-                     "intervals", ["marker"], columns)
+    table = table_of(summary, "IDs by detection rate, with 95 % intervals", dims, (
+        *RATES, Column("expected, %", "expected_rate", 100), Column("p, adjusted", "p_adjusted"),
+        Column("weak", "weak")), data.results, counted="looked_for")
+    rates, weak = table.column(DETECTED.heading), table.column("weak")
+    order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k].value))
     return Figure(
         "ranking", f"Marker IDs, the weakest first{whose}", sentences(
-            f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. "
-            f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
+            f"Detection rates of the {min(WEAKEST, len(weak))} weakest IDs. "
+            f"{sum(weak):,} of {len(weak):,} IDs are weak (diamonds): below the "
             "rate expected if all were alike, with an adjusted p-value under 0.05.",
             data.pooled(*dims)),
-        table, [DETECTED], by="weak", rows=WEAKEST, covers=(IDS,))
+        dataclasses.replace(table, frame=table.frame.iloc[order]), [DETECTED], by="weak",
+        rows=WEAKEST, covers=(IDS,))
 
 
 SIZE_COLUMNS = 12
 
 
 def error_over_bound(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-    """Return RMSE over bound, the inverse of efficiency, with the ends of its intervals."""
+    """Return RMSE over bound, the inverse of the efficiency, with the ends of its intervals."""
     # Computed first: of a store without errors the efficiency is 0, and the ratio infinite.
-    summary = efficiency(results, per, bins).compute()
+    summary = analysis.efficiency(results, per, bins).compute()
     with np.errstate(divide="ignore"):
         ratios: dict[str, Any] = {
             f"{quantity}_over_bound{end}": 1 / summary[f"{quantity}_efficiency{other}"]
@@ -396,7 +369,7 @@ def _ambiguity(data: ReportData) -> Figure | None:
     if angles is not None and not data.once(
             "largest angle", lambda: float(angles.max())) > FRONTAL_DEG:
         return None
-    pooled = grouped(data, ambiguity)
+    pooled = grouped(data, analysis.ambiguity)
     curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values
                             & (pooled["flipped"] > 0).values)
     if not curved.size:
@@ -422,7 +395,7 @@ def threshold_tables(data: ReportData) -> list[Table]:
         return []
     along = data.size or data.angle_axis
     groups = data.along(along, CONDITIONS) if along else {}
-    table = grouped(data, ambiguity, groups)
+    table = grouped(data, analysis.ambiguity, groups)
     words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
     choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
     wanted = 100 * float(table.attrs["flip_rate"])
@@ -452,38 +425,45 @@ def figures_of(data: ReportData) -> list[Figure]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Tables of errors, of boards' markers, and of the precision that was reached.
-
-#: The most rows of a table of all detector settings.
-MAX_TABLE_ROWS = 40
+# Tables of errors, of boards' markers, of thresholds, and of the precision that was reached.
 
 #: Quantity in the names of errors -> its name in words, and its unit in those names.
-QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
-              "position": ("position", "m")}
+QUANTITIES = {"rotation": ("rotation, deg", "deg"), "range": ("range (depth), %", "percent"),
+              "position": ("position, m", "m")}
 
 
-def board_tables(data: ReportData) -> list[Table]:
+def tables_of(data: ReportData, errors: xr.Dataset, name: str) -> list[Table]:
+    """Return the tables below a report's figures.
+
+    Parameters
+    ----------
+    data
+        The store.
+    errors, name
+        The statistics of the errors of the configuration that is named, and its label.
+    """
+    rule, boards = data.pipeline.stopping, "marker_detection" in data.results
+    return [
+        *([board_table(data)] if boards else []),
+        errors_table(errors, name),
+        configuration_table(
+            data, grouped(data, signed_error_statistics), (),
+            "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
+        *threshold_tables(data),
+        *([precision_table(data.once(
+            "precision_reached", lambda: analysis.precision_reached(data.results)))]
+          if rule is not None and rule.precision else [])]
+
+
+def board_table(data: ReportData) -> Table:
     """Return the rates of boards' single markers, by board and detector setting."""
-    if "marker_detection" not in data.results:
-        return []
-    board = data.pipeline.axis_of(BOARDS)
-    boards = [board.name] if board is not None and len(board) > 1 else []
-    settings = [axis.name for axis in data.pipeline.axes_of(Stage.detection) if len(axis) > 1]
-    if math.prod(data.length(name) for name in (*boards, *settings)) > MAX_TABLE_ROWS:
-        settings = []
-    dims = [*boards, *settings]
-    rates = data.once(("markers of boards", *dims),
-                      lambda: detection_rate(per_marker(data.results), dims))
-    return [table_of(
+    axes = [data.pipeline.axis_of(BOARDS), *data.pipeline.axes_of(Stage.detection)]
+    dims = [axis.name for axis in axes if axis is not None and len(axis) > 1]
+    rates = data.once(("markers of boards", *dims), lambda: analysis.detection_rate(
+        analysis.per_marker(data.results), dims))
+    return table_of(
         rates, "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
-        sources=data.results)]
-
-
-def signed_errors_table(data: ReportData) -> Table:
-    """Return bias and spread in the camera's frame, with a row for each configuration."""
-    return configuration_table(
-        data, grouped(data, signed_error_statistics), (),
-        "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved")
+        data.results)
 
 
 def errors_table(errors: xr.Dataset, name: str) -> Table:
@@ -494,20 +474,9 @@ def errors_table(errors: xr.Dataset, name: str) -> Table:
             for quantity, (_, unit) in QUANTITIES.items()
             for variable in [f"{quantity}_{statistic}_{unit}"])]
         for heading, statistic in ERROR_HEADINGS.items()]
-    headings = [f"{words}, {'%' if unit == 'percent' else unit}"
-                for words, unit in QUANTITIES.values()]
     whose = f", with {name}" if name else ""
     return Table.of(f"Errors over the whole grid{whose}, with 95 % intervals",
-                    ["statistic", *headings], rows)
-
-
-def precision_tables(data: ReportData) -> list[Table]:
-    """Return the precision that a run reached, by quantity and configuration."""
-    rule = data.pipeline.stopping
-    if rule is None or not rule.precision:
-        return []
-    return [precision_table(data.once(
-        "precision_reached", lambda: precision_reached(data.results)))]
+                    ["statistic", *(words for words, _ in QUANTITIES.values())], rows)
 
 
 def precision_table(table: xr.Dataset) -> Table:
@@ -518,8 +487,8 @@ def precision_table(table: xr.Dataset) -> Table:
     known = reached.isin((Reached.reached, Reached.not_reached))
     counts = {each.name: (reached == each).sum(pooled) for each in Reached}
     return table_of(
-        xr.Dataset(counts | {"wanted": table["wanted"],
-                             "widest": table["half_width"].where(known).max(pooled)}),
+        table[["wanted"]].assign(
+            counts | {"widest": table["half_width"].where(known).max(pooled)}),
         f"Precision of {run.size:,} conditions, which took {int(run.min()):,} to "
         f"{int(run.max()):,} poses each: conditions by what was reached; of rates the "
         "half-width of the interval, of others relative to the value (bias: to the RMSE)",

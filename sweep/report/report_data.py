@@ -222,6 +222,21 @@ class ReportData:
         found: T = self.made[key]
         return found
 
+    def by(
+        self, axes: Mapping[str, list[int]], analysis: Analysis, groups: Groups | None = None
+    ) -> xr.Dataset:
+        """Return an analysis at some values of axes and by groups of poses, computed once.
+
+        Axes of settings that have a single value are no dimensions of it.
+        """
+        groups = groups or {}
+        per = [*axes, *(name for name, edges in groups.items() if edges is None)]
+        bins = {name: edges for name, edges in groups.items() if edges is not None}
+        table = self.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
+            self.results.isel(axes), per=per, bins=bins))
+        single = {axis.name: 0 for axis in self.pipeline.axes_of(*BOTH) if len(axis) == 1}
+        return table.isel(single, drop=True, missing_dims="ignore")
+
 
 def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
     """Return how requirements are followed over the conditions.
@@ -374,8 +389,7 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
     every = [dict(zip(axes, index, strict=True))
              for index in itertools.product(*map(range, counts.values()))]
     kept, labels = _labelled(data, axes, every)
-    table = data.once(("errors", *axes), lambda: error_statistics(
-        data.results.isel(axes), per=list(axes)))
+    table = data.by(axes, error_statistics)
     summary = stacked(table, kept, labels)
     flags = np.reshape(wrong_configurations(data.pipeline, settings), list(map(len, settings)))
     wrong = np.array([flags[tuple(axes[axis.name][each[axis.name]] for axis in settings)]
@@ -432,10 +446,7 @@ def grouped(
     axes = {name: some for name, some in known.axes.items() if name in compared}
     places = dict.fromkeys(tuple(each[name] for name in axes) for each in known.combinations)
     kept, labels = _labelled(data, axes, [dict(zip(axes, each, strict=True)) for each in places])
-    per = [*axes, *(name for name, edges in groups.items() if edges is None)]
-    bins = {name: edges for name, edges in groups.items() if edges is not None}
-    table = data.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
-        data.results.isel(axes), per=per, bins=bins))
+    table = data.by(axes, analysis, groups)
     return stacked(table, kept, labels).transpose(CONFIGURATION, *groups, ...)
 
 

@@ -81,8 +81,11 @@ def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
         First line of the caption: the pose on its grid. Then come what was drawn at random, flags
         and errors, and the legend.
     """
+    drawn = ", ".join(
+        f"{name} {float(value):.5g}" for name, value in scene.values.items()
+        if name not in VARIABLES and value.ndim == 0)
     encoded = scene_png(scene, "\n".join(filter(
-        None, [title, _drawn_text(scene), result_text(scene)])))
+        None, [title, f"drawn: {drawn}" * bool(drawn), result_text(scene)])))
     return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR),
                       dtype=np.uint8)
 
@@ -117,10 +120,12 @@ def _draw(axes: Axes, scene: SceneInspection) -> None:
     extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
     axes.imshow(scene.image, cmap="gray", vmin=0, vmax=255, interpolation="nearest", extent=extent)
     several = len(scene.true_markers) > 1
+    other = [quad for _, quad in scene.decoded
+             if not np.isclose(quad, scene.markers, atol=0.01).all(axis=(1, 2)).any()]
     found = scene.markers[np.isfinite(scene.markers).all(axis=(1, 2))]
     for label, quads, thickness in (
         ("rejected candidate", scene.rejected, 1.0),
-        ("other detection", other_quadrilaterals(scene), 1.5),
+        ("other detection", other, 1.5),
         ("true outline", scene.true_markers, 2.0 if several else 3.5),
         ("detected corners (dot: the first)", found, 1.0 if several else 1.5),
     ):
@@ -177,22 +182,6 @@ def cut_to_marker(scene: SceneInspection) -> SceneInspection:
         scene, image=np.ascontiguousarray(image), window=(int(x0), int(y0), int(x1), int(y1)))
 
 
-def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
-    """Return the decoded quadrilaterals that are not the scene's markers."""
-    return [
-        quad for _, quad in scene.decoded
-        if not np.isclose(quad, scene.markers, atol=0.01).all(axis=(1, 2)).any()
-    ]
-
-
-def _drawn_text(scene: SceneInspection) -> str:
-    """Return the values drawn at random for the scene; empty if there are none."""
-    drawn = ", ".join(
-        f"{name} {float(value):.5g}" for name, value in scene.values.items()
-        if name not in VARIABLES and value.ndim == 0)
-    return f"drawn: {drawn}" if drawn else ""
-
-
 # --------------------------------------------------------------------------------------------------
 # Values of one cell as lines of text, with the stored values beside them.
 
@@ -203,11 +192,11 @@ def value_table(
     """Return a row for each variable: the recomputed value, and the stored one if it differs."""
     rows = []
     for variable in variables:
-        value = recomputed[variable.name]
-        text, beside = _text_scene_values(variable, value), ""
+        value, beside = recomputed[variable.name], ""
+        text = _value_text(variable, value)
         if stored is not None and variable.name in stored:
             other = stored[variable.name]
-            beside = _text_scene_values(variable, other)
+            beside = _value_text(variable, other)
             if beside == text:
                 same = np.array_equal(value, other, equal_nan=variable.flags is None)
                 beside = "" if same else "other last digits"
@@ -219,18 +208,17 @@ def value_table(
 MAX_NUMBERS = 12
 
 
-def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
+def _value_text(variable: Variable, value: NDArray[Any]) -> str:
     if variable.flags is not None:
         names = Counter(variable.flags(int(flag)).name for flag in np.ravel(value))
-        return next(iter(names)) if np.ndim(value) == 0 else ", ".join(
-            f"{count} {name}" for name, count in names.items())
-    if value.size > MAX_NUMBERS:
-        known = value[np.isfinite(value)]
-        if not known.size:
-            return f"{value.size} x nan"
-        return (f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
-                f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
-    return " ".join(coordinate(float(number)) for number in value.ravel())
+        return ", ".join(f"{count} {name}" if np.ndim(value) else str(name)
+                         for name, count in names.items())
+    if value.size <= MAX_NUMBERS:
+        return " ".join(coordinate(float(number)) for number in value.ravel())
+    known = value[np.isfinite(value)]
+    return f"{value.size} x nan" if not known.size else (
+        f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
+        f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -266,17 +254,15 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
         "worst without a flip": (solved & ~flipped, error),
         "flipped to the mirrored pose": (solved & flipped & (error > MIN_FLIP_DEG), area),
     }
-    failures = dict[str, tuple[Flag, NDArray[Any]]]()
-    stages: tuple[tuple[type[Flag], NDArray[Any]], ...] = (
-        (DetectionStatus, detection), (EstimateStatus, estimate))
-    for flags, column in stages:
-        for flag in flags:
-            if flag.counted and flag.ends and flag is not EstimateStatus.solved:
-                # A failure of the detection is flagged in the estimate, too: it is shown once.
-                failures.setdefault(flag.name, (flag, column == flag))
-    for name, (failure, mask) in failures.items():
+    failures: dict[str, Flag] = {}
+    for flag in (*DetectionStatus, *EstimateStatus):
+        if flag.counted and flag.ends and flag is not EstimateStatus.solved:
+            # A failure of the detection is flagged in the estimate, too: it is shown once.
+            failures.setdefault(flag.name, flag)
+    for name, failure in failures.items():
+        column = detection if isinstance(failure, DetectionStatus) else estimate
         meaning = f"{failure.meaning[:1].lower()}{failure.meaning[1:]}".removesuffix(".")
-        kinds[f"{name.replace('_', ' ')}: {meaning}"] = mask, area
+        kinds[f"{name.replace('_', ' ')}: {meaning}"] = column == failure, area
     shape = [results.sizes[dim] for dim in dims]
     for title, (mask, merit) in kinds.items():
         rows = np.flatnonzero(mask)
@@ -350,7 +336,6 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
     try:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
-        scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
         picture = scene_png(cut_to_marker(inspected))  # the page has a caption of its own
         # The store may be another machine's: as `sweep verify`, within the tolerances for those.
         difference = compare(inspected.values, stored, data.pipeline.experiment.variables,
@@ -359,12 +344,10 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
     result = result_text(inspected)
-    return dataclasses.replace(
-        scene, result=result, picture=picture,
-        problem=f"Differs from the store: {difference}." if difference else "",
-        alt=f"Rendered {data.pipeline.target_word} with its true outline and the detections: "
-            f"{result}",
-    )
+    return Scene(
+        titles, coordinates_text(data.pipeline, single), command, result,
+        f"Rendered {data.pipeline.target_word} with its true outline and the detections: {result}",
+        picture, f"Differs from the store: {difference}." if difference else "")
 
 
 def pipeline_file(pipeline: Pipeline) -> str:

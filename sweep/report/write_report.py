@@ -10,6 +10,7 @@ import re
 import shlex
 import time
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,16 +20,154 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.grid import Axis
-from sweep.messages import label, quoted
+from sweep.messages import byte_count, label, quoted
 from sweep.report.answer import Answer, answer
+from sweep.report.error_model_file import check_error_model_file, written_error_models
 from sweep.report.figure import Figure, Panel, panels_file
 from sweep.report.figures import figures_of
-from sweep.report.output_file import check_output_file, write_errors_explained, write_output_file
-from sweep.report.report_data import ReportData
+from sweep.report.output_file import (
+    check_output_file,
+    is_standard_stream,
+    write_errors_explained,
+    write_output_file,
+)
+from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.scenes import LEGEND, Scene, pipeline_file, scenes_of
-from sweep.report.table import Table, coordinates, markdown_text
+from sweep.report.table import Findings, Table, coordinates, markdown_text, plural
 from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store
+
+FORMS = ("html", "md")
+PICTURES = (".svg", ".png")
+
+#: Suffixes of files that neither HTML nor Markdown would be taken for.
+NO_REPORTS = {
+    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
+}
+
+
+def write_report(
+    store: str | PathLike[str], output: str | PathLike[str] | None = None, *,
+    require: Sequence[str] = (), per: Sequence[str] | None = None, form: str | None = None,
+    figures: str | PathLike[str] | None = None, error_model: Sequence[str] = (),
+    command: str = "",
+) -> Findings:
+    """Write the report of a store: answer, figures, example scenes.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    output
+        File to write (default: ``report.html``, or ``report.md`` with the form "md").
+    require, per
+        As for :func:`require`: the report begins with whether, and how far, it is met.
+    form
+        "html": one page; "md": Markdown with its figures and scenes in a folder beside it, named
+        as the file with ``_figures`` in place of the suffix (default: by the file's suffix).
+    figures
+        Folder into which each figure is written as SVG and PNG, too.
+    error_model
+        JSON files of the error models to write, too.
+    command
+        The command line that asked for it, which the report shows.
+
+    Returns
+    -------
+    Findings
+        The first line and the numbers of the report.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, or written; files are written after all of them were made.
+
+    Examples
+    --------
+    >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
+    >>> found.numbers["figures"], (folder / "report.html").exists()
+    (4, True)
+    """
+    output, figures = (None if each is None else os.fspath(each) for each in (output, figures))
+    for name, value in (("output", output), ("figures", figures)):
+        if value is not None and not value.strip():
+            raise ArgumentError(name, repr(value), "expected a name")
+    for path in error_model:
+        check_error_model_file(path)
+    if Path(output or "").suffix.lower() in NO_REPORTS:
+        raise ArgumentError("output", output, "expected a file that ends in .html or .md")
+    form = form or ("md" if str(output).lower().endswith(".md") else "html")
+    if form not in FORMS:
+        raise ArgumentError("form", form, f"expected one of {', '.join(FORMS)}")
+    file = Path(output or f"report.{form}")
+    beside = file.with_name(f"{file.stem}_figures") if form == "md" else None
+    folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
+    data = read_report_data(os.fspath(store), require, per, command)
+    if error_model:
+        written_error_models(data, error_model)
+    check_output(file, folders)
+    if data.results["estimate"].size == 0:
+        raise StoreError(f"{data.store}: there are no results")
+    found, drawn, scenes = answer(data), figures_of(data), list(scenes_of(data))
+    pictures = {
+        f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
+        for figure in drawn for suffix in PICTURES if folders}
+    text = page(data.pipeline.heading, found, provenance(data, str(file)), drawn, scenes,
+                data.require, "" if beside is None else beside.name)
+    for folder in folders:
+        _write_pictures(folder, pictures)
+    if beside is not None:
+        _write_pictures(beside, {
+            f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
+            if scene.picture is not None})
+    # Invalid Unicode, which a file's name may hold, is written as a question mark.
+    write_output_file(file, text.encode("utf-8", errors="replace"))
+    size = f", {byte_count(file.stat().st_size)}" if file.is_file() else ""
+    then = (f"look at {file}", "")
+    if data.trade is None and data.setting_axes:
+        then = (f"sweep tradeoff {quoted(data.store)}", "what each configuration costs")
+    content: dict[str, Any] = {
+        "report": str(file), "figures": len(drawn), "store": data.store,
+        "required": list(data.require), "per": list(data.per)}
+    # Into the page's own stream a line more would not be HTML.
+    lines = [] if is_standard_stream(file) else [
+        f"{file}: {plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
+    return Findings(lines, content | found.as_json(), None, 0, then if lines else ("", ""))
+
+
+def check_output(output: Path, folders: Sequence[Path]) -> None:
+    """Check that a report can be written, before it is computed.
+
+    Raises
+    ------
+    StoreError
+        If the output is a folder, or its folder is missing or not writable; if a folder of figures
+        is a file; or if anything would be written into a store.
+    """
+    for wanted in (output, *folders):
+        with write_errors_explained(wanted):
+            around = enclosing_store(wanted)
+        if around is not None:
+            raise StoreError(f"{wanted}: cannot be written: it is inside the store {around}")
+    check_output_file(output)
+    for folder in folders:
+        with write_errors_explained(folder):
+            if folder.is_dir():
+                check_folder_writable(folder)
+            elif os.path.lexists(folder):
+                folder.stat()  # a link that leads nowhere, or in a circle
+                raise StoreError(f"{folder}: cannot hold figures: it is a file; choose a folder")
+            else:
+                check_output_file(folder)  # it can be made
+
+
+def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
+    """Write files into a folder; files and links of their names are replaced."""
+    with write_errors_explained(folder):
+        folder.mkdir(exist_ok=True)
+        for name, content in pictures.items():
+            write_whole(folder / name, content)
+
 
 # --------------------------------------------------------------------------------------------------
 # Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
@@ -43,70 +182,51 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
         table, or None for a single pose. ``drawn``: the distributions of drawn parameters.
         ``pipeline`` and ``file``: the pipeline's text, and the name of its file.
     """
-    fingerprint: dict[str, Any] = dict(data.run_metadata.get("fingerprint", {}))
-    environment: dict[str, Any] = dict(data.run_metadata.get("environment", {}))
-    versions = ", ".join(
-        f"{name} {value}" for name, value in (
-            ("sweep", environment.get("sweep")), ("OpenCV", fingerprint.get("opencv")),
-            ("NumPy", fingerprint.get("numpy")), ("Numba", fingerprint.get("numba")),
-            ("Python", environment.get("python")),
-        ) if value
-    )
+    run, pipeline = data.run_metadata, data.pipeline
+    fingerprint: dict[str, Any] = dict(run.get("fingerprint", {}))
+    environment: dict[str, Any] = dict(run.get("environment", {}))
+    versions = {"sweep": environment.get("sweep"), "OpenCV": fingerprint.get("opencv"),
+                "NumPy": fingerprint.get("numpy"), "Numba": fingerprint.get("numba"),
+                "Python": environment.get("python")}
     files = dict(fingerprint.get("files", {}))
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
         "Store": data.store,
-        "Camera": "; ".join([data.pipeline.facts.camera_line, *data.pipeline.facts.camera_notes]),
-        "Run": _dates(data.run_metadata),
-        **({"Sampling": sampling} if (sampling := sampling_text(data.results)) else {}),
-        "Versions": versions,
+        "Camera": "; ".join([pipeline.facts.camera_line, *pipeline.facts.camera_notes]),
+        "Run": " to ".join(str(run[name]) for name in ("created", "finished_at") if name in run),
+        "Sampling": sampling_text(data.results),
+        "Versions": ", ".join(f"{name} {value}" for name, value in versions.items() if value),
         "Processor": str(environment.get("cpu", "unknown")),
-        "Seed": str(fingerprint.get("seed", data.pipeline.seed)),
+        "Seed": str(fingerprint.get("seed", pipeline.seed)),
         "Fingerprint": f"{digest[:16]} (numbers {fingerprint.get('numbers', '?')})",
-        **({"Files": ", ".join(f"{name} (SHA-256 {sha256[:12]}\u2026)"
-                               for name, sha256 in files.items())} if files else {}),
+        "Files": ", ".join(f"{name} (SHA-256 {sha256[:12]}\u2026)"
+                           for name, sha256 in files.items()),
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
     store = shlex.quote(data.store)
     trade = [] if data.trade is None else [quoted("sweep", "tradeoff", data.store, *(
         word for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
         for word in ("--per", name)))]
+    axes = [[axis.name, len(axis), _values(axis), axis.unit, _meaning(axis)]
+            for axis in pipeline.axes]
     return {
-        "facts": facts,
+        "facts": {name: text for name, text in facts.items() if text},
         "commands": (
-            f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
+            f"sweep run {pipeline_file(pipeline)} --store {store}", *trade,
             data.command or f"sweep report {store} -o {shlex.quote(output)}"),
-        "axes": _axes(data),
+        "axes": Table.of("Axes of the grid", ["axis", "values", "which", "unit", "meaning"], axes,
+                         words=True) if axes else None,
         "drawn": "; ".join(f"{name} {distribution}"
-                           for name, distribution in data.pipeline.distributions.items()),
-        "pipeline": data.pipeline.text,
-        "file": f"{data.pipeline.name}.toml",
+                           for name, distribution in pipeline.distributions.items()),
+        "pipeline": pipeline.text,
+        "file": f"{pipeline.name}.toml",
     }
-
-
-def _dates(run_metadata: Mapping[str, Any]) -> str:
-    created, finished = (
-        str(run_metadata.get(name, default)).replace("T", " ").replace("Z", " UTC")
-        for name, default in (("created", "unknown"), ("finished_at", ""))
-    )
-    return f"begun {created}" + (f", finished {finished}" if finished else "")
-
-
-def _axes(data: ReportData) -> Table | None:
-    if not data.pipeline.axes:
-        return None
-    rows = [[axis.name, len(axis), _values(axis), axis.unit, _meaning(axis)]
-            for axis in data.pipeline.axes]
-    return Table.of(
-        "Axes of the grid", ["axis", "values", "which", "unit", "meaning"], rows, words=True)
 
 
 def _meaning(axis: Axis) -> str:
     """Return an axis' meaning; of one that explains each choice, only the axis' own choices."""
-    choices = [
-        text for text in axis.meaning.split("; ")
-        if text.partition(": ")[0] in map(str, axis.values)
-    ]
+    choices = [text for text in axis.meaning.split("; ")
+               if text.partition(": ")[0] in map(str, axis.values)]
     return "; ".join(choices) or axis.meaning
 
 
@@ -146,8 +266,7 @@ def page(
 
 
 def _base64(content: bytes | str) -> str:
-    encoded = content.encode() if isinstance(content, str) else content
-    return base64.b64encode(encoded).decode()
+    return base64.b64encode(content.encode() if isinstance(content, str) else content).decode()
 
 
 def _svg(panel: Panel) -> bytes:
@@ -161,95 +280,3 @@ def _code(text: str, language: str) -> str:
     while fence in text:
         fence += "`"
     return f"{fence}{language}\n{text.rstrip()}\n{fence}"
-
-
-# --------------------------------------------------------------------------------------------------
-# Writing a report: completely, or not at all.
-
-FORMATS = ("html", "md")
-PICTURES = (".svg", ".png")
-
-def check_output(output: Path, folders: Sequence[Path]) -> None:
-    """Check that a report can be written, before it is computed.
-
-    Raises
-    ------
-    StoreError
-        If the output is a folder, or its folder is missing or not writable; if a folder of figures
-        is a file; or if anything would be written into a store.
-    """
-    for wanted in (output, *folders):
-        with write_errors_explained(wanted):
-            around = enclosing_store(wanted)
-        if around is not None:
-            raise StoreError(f"{wanted}: cannot be written: it is inside the store {around}")
-    check_output_file(output)
-    for folder in folders:
-        with write_errors_explained(folder):
-            if folder.is_dir():
-                check_folder_writable(folder)
-            elif os.path.lexists(folder):
-                folder.stat()  # a link that leads nowhere, or in a circle
-                raise StoreError(f"{folder}: cannot hold figures: it is a file; choose a folder")
-            else:
-                check_output_file(folder)  # it can be made
-
-
-def write_page(
-    data: ReportData, output: Path, form: str = "html", figures: Path | None = None
-) -> tuple[int, Answer]:
-    """Write the report of a store; return its number of figures, and the answer.
-
-    Parameters
-    ----------
-    data
-        The store.
-    output
-        The file to write; an existing one is replaced.
-    form
-        ``html``: one self-contained page. ``md``: Markdown with its figures and scenes in a folder
-        beside it, named as ``output`` with ``_figures`` in place of the suffix.
-    figures
-        Folder into which each figure is written as an SVG and a PNG file, too.
-
-    Raises
-    ------
-    ArgumentError
-        If ``form`` is neither of these, or for what cannot be required.
-    StoreError
-        If there are no results, some are missing or cannot be read, or a file cannot be written.
-    """
-    if form not in FORMATS:
-        raise ArgumentError("form", form, f"expected one of {', '.join(FORMATS)}")
-    beside = output.with_name(f"{output.stem}_figures") if form == "md" else None
-    folders = [folder for folder in (beside, figures) if folder is not None]
-    check_output(output, folders)
-    if data.results["estimate"].size == 0:
-        raise StoreError(f"{data.store}: there are no results")
-    title = data.pipeline.heading
-    numbers, origin = answer(data), provenance(data, str(output))
-    rendered = figures_of(data)
-    pictures = {
-        f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
-        for figure in rendered for suffix in PICTURES if folders}
-    scenes = list(scenes_of(data))
-    text = page(title, numbers, origin, rendered, scenes, data.require,
-                "" if beside is None else beside.name)
-    # Files are written after all of them were made.
-    for folder in folders:
-        _write_pictures(folder, pictures)
-    if beside is not None:
-        _write_pictures(beside, {
-            f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
-            if scene.picture is not None})
-    # Invalid Unicode, which a file's name may hold, is written as a question mark.
-    write_output_file(output, text.encode("utf-8", errors="replace"))
-    return len(rendered), numbers
-
-
-def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
-    """Write files into a folder; files and links of their names are replaced."""
-    with write_errors_explained(folder):
-        folder.mkdir(exist_ok=True)
-        for name, content in pictures.items():
-            write_whole(folder / name, content)

@@ -141,7 +141,7 @@ def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(
     status, out, _ = command("size", "runs/marker.zarr", "--seconds", "0.2", "--markdown")
     assert status == 0
     assert out.startswith("side\\_px=30, solver=")
-    assert "| solver | side\\_px | next | ms a frame | why not better |" in out
+    assert "| solver | side\\_px | next | ms a frame |" in out
     status, out, _ = command("size", "marker.toml", "--seconds", "0.2")
     assert "detection_rate >= 0.5 is not met: 0 (" in out
     assert out.splitlines()[-1].startswith("next: sweep report runs/marker.zarr")

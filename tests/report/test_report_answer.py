@@ -145,7 +145,7 @@ def test_the_table_of_limits_has_a_dip_and_an_open_interval():
     shown = answer(synthetic(all_tilts([[1, 0.91], [0.2, 0.91], [1, 0.2], [0.2, 0.2]])))
     rows = {row[0]: row for row in shown.tables[0].rows}
     assert rows["none"][1:4] == ["up to 0.2 m", "0.2", "yes"]
-    assert rows["none"][5] == "kept again by estimate, farthest at 0.8 m"
+    assert rows["none"][5] == "0.8 m"
     assert rows["subpix"][1:4] == ["not decided: up to 0.4 m", "below 0.2 to 0.4", "no"]
 
 

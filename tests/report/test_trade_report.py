@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
+from sweep.report.cost_tables import headlines, trade_figure, tradeoff_table
 from sweep.report.figure import panels_file
 from sweep.report.table import MAX_WIDTH
-from sweep.report.tradeoff_figure import headlines, trade_figure, tradeoff_table
 from sweep.tradeoff.pareto import UNITS, mark_front, pareto_front
 
 P95 = "rotation_p95_deg"
@@ -91,7 +91,7 @@ def test_tables_and_figures_have_every_treatment_of_every_condition(trade, condi
     assert max(map(len, text.splitlines())) <= MAX_WIDTH
     assert len(table.frame) == trade.sizes.get("side_px", 1) * trade.sizes["treatment"]
     assert table.frame["on the front"].sum() == mark_front(trade, P95).on_front.sum()
-    assert ("condition" in table.frame) == (trade["cost_ms"].ndim > 1)
+    assert ("side of the marker" in table.frame) == (trade["cost_ms"].ndim > 1)
     assert "nan" not in text + table.markdown() + "".join(headlines(trade, P95))
     figure = trade_figure(trade, P95)
     assert len(figure.panels) == conditions

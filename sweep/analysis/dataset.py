@@ -296,8 +296,8 @@ NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
 
 def common_trials(
     results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]
-) -> xr.DataArray | None:
-    """Return which trials all pooled cells have, computed; None if no cells are pooled.
+) -> xr.DataArray:
+    """Return which trials all pooled cells have, computed.
 
     Parameters
     ----------
@@ -311,19 +311,17 @@ def common_trials(
     """
     scene = [name for name in axes_of(results, Stage.scene) if name != DRAWS]
     pooled = [name for name in scene if name not in kept]
-    flags = [array for name, array in inputs.items() if name.split()[-1] == "detection"]
-    if not pooled or not flags or DRAWS not in flags[0].dims:
-        return None
-    common = None
-    for array in flags:
+    common = xr.DataArray(True)
+    for name, array in inputs.items():
+        if name.split()[-1] != "detection" or DRAWS not in array.dims or not pooled:
+            continue
         # All configurations of a scene that is needed are computed.
         one = array.isel({dim: 0 for dim in array.dims if dim not in (*scene, DRAWS)}, drop=True)
         one = one.fillna(0) if one.dtype.kind == "f" else one
         counted = (~one.isin(NOT_LOOKED_FOR)).any(DRAWS)
-        available = (~one.isin(NOT_AVAILABLE) | ~counted).all(
+        common = common & (~one.isin(NOT_AVAILABLE) | ~counted).all(
             [name for name in pooled if name in one.dims])
-        common = available if common is None else common & available
-    return None if common is None else common.reset_coords(drop=True).compute()
+    return common.reset_coords(drop=True).compute()
 
 
 def computed_scenes(results: xr.Dataset) -> xr.DataArray:

@@ -369,44 +369,6 @@ def ratio_terms(residuals: Floats, counted: Masks) -> tuple[Integers, Floats]:
         return units, np.square(rests, out=rests).sum(axis=2)
 
 
-def estimate_mean(
-    mean: Floats, residuals: Floats, used: Integers, run: Masks
-) -> MeanEstimate:
-    """Return means (groups,) with their standard errors, by the residuals (groups, cells, draws).
-
-    A cell with a single draw has no variance of its own and gets the pooled one. The degrees of
-    freedom are Welch's (Biometrika 34, 1947, the form with f + 2): a few cells with the largest
-    errors can make most of the variance. They are at most `Sample.freedom`; 0 of these: standard
-    error NaN.
-
-    Parameters
-    ----------
-    mean
-        The estimates.
-    residuals
-        What each draw adds to the sum of ``used * (value - mean)``.
-    used
-        How many values of each draw count.
-    run
-        The draws that were run.
-    """
-    sample = Sample(used)
-    n, most = sample.n, sample.freedom
-    units, m2 = ratio_terms(residuals, run)
-    repeated = units > 1
-    rest, m2 = np.where(repeated, units - 1.0, 0.0), np.where(repeated, m2, 0.0)
-    with np.errstate(all="ignore"):
-        terms = (rest + 1.0) * m2 / np.maximum(rest, 1.0)  # n_c s_c²
-        variance = terms.sum(axis=1)
-        welch = variance**2 / (terms**2 / (rest + 2.0)).sum(axis=1) - 2.0
-        single = (units == 1).sum(axis=1)
-        pooled = single * m2.sum(axis=1) / rest.sum(axis=1)
-        variance = variance + np.where(single > 0, pooled, 0.0)
-        degrees = np.where(most > 0, np.fmin(most, welch), np.nan)
-        error = np.where(most > 0, np.sqrt(variance) / n, np.nan)
-    return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
-
-
 #: Value, low and high, each (groups,).
 Interval = tuple[Floats, Floats, Floats]
 
@@ -732,11 +694,27 @@ class Sums(NamedTuple):
             return np.asarray(self.values.sum(axis=(1, 2)) / Sample(self.used).n[:, None])
 
     def estimate(self, mean: Floats, values: Floats) -> MeanEstimate:
-        """Return a mean (groups,), ``values`` (groups, cells, draws) being the draws' sums."""
+        """Return a mean (groups,), ``values`` (groups, cells, draws) being the draws' sums.
+
+        A cell with a single draw has no variance of its own and gets the pooled one. The degrees of
+        freedom are Welch's (Biometrika 34, 1947, the form with f + 2): a few cells with the largest
+        errors can make most of the variance. They are at most `Sample.freedom`; 0 of these:
+        standard error NaN.
+        """
+        n, most = Sample(self.used).n, Sample(self.used).freedom
         with np.errstate(all="ignore"):
             residuals = mean[:, None, None] * self.used
-            np.subtract(values, residuals, out=residuals)
-        return estimate_mean(mean, residuals, self.used, self.run)
+            units, m2 = ratio_terms(np.subtract(values, residuals, out=residuals), self.run)
+            rest, m2 = np.maximum(units - 1.0, 0.0), np.where(units > 1, m2, 0.0)
+            terms = (rest + 1.0) * m2 / np.maximum(rest, 1.0)  # n_c s_c²
+            variance = terms.sum(axis=1)
+            welch = variance**2 / (terms**2 / (rest + 2.0)).sum(axis=1) - 2.0
+            single = (units == 1).sum(axis=1)
+            pooled = single * m2.sum(axis=1) / rest.sum(axis=1)
+            variance = variance + np.where(single > 0, pooled, 0.0)
+            degrees = np.where(most > 0, np.fmin(most, welch), np.nan)
+            error = np.where(most > 0, np.sqrt(variance) / n, np.nan)
+        return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
 
 
 @dataclass(frozen=True)
@@ -1255,8 +1233,8 @@ def arranged(
 ) -> tuple[Arrays, Design]:
     """Return a dataset's columns (groups, cells, draws, settings, ...), and the draws' design."""
     stopped = is_sampling_stopped(results) if stopped is None else stopped
-    if stopped and (common := common_trials(results, inputs, kept)) is not None:
-        inputs = {**inputs, COMMON: common}
+    if stopped:
+        inputs = {COMMON: common_trials(results, inputs, kept), **inputs}
     sizes = {name: results.sizes[name] for name in kept}
     for array in inputs.values():
         sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}

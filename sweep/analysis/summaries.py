@@ -316,9 +316,8 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     cells = [name for name in axes_of(results) if name in results["detection"].dims
              and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
     inputs = pose_arrays(results, DETECTION_INPUTS)
-    if is_sampling_stopped(results) and (
-            common := common_trials(results, inputs, kept)) is not None:
-        inputs[COMMON] = common
+    if is_sampling_stopped(results):
+        inputs[COMMON] = common_trials(results, inputs, kept)
     rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "")))
     table, counts = (aggregate(results, inputs, names, [rate], Poses)
                      for names in (kept, (*kept, *cells)))

@@ -69,7 +69,6 @@ from sweep.analysis.poses import (
     INSIDE,
     OF_MARKERS,
     QUANTITIES,
-    REQUIRED_VARIABLES,
     Poses,
     Quantity,
     norm_squared,
@@ -863,7 +862,7 @@ def matched_sides(
     read_bins(first, kept, bins)
     scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
     std = second.get(TRUTH_STD)
-    first, second = (side[list(REQUIRED_VARIABLES)].assign({
+    first, second = (side[list(ERROR_INPUTS)].assign({
         name: _binned(side, name) for name in bins}).drop_attrs() for side in (first, second))
     if paired:
         trials = _trials_of(photographs, simulated)

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.poses import AXIS, DETECTION_INPUTS, NOT_LOOKED_FOR, REQUIRED_VARIABLES
+from sweep.analysis.poses import AXIS, DETECTION_INPUTS, ERROR_INPUTS, NOT_LOOKED_FOR
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.document import SEARCH, read_document
 from sweep.experiment.draws import REPLICATES
@@ -182,7 +182,7 @@ def require_poses(results: xr.Dataset) -> None:
 
     Of boards' markers (`sweep.analysis.per_marker`) it has detections alone.
     """
-    required = DETECTION_INPUTS if AXIS in results.dims else REQUIRED_VARIABLES
+    required = DETECTION_INPUTS if AXIS in results.dims else ERROR_INPUTS
     lacking = [name for name in required if name not in results]
     if lacking:
         present = ", ".join(map(str, results.data_vars)) or "none"

@@ -33,12 +33,11 @@ from sweep.analysis.dataset import (
     of_photographs,
     replicate_order,
 )
-from sweep.analysis.intervals import LEVEL, clopper_pearson, jeffreys, wilson
+from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
 from sweep.analysis.poses import COMMON, INSIDE, Poses, component_sum
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.schema import LABELS, cf_attributes
-from sweep.measure.flags import Flag, flag
 from sweep.typing import Floats, Integers, Masks
 
 #: Arrays of poses, (groups, cells, draws, settings, ...), by name.
@@ -573,18 +572,12 @@ class Rate(Statistic[ViewT]):
     used: Callable[[ViewT], Masks]
     #: Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted.
     counts: Sequence[tuple[str, str]] = ()
-    with_jeffreys: bool = False
     exact: bool = False
 
     def outputs(self) -> Sequence[Output]:
         """Return the rate, its interval, and the counts that are asked for."""
         counted = [*self.counts, ("draws", "random draws that the interval is of")]
-        return [
-            *(Output(*each, "1", "i8") for each in counted if self.counts),
-            *super().outputs(),
-            *(with_interval(f"{self.name}_jeffreys", f"{self.meaning} (Jeffreys)", "1")[1:]
-              if self.with_jeffreys else []),
-        ]
+        return [*(Output(*each, "1", "i8") for each in counted if self.counts), *super().outputs()]
 
     def worth(
         self, columns: Columns[ViewT], design: Design, level: float
@@ -604,9 +597,8 @@ class Rate(Statistic[ViewT]):
         """Return the counts, the rate and its intervals."""
         level = design.level(self.level)
         sample, hits, draws = self.worth(columns, design, level)
-        kinds = [clopper_pearson if self.exact or design.stopped else wilson]
+        interval = clopper_pearson if self.exact or design.stopped else wilson
         ends = [np.where(sample.drawn, end, np.nan)
-                for interval in kinds + [jeffreys] * self.with_jeffreys
                 for end in outward(interval, hits, sample.n, draws, level)]
         counts = [sample.n, hits][: len(self.counts)] + [draws] * bool(self.counts)
         with np.errstate(invalid="ignore"):
@@ -923,15 +915,6 @@ def _first_known(first: Floats, second: Floats) -> Floats:
 PERCENTS = {"median": 50, "p95": 95, "p99": 99}
 
 
-class IntervalOf(Flag):
-    """Why an interval has both ends, or not."""
-
-    not_run = flag(0, "No pose counts.", counted=False)
-    given = flag(1, "Both ends exist.", present=True)
-    nothing_drawn = flag(2, "No cell has two draws that count.")
-    too_few_draws = flag(3, "An end lies beyond the smallest or the largest draw.")
-
-
 #: Values of a column that are sorted at once: 1.6 GB.
 MAX_VALUES = 2 * 10**8
 
@@ -1018,22 +1001,15 @@ class Quantiles(Statistic[ViewT]):
     errors: Callable[[ViewT], Floats]
     solved: Callable[[ViewT], Masks]
     used: Callable[[ViewT], Masks]
-    with_reason: bool = False
 
     def outputs(self) -> Sequence[Output]:
         """Return the quantiles and their intervals."""
-        variables = []
-        for statistic, percent in PERCENTS.items():
-            meaning = f"{percent} % quantile of the {self.meaning}, not solved = infinite"
-            variables += with_interval(self.name.format(statistic), meaning, self.units)
-            if self.with_reason:
-                variables.append(Output(
-                    f"{statistic}_interval", f"why the interval of the {percent} % quantile has "
-                    "both ends, or not", "", "u1", IntervalOf))
-        return variables
+        return [output for statistic, percent in PERCENTS.items() for output in with_interval(
+            self.name.format(statistic),
+            f"{percent} % quantile of the {self.meaning}, not solved = infinite", self.units)]
 
-    def column(self, columns: Columns[ViewT]) -> tuple[NDArray[np.float32], Integers]:
-        """Return the errors (groups, cells, draws, settings), and how many count of each draw."""
+    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
+        """Return the quantiles and their intervals."""
         def values(poses: ViewT, _: slice) -> list[NDArray[np.float32]]:
             errors = self.errors(poses)
             known = self.solved(poses) & ~np.isnan(errors)
@@ -1048,22 +1024,9 @@ class Quantiles(Statistic[ViewT]):
                 "each condition")
         used, = columns.by_draw(lambda poses, _: [self.used(poses)])
         errors, = columns.joined(values)
-        return errors, used
-
-    def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
-        """Return the quantiles, their intervals, and why these may have no ends."""
-        errors, used = self.column(columns)
-        values = quantile_intervals(
+        found = quantile_intervals(
             errors, used, [*PERCENTS.values()], design, design.level(self.level))
-        sample, found = Sample(used), list[NDArray[Any]]()
-        for of_percent in np.moveaxis(values, 1, 0):
-            found += [*of_percent.T]
-            if self.with_reason:
-                found.append(np.select(
-                    [sample.n == 0, ~sample.drawn, np.isnan(of_percent[:, 1:]).any(axis=1)],
-                    [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
-                    IntervalOf.given))
-        return found
+        return [*found.reshape(len(found), -1).T]
 
 
 def draws_to_see(share: float, level: float = LEVEL) -> int:

@@ -48,28 +48,6 @@ def wilson(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Fl
                                 upper / (n + kappa**2))
 
 
-def jeffreys(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats]:
-    """Return the ends (low, high) of Jeffreys' equal-tailed interval, of the broadcast shape.
-
-    Quantiles of Beta(successes + 1/2, n - successes + 1/2), and 0 at 0 of n, 1 at n of n: Brown,
-    Cai and DasGupta 2001, section 3.1.3. Each is right to 1e-11 of itself up to some million
-    successes and failures, to 1e-8 beyond. The upper end comes
-    from its own tail, for 1 - tail is not a double; where it is near 1 its distance from 1 is the
-    lower end for n - successes.
-
-    Counts, ``n = 0`` and exact ends as in `wilson`.
-
-    >>> low, high = jeffreys([0, 5], 7)
-    >>> low.round(3).tolist(), high.round(3).tolist()
-    ([0.0, 0.352], [0.292, 0.935])
-    """
-    successes, n = _counts(successes, n)
-    a, b = successes + 0.5, n - successes + 0.5
-    tail = (1.0 - level) / 2.0
-    return _with_exact_ends(
-        successes, n, special.betaincinv(a, b, tail), special.betainccinv(a, b, tail))
-
-
 def clopper_pearson(
     successes: ArrayLike, n: ArrayLike, level: float = LEVEL
 ) -> tuple[Floats, Floats]:

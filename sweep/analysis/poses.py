@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -280,66 +280,32 @@ INSIDE = "inside"
 #: Name of the mask of the trials that all pooled cells have, where sampling was stopped.
 COMMON = "common"
 
-#: Name of z of the true position, beside the names of the dataset's variables.
-DEPTH = "true_depth_m"
-
-#: Names, likewise, of the bounds' parts.
-ROTATION_BOUND, DEPTH_BOUND = "rotation_bound", "depth_bound"
-
-#: Arrays that are parts of a variable: its name, and which part.
-DERIVED: dict[str, tuple[str, Callable[[xr.DataArray], xr.DataArray]]] = {
-    DEPTH: ("true_tvec_m", lambda array: array.isel(xyz=XYZ.index("z"), drop=True)),
-    ROTATION_BOUND: ("bound_std", lambda array: array.sel(
-        pose_parameter=[f"rotation_{axis}" for axis in XYZ])),
-    DEPTH_BOUND: ("bound_std", lambda array: array.sel(
-        pose_parameter="translation_z", drop=True)),
-}
-
-
-def variables_read(names: Iterable[str]) -> list[str]:
-    """Return the dataset's variables that arrays of these names are of, each once.
-
-    >>> variables_read(["estimate", DEPTH_BOUND, ROTATION_BOUND])
-    ['estimate', 'bound_std']
-    """
-    return list(dict.fromkeys(DERIVED[name][0] if name in DERIVED else name for name in names))
-
-
+#: Names of the variables that a statistic of detections, of estimates, of errors reads, one of
+#: errors along axes and about angles, and one of errors and their bounds.
 DETECTION_INPUTS = ("detection",)
 ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
-ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", DEPTH)
-#: Names of the arrays that a statistic of detections, of estimates, of errors reads, and one of
-#: errors along axes and about angles.
-SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec", "true_tvec_m")
-
-#: Variables that a statistic of errors and their bounds reads.
-BOUND_INPUTS = (*ERROR_INPUTS, ROTATION_BOUND, DEPTH_BOUND)
-
-#: Variables that every dataset of results has.
-REQUIRED_VARIABLES = tuple(variables_read(ERROR_INPUTS))
+ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", "true_tvec_m")
+SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec")
+BOUND_INPUTS = (*ERROR_INPUTS, "bound_std")
 
 
-def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
-    """Return arrays by the names that `Poses` gives them: variables' names, or of `DERIVED`.
+def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
+    """Return a dataset's variables by name.
 
     Raises
     ------
     DatasetError
-        If the dataset lacks a variable.
+        If the dataset lacks one.
     """
-    arrays = {}
-    for name in dict.fromkeys(names):
-        variable = variables_read([name])[0]
-        if variable not in results:
+    for name in names:
+        if name not in results:
             if AXIS in results.dims:
                 raise DatasetError(
-                    f"no variable {variable}: a board's markers have detections alone; estimates "
+                    f"no variable {name}: a board's markers have detections alone; estimates "
                     "are the board's: give the dataset that per_marker was given")
-            raise DatasetError(f"no variable {variable}; "
+            raise DatasetError(f"no variable {name}; "
                                f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
-        array = results[variable]
-        arrays[name] = DERIVED[name][1](array) if name in DERIVED else array
-    return arrays
+    return {name: results[name] for name in names}
 
 
 class Poses:
@@ -437,8 +403,12 @@ class Poses:
     @cached_property
     def range_percent(self) -> Floats:
         """Depth error in percent of the true depth, (..., 1)."""
-        error = self["translation_error_m"][..., XYZ.index("z")]
-        return 100.0 * relative(error, self[DEPTH])[..., None]
+        return self.percent_of_depth(self["translation_error_m"][..., 2])[..., None]
+
+    def percent_of_depth(self, length: NDArray[Any]) -> Floats:
+        """Return lengths (...) in percent of the true z."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100.0 * np.asarray(length / self["true_tvec_m"][..., 2], dtype=np.float64)
 
     @cached_property
     def signed(self) -> SignedErrors:
@@ -450,12 +420,6 @@ class Poses:
     def position_m(self) -> Floats:
         """Position error vectors, (..., xyz), in metres."""
         return np.asarray(self["translation_error_m"], dtype=np.float64)
-
-
-def relative(length: NDArray[Any], depth: NDArray[Any]) -> Floats:
-    """Return lengths over depths."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(length / depth, dtype=np.float64)
 
 
 def norm_squared(vectors: NDArray[Any]) -> Floats:

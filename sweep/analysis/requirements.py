@@ -53,7 +53,6 @@ from sweep.analysis.poses import (
     Poses,
     Quantity,
     pose_arrays,
-    variables_read,
 )
 from sweep.analysis.summaries import NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError, PipelineError
@@ -126,7 +125,7 @@ class Requirable:
     @property
     def variables(self) -> list[str]:
         """The dataset's variables that it is computed of."""
-        return variables_read(self.inputs)
+        return [*self.inputs]
 
     def level(self, share: float = 1.0) -> float:
         """Return the level of the interval by which it is decided with a share of the error."""
@@ -138,8 +137,6 @@ class Requirable:
         Rates have Clopper and Pearson's interval.
         """
         changes: dict[str, Any] = {"exact": True} if self.is_rate else {}
-        if isinstance(self.statistic, Quantiles):
-            changes["with_reason"] = False
         return [
             dataclasses.replace(
                 self.statistic, name=f"{prefix}{self.statistic.name}", level=level, **changes),

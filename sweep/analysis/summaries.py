@@ -47,18 +47,14 @@ from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import (
     BOUND_INPUTS,
     COMMON,
-    DEPTH,
-    DEPTH_BOUND,
     DETECTION_INPUTS,
     ESTIMATE_INPUTS,
     QUANTITIES,
-    ROTATION_BOUND,
     Poses,
     Quantity,
     chosen_quantities,
     norm_squared,
     pose_arrays,
-    relative,
 )
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS
@@ -111,8 +107,7 @@ def detection_rate(
         - ``draws``: the random draws that they are worth, since pooled settings see the same ones
           (`sweep.analysis.estimator.Sample.draws`).
         - ``detection_rate`` with Wilson's interval in ``detection_rate_low`` and
-          ``detection_rate_high``, and Jeffreys' in ``detection_rate_jeffreys_low`` and
-          ``detection_rate_jeffreys_high``.
+          ``detection_rate_high``.
 
     Raises
     ------
@@ -134,8 +129,7 @@ def detection_rate(
     >>> table["detection_rate_low"].round(3).values.tolist()
     [0.0, 0.306, 0.676]
     """
-    rate = replace(
-        DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "detected poses")), with_jeffreys=True)
+    rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "detected poses")))
     return _table(results, per, bins, [rate])
 
 
@@ -175,7 +169,7 @@ def flip_rate(
     >>> table["flip_rate"].round(3).values.tolist()
     [0.0, 0.231]
     """
-    rate = replace(FLIP_RATE, counts=(SOLVED, FLIPPED), with_jeffreys=True)
+    rate = replace(FLIP_RATE, counts=(SOLVED, FLIPPED))
     return _table(results, per, bins, [rate])
 
 
@@ -420,8 +414,7 @@ def quantiles_of(quantity: Quantity) -> Statistic[Poses]:
     return Quantiles(
         quantity.named("{}"), f"absolute {quantity.words}", quantity.norm,
         lambda poses: poses.solved, lambda poses: poses.looked_for,
-        # Why an end is missing is the same for all kinds of error.
-        with_reason=quantity is QUANTITIES[0], units=quantity.units, inputs=quantity.inputs)
+        units=quantity.units, inputs=quantity.inputs)
 
 
 def statistics_of(quantity: Quantity) -> list[Statistic[Poses]]:
@@ -506,9 +499,8 @@ def error_statistics(
           ``solved_rate`` are of ``looked_for``, ``flip_rate`` is of ``solved``.
         - ``*_median_*``, ``*_p95_*``, ``*_p99_*``: quantiles of the absolute error over the poses
           looked for. A pose that is not solved counts as infinite, so an infinite quantile says
-          that more than 50, 5 or 1 % were not solved. ``median_interval``, ``p95_interval`` and
-          ``p99_interval`` say why an end of the interval is missing
-          (`sweep.analysis.estimator.IntervalOf`).
+          that more than 50, 5 or 1 % were not solved. An end of the interval is NaN if no cell
+          has two draws, and if it lies beyond the smallest or the largest draw.
         - ``*_rmse_*``: over the solved poses; ``*_rmse_unflipped_*`` without flipped ones.
         - ``*_bias_*``: of rotation and position the length of the mean vector, of the others the
           signed mean; solved and not flipped. A length is never negative, so it is above 0 by
@@ -772,7 +764,8 @@ def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> Statistic
 
 #: Of the rotation and of the depth.
 RATIOS = (
-    _of_bound(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses[ROTATION_BOUND]))),
+    _of_bound(QUANTITIES[0],
+              lambda poses: norm_squared(np.degrees(poses["bound_std"][..., :3]))),
     _of_bound(QUANTITIES[1],
-              lambda poses: (100.0 * relative(poses[DEPTH_BOUND], poses[DEPTH])) ** 2),
+              lambda poses: poses.percent_of_depth(poses["bound_std"][..., 5]) ** 2),
 )

@@ -26,7 +26,7 @@ from sweep.analysis.decisions import (
 )
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.intervals import looks_factor
-from sweep.analysis.poses import ESTIMATE_INPUTS, REQUIRED_VARIABLES
+from sweep.analysis.poses import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.requirements import (
     ERROR_PROBABILITY,
     MIN_DRAWS,
@@ -70,7 +70,7 @@ def group_dataset(
         for axis in pipeline.axes}
     lengths = {name: len(listed) for name, (_, listed, _) in coordinates.items()}
     arrays = {}
-    for name in dict.fromkeys([*REQUIRED_VARIABLES, *values]):
+    for name in dict.fromkeys([*ERROR_INPUTS, *values]):
         dims = VARIABLES[name].dimensions(pipeline)
         missing = np.broadcast_to(np.float32(np.nan), [
             lengths[dim] if dim in lengths else len(LABELS[dim]) for dim in dims])

@@ -7,9 +7,9 @@ import pytest
 from mpmath import mp, mpf
 
 from support.lengths import lengths
-from sweep.analysis.intervals import jeffreys, wilson
+from sweep.analysis.intervals import clopper_pearson, wilson
 
-METHODS = pytest.mark.parametrize("interval", [wilson, jeffreys])
+METHODS = pytest.mark.parametrize("interval", [wilson, clopper_pearson])
 MAX_N = 10**15
 LEVELS = (1e-6, 0.5, 0.9, 0.95, 0.999, 1 - 1e-9)
 
@@ -60,15 +60,15 @@ def test_wilson_keeps_its_digits_up_to_a_million_billion(count, claim):
 
 
 @pytest.mark.parametrize("n", [1, 2, 10, 1000])
-def test_jeffreys_is_the_root_that_fifty_digits_find(n):
+def test_clopper_and_pearsons_is_the_root_that_fifty_digits_find(n):
     tail = (1 - mpf(0.95)) / 2
     for successes in edges(n):
-        low, high = (float(end) for end in jeffreys(successes, n))
-        a, b = successes + mpf(0.5), n - successes + mpf(0.5)
+        low, high = (float(end) for end in clopper_pearson(successes, n))
+        a, b = mpf(successes), mpf(n - successes)
         if successes > 0:
-            assert low == pytest.approx(float(root(a, b, tail, low)), rel=2e-15)
+            assert low == pytest.approx(float(root(a, b + 1, tail, low)), rel=2e-15)
         if successes < n:
-            assert high == pytest.approx(float(1 - root(b, a, tail, 1 - high)), rel=2e-15)
+            assert high == pytest.approx(float(1 - root(b, a + 1, tail, 1 - high)), rel=2e-15)
 
 
 def root(a, b, tail, near):

@@ -87,15 +87,14 @@ def expected_detection(found):
     aimed = found.where(looked_for(found))
     hits = int(is_detected(aimed).sum())
     return {"looked_for": len(aimed), "detected": hits, "draws": draws_in(aimed),
-            **rate("detection_rate", aimed, hits),
-            **rate("detection_rate", aimed, hits, "jeffreys")}
+            **rate("detection_rate", aimed, hits)}
 
 
 def expected_flips(found):
     solved = found.where(is_solved(found))
     hits = int((solved["flipped"] == Flipped.flipped).sum())
     return {"solved": len(solved), "flipped": hits, "draws": draws_in(solved),
-            **rate("flip_rate", solved, hits), **rate("flip_rate", solved, hits, "jeffreys")}
+            **rate("flip_rate", solved, hits)}
 
 
 OF_LOOKED_FOR = ("solved", "wrong_id", "rejected", "no_candidate", "solver_failed",
@@ -145,10 +144,7 @@ def expected_errors(found):
         out |= named(f"{name}_rmse_{unit}", rmse)
         sizes = np.where(is_solved(aimed), lengths_of(error(aimed)), math.inf).tolist()
         for label, share in SHARES.items():
-            interval = order_statistics(sizes, aimed, share)
-            out |= named(f"{name}_{label}_{unit}", interval)
-            given = 2 if freedom_in(aimed) == 0 else 3 if any(map(math.isnan, interval)) else 1
-            out[f"{label}_interval"] = given if len(aimed) else 0
+            out |= named(f"{name}_{label}_{unit}", order_statistics(sizes, aimed, share))
     return out
 
 

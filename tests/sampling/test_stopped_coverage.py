@@ -60,7 +60,6 @@ def rms(share, spread=3.0):
 def intervals(wanted, values):
     """Return low and high ends (groups,) of poses, as they are where sampling stopped."""
     arrays = {key: array[:, None, :, None] for key, array in values.items()}
-    arrays["true_depth_m"] = arrays["true_tvec_m"][..., 2]
     columns, table = Columns(arrays, Poses), {}
     for statistic in wanted.requirable.computed("", LEVEL):
         table |= zip((each.name for each in statistic.outputs()),

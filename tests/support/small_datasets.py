@@ -8,7 +8,7 @@ import tomlkit
 import xarray as xr
 from scipy import special
 
-from sweep.analysis.intervals import jeffreys, wilson
+from sweep.analysis.intervals import wilson
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 VALUES = {
@@ -272,16 +272,14 @@ def freedom_in(some):
     return len(np.unique(some.unit)) - len(np.unique(some.cell))
 
 
-def rate(name, of, hits, method="wilson"):
+def rate(name, of, hits):
     """Return a rate and its interval, the successes scaled outwards to draws."""
     n, draws, hits = len(of), draws_in(of), int(hits)
     out = {name: hits / n if n else math.nan}
-    stem = name if method == "wilson" else f"{name}_{method}"
     if freedom_in(of) == 0:
-        return out | {f"{stem}_low": math.nan, f"{stem}_high": math.nan}
-    ends = wilson if method == "wilson" else jeffreys
-    return out | {f"{stem}_low": ends(hits * draws // n, draws)[0],
-                  f"{stem}_high": ends(math.ceil(hits * draws / n), draws)[1]}
+        return out | {f"{name}_low": math.nan, f"{name}_high": math.nan}
+    return out | {f"{name}_low": wilson(hits * draws // n, draws)[0],
+                  f"{name}_high": wilson(math.ceil(hits * draws / n), draws)[1]}
 
 
 def mean_of(used, values, run):

@@ -25,7 +25,6 @@ from sweep.analysis.dataset import (
 from sweep.analysis.estimator import INTERVAL, Columns, arranged
 from sweep.analysis.intervals import DEVIATIONS
 from sweep.analysis.poses import (
-    DEPTH,
     SIGNED_INPUTS,
     Poses,
     bearing_of,
@@ -485,7 +484,7 @@ class Sights:
     @classmethod
     def of(cls, poses: Poses, _: tuple[slice, ...]) -> Sights:
         """Return those of a block."""
-        used = poses.looked_for & (poses[DEPTH] > 0)
+        used = poses.looked_for & (poses["true_tvec_m"][..., 2] > 0)
 
         def rows(values: NDArray[Any]) -> NDArray[Any]:
             return np.broadcast_to(values, (*used.shape, *values.shape[used.ndim :]))[used]

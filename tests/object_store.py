@@ -51,8 +51,7 @@ if program == "rings":
     for kind, port in zip(("account", "container", "object"), map(int, arguments)):
         ring = RingBuilder(4, 1, 0)
         ring.add_dev({"id": 0, "region": 1, "zone": 1, "weight": 1, "device": "disk",
-                      "ip": "127.0.0.1", "port": port, "replication_ip": "127.0.0.1",
-                      "replication_port": port})
+                      "ip": "127.0.0.1", "port": port})
         ring.rebalance()
         ring.get_ring().save(f"{folder}/{kind}.ring.gz")
 else:
@@ -70,7 +69,6 @@ devices = {folder}
 mount_check = false
 workers = 0
 user = {user}
-log_level = WARNING
 container_update_timeout = 60
 [pipeline:main]
 pipeline = {filters} {server}-server

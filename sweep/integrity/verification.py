@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -523,7 +523,7 @@ def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[str]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Repair: damaged blocks are recomputed, other damaged files are written again.
+# Repair: damaged blocks are recomputed; if another file is damaged, all others are written again.
 
 def repair(
     url: str, sample: int = SAMPLE, *, workers: int | None = None,
@@ -565,13 +565,14 @@ def repair(
     with lock.changing(url, store.storage):
         with translate_errors(url, "written"):
             files.delete_files(store.storage, before.left_over)
-            _rewrite(store, {each.where for each in before.damage if each.block is None})
+        if any(each.block is None for each in before.damage if each not in lasting):
+            lifecycle.reopen(store)
         store = lifecycle.open_store(url, "r+")
         for number in numbers:
             blocks.drop_block(store, store.blocks[number])
         if numbers:
             recompute(store, numbers, workers=workers, time_limit_s=time_limit_s)
-        if store.finished:
+        if before.finished:
             close(store)
     after = report_on(lifecycle.open_unchecked(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
@@ -579,25 +580,6 @@ def repair(
     remaining = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in remaining]
     return after
-
-
-def _rewrite(store: RunStore, keys: Collection[str]) -> None:
-    """Write the files of these keys that follow from the pipeline; delete tables.
-
-    A finished store's tables are written when it is closed again, but for what was measured.
-    """
-    arrays = lifecycle.planned_arrays(store.pipeline, store.blocks.extents)
-    planned = lifecycle.planned_files(arrays)
-    again = {key: planned[key] for key in keys if key in planned}
-    files.write_files(store.storage, again)
-    metadata = store.run_metadata
-    listed = metadata["files"] | lifecycle.checksums(again)
-    for group in lifecycle.MEASURED:
-        if any(key.startswith(f"{group}/") for key in keys):
-            files.delete_folder(store.storage, group)
-            listed = {key: crc for key, crc in listed.items() if not key.startswith(f"{group}/")}
-    files.delete_files(store.storage, filter(lifecycle.is_of_table, keys))
-    lifecycle.write_root(store, {**metadata, "files": listed})
 
 
 # --------------------------------------------------------------------------------------------------

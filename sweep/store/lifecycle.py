@@ -237,20 +237,12 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
 #: Groups that a finished store has.
 TABLES = ("cost", "failures")
 
-#: Groups within groups that no receipt could restore.
-MEASURED = ("cost/tradeoff", "cost/renderers")
-
 CHANGED = "changed: does not fit its checksum"
 
 
 def checksums(contents: Mapping[str, bytes]) -> dict[str, int]:
     """Return the CRC-32 of files by key."""
     return {key: crc32(content) for key, content in contents.items()}
-
-
-def is_of_table(key: str) -> bool:
-    """Return whether a key belongs to a table of a finished store."""
-    return key.partition("/")[0] in TABLES
 
 
 def changed_files(
@@ -266,7 +258,8 @@ def changed_files(
 
 def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
     """Return the contents of the listed files by key, with or without tables."""
-    keys = [key for key in store.run_metadata["files"] if tables or not is_of_table(key)]
+    keys = [key for key in store.run_metadata["files"]
+            if tables or not key.startswith(tuple(f"{name}/" for name in TABLES))]
     return dict(zip(keys, files.read_files(store.storage, keys), strict=True))
 
 
@@ -591,17 +584,20 @@ def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, 
 
 
 def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
-    """Mark a finished store unfinished, so that blocks of it can be computed again.
+    """Mark a store unfinished, so that blocks of it can be computed again.
 
-    Its groups go, since they sum the blocks up. A ``pipeline`` of the same cells is its own from
-    then on. A kill at any instant leaves a store with one of the two.
+    Its metadata and coordinates are written again. Its groups go, since they sum the blocks up. A
+    ``pipeline`` of the same cells is its own from then on. A kill at any instant leaves a store
+    with one of the two.
     """
-    metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline))
+    contents = planned_files(planned_arrays(store.pipeline, store.blocks.extents))
+    metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline)) | {
+        "finished": False, "files": checksums(contents)}
     for ended in ("finished_at", "counts"):
         metadata.pop(ended, None)
-    listed = {key: crc for key, crc in metadata["files"].items() if not is_of_table(key)}
     with locations.translate_errors(store.url, "written"):
-        write_root(store, {**metadata, "finished": False, "files": listed}, pipeline)
+        files.write_files(store.storage, contents)
+        write_root(store, metadata, pipeline)
         for name in TABLES:
             files.delete_folder(store.storage, name)
 

@@ -1,6 +1,5 @@
 """Who may write, change, close and delete a store, and files that are whole or not there."""
 
-import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,7 +8,6 @@ from unittest import mock
 import pytest
 from zarr.storage import MemoryStore
 
-from support.commands import started
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed, status
@@ -85,27 +83,6 @@ def test_of_many_changes_of_an_object_store_at_once_one_at_most_is_inside(anothe
         list(pool.map(change, range(40)))
     assert max(most, default=1) == 1
     assert len(most) + len(refused) == 40
-
-
-HOLD = """
-import sys, time
-from sweep.store.lifecycle import open_store
-from sweep.store.lock import writing
-
-store = open_store(sys.argv[1], "r+")
-with writing(store.url, store.storage):
-    print("held", flush=True)
-    time.sleep(60)
-"""
-
-
-@pytest.mark.system
-def test_the_lock_of_a_process_that_was_killed_is_free_at_once(store):
-    with started(["-c", HOLD, store.url], stdout=subprocess.PIPE, text=True) as writer:
-        assert writer.stdout.readline() == "held\n"
-        assert is_written(store.storage)
-    with changing(store.url, store.storage):
-        pass
 
 
 def test_where_folders_cannot_be_locked_nobody_is_excluded(store, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -68,18 +69,16 @@ StageReport = Callable[[str, float], None]
 @contextlib.contextmanager
 def stage_display() -> Iterator[StageReport]:
     """Show the current step on stderr: a bar on a terminal, else a line for each new step."""
-    printed: list[str] = []
+    printed = ""
 
-    def report(what: str, _share: float) -> None:
-        if printed[-1:] != [what]:
-            printed.append(what)
+    def line(what: str, *_: float) -> None:
+        nonlocal printed
+        if what != printed:
             notice(what)
+            printed = what
 
-    if _on_terminal():
-        with _bar() as update:
-            yield lambda what, share: update(what, share, 1.0)
-    else:
-        yield report
+    with _display(line) as update:
+        yield lambda what, share: update(what, share, 1.0)
 
 
 @contextlib.contextmanager
@@ -114,32 +113,30 @@ def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
 
     ``ends``: with a line for the beginning and one for the end, however short the run is.
     """
-    if _on_terminal():
-        with _bar() as update:
-            yield lambda progress: update(progress.line, *progress.share)
-        return
-    printed: float | None = None
+    printed_s = -math.inf if ends else time.monotonic()
 
-    def report(progress: Progress) -> None:
-        nonlocal printed
+    def line(what: str, done: float, total: float) -> None:
+        nonlocal printed_s
         now = time.monotonic()
-        is_end = printed is None or progress.done == progress.total
-        if (ends and is_end) or (printed is not None and now > printed + LINE_INTERVAL_S):
-            notice(progress.line)
-            printed = now
-        elif printed is None:
-            printed = now
+        if now > printed_s + LINE_INTERVAL_S or (ends and done == total):
+            notice(what)
+            printed_s = now
 
-    yield report
-
-
-def _on_terminal() -> bool:
-    return sys.stderr is not None and sys.stderr.isatty()
+    with _display(line) as update:
+        yield lambda progress: update(progress.line, *progress.share)
 
 
 @contextlib.contextmanager
-def _bar() -> Iterator[Callable[[str, float, float], None]]:
-    """Show a bar on stderr, which disappears at the end; update it by what, done, total."""
+def _display(
+    line: Callable[[str, float, float], None]
+) -> Iterator[Callable[[str, float, float], None]]:
+    """Show what is done, and of how much, on stderr.
+
+    On a terminal, that is a bar, which disappears at the end; elsewhere ``line`` is called.
+    """
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield line
+        return
     from rich.console import Console  # noqa: PLC0415  (slow to import)
     from rich.progress import (  # noqa: PLC0415
         BarColumn,

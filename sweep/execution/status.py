@@ -185,35 +185,8 @@ def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
     return sorted(groups, key=lambda group: -group.count)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The outcome of the cells of a store.
-
-    Attributes
-    ----------
-    nothing_computed
-        Whether a stage was tried and failed on every cell.
-    failed_share
-        Share of the cells that failed or crashed, of those that a stage was tried on; the largest
-        of the stages.
-    failures
-        The cells that failed or crashed, by reason.
-    warnings
-        The same for a reader; and that nothing was detected, or no pose estimated. Empty if there
-        is nothing to tell.
-    advice
-        The command that recomputes one cell of each reason; empty where there is nothing to tell.
-    """
-
-    nothing_computed: bool
-    failed_share: float
-    failures: list[FailureGroup]
-    warnings: list[str]
-    advice: str
-
-
-def outcome_of(url: str, totals: Totals, first: str) -> Outcome:
-    """Return the outcome of the cells that a store holds.
+def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
+    """Return the outcome of the cells that a store holds, as `Account` has it.
 
     Parameters
     ----------
@@ -252,15 +225,8 @@ def outcome_of(url: str, totals: Totals, first: str) -> Outcome:
         warnings.append(nothing)
         advice = advice or f"{repro_command(url, [first])} -o scene.png"
     warnings += differing_processors(totals.processors, "blocks")
-    return Outcome(1.0 in shares, round(max(shares), 6), groups, warnings, advice)
-
-
-def outcome_of_store(store: RunStore, totals: Totals) -> Outcome:
-    """Return the outcome of the cells of a store, with what may surprise of its pipeline."""
-    first = selection_text(store.pipeline, {axis.name: 0 for axis in store.pipeline.axes})
-    outcome = outcome_of(store.url, totals, first)
-    outcome.warnings.extend(bound_notes(store.pipeline))
-    return outcome
+    return {"nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
+            "failures": groups, "warnings": warnings, "advice": advice}
 
 
 def repro_command(url: str, cells: Sequence[str]) -> str:
@@ -404,7 +370,7 @@ def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
 # The totals of a store in one record: the summary of a run, and the status of a store.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Account(Outcome):
+class Account:
     """What a summary and a status have in common.
 
     Attributes
@@ -419,27 +385,44 @@ class Account(Outcome):
     needed, conditions
         Of a run in waves, how many of the committed poses were needed, and the conditions; None of
         a run of fixed trials.
+    nothing_computed
+        Whether a stage was tried and failed on every cell.
+    failed_share
+        Share of the cells that failed or crashed, of those that a stage was tried on; the largest
+        of the stages.
+    failures
+        The cells that failed or crashed, by reason.
+    warnings
+        The same for a reader; that nothing was detected, or no pose estimated; and what may
+        surprise of the pipeline. Empty if there is nothing to tell.
+    advice
+        The command that recomputes one cell of each reason; empty where there is nothing to tell.
     """
 
     store: str
     poses: int
     blocks: int
     looked_for: int
-    needed: int | None = None
-    conditions: int | None = None
+    needed: int | None
+    conditions: int | None
+    nothing_computed: bool
+    failed_share: float
+    failures: list[FailureGroup]
+    warnings: list[str]
+    advice: str
 
 
-def _account(store: RunStore, totals: Totals, needed: int) -> dict[str, Any]:
-    """Return the fields of an account."""
-    outcome, in_waves = outcome_of_store(store, totals), store.pipeline.stopping is not None
+def account_of(store: RunStore, totals: Totals, needed: int = 0) -> dict[str, Any]:
+    """Return the fields of an account; ``needed`` is of a run in waves."""
+    pipeline, in_waves = store.pipeline, store.pipeline.stopping is not None
+    first = selection_text(pipeline, {axis.name: 0 for axis in pipeline.axes})
+    outcome = outcome_of(store.url, totals, first)
+    outcome["warnings"] += bound_notes(pipeline)
     return {
-        **{name: getattr(outcome, name) for name in Outcome.__slots__},
-        "store": store.url,
-        "poses": store.pipeline.size(Stage.scene),
-        "blocks": len(store.blocks),
-        "looked_for": int(looked_for(totals.detection.tolist())),
+        "store": store.url, "poses": pipeline.size(Stage.scene), "blocks": len(store.blocks),
+        "looked_for": looked_for(totals.detection.tolist()),
         "needed": needed if in_waves else None,
-        "conditions": condition_count(store.pipeline) if in_waves else None,
+        "conditions": condition_count(pipeline) if in_waves else None, **outcome,
     }
 
 
@@ -509,7 +492,8 @@ def summary_of(
     """
     totals, rule = Totals.of_finished(store), store.pipeline.stopping
     sampled = store.run_metadata["counts"].get("sampled", {})
-    account, unsettled = _account(store, totals, sampled.get("needed", 0)), sampled.get("unsettled")
+    account = account_of(store, totals, sampled.get("needed", 0))
+    unsettled = sampled.get("unsettled")
     # A search says itself what it does not know.
     if unsettled and rule is not None and rule.precision:
         account["warnings"].append(
@@ -596,7 +580,7 @@ def status(url: str) -> Status:
     for _, receipt in blocks.receipts(store, blocks.check_whole(store)):
         totals.add(receipt)
         written.append((receipt.written, receipt.wall_s, receipt.scenes_needed))
-    account, settled = _account(store, totals, totals.needed), None
+    account, settled = account_of(store, totals, totals.needed), None
     if sampled := store.finished and store.run_metadata["counts"].get("sampled"):
         settled = account["conditions"] - sampled["unsettled"]
     elif account["conditions"] is not None:

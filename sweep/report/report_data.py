@@ -18,7 +18,7 @@ from sweep.analysis import error_statistics
 from sweep.analysis.dataset import SIZE_AXES, is_grid_axis, of_photographs
 from sweep.analysis.requirements import SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError
-from sweep.execution.status import Totals, outcome_of_store
+from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import Stage
@@ -302,7 +302,7 @@ def read_report_data(
     required = tuple(require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
-        tuple(outcome_of_store(store, Totals.of_finished(store)).warnings),
+        tuple(account_of(store, Totals.of_finished(store))["warnings"]),
         tuple(each.text for each in parse_requirements(required)) if required else (),
         conditions(results, per, store.pipeline.require_per),
         command,

@@ -99,13 +99,13 @@ def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
 def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, share, first):
     cells = [lost_cell("E: 1", "trial=3")] if share else []
     found = outcome(detection, estimate, cells)
-    assert (found.nothing_computed, found.failed_share) == (nothing, pytest.approx(share))
+    assert (found["nothing_computed"], found["failed_share"]) == (nothing, pytest.approx(share))
     if first is None:
-        assert (found.warnings, found.advice) == ([], "")
+        assert (found["warnings"], found["advice"]) == ([], "")
         return
-    assert found.warnings[0].startswith(first)
+    assert found["warnings"][0].startswith(first)
     expected = "--at trial=3" if share else "--at trial=0 -o scene.png"
-    assert found.advice == f"sweep repro 'a b.zarr' {expected}"
+    assert found["advice"] == f"sweep repro 'a b.zarr' {expected}"
 
 
 def blocks(workers, count, *, begin, took=2.0, scenes=100, lockstep=True):

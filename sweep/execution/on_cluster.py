@@ -119,14 +119,6 @@ def _checked_address(address: str) -> str:
     If it begins with ``tls://``, Dask's own configuration names the certificates.
     """
     try:
-        parts = urlsplit(address)
-        if not (parts.scheme and parts.hostname and parts.port):
-            raise ValueError(address)
-    except ValueError:
-        raise ArgumentError(
-            "scheduler", address,
-            f"expected an address such as tcp://host:8786, or {LOCAL}") from None
-    try:
         # Dask's client waits without end for a handshake, so that comes first, and alone; in a
         # thread, since the caller may be in an event loop, as notebooks are.
         with ThreadPoolExecutor(1) as thread:
@@ -134,7 +126,8 @@ def _checked_address(address: str) -> str:
     except TimeoutError:
         reason = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
     except Exception as error:
-        reason = f"cannot connect: {exception_line(error)}"
+        reason = (f"cannot connect: {exception_line(error)}; "
+                  f"expected an address such as tcp://host:8786, or {LOCAL}")
     else:
         if kind == "Scheduler":
             return address

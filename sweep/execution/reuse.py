@@ -129,6 +129,18 @@ class Source:
                 indices[key.axis] = np.broadcast_to(spread, shape)
         return exists, indices
 
+    def read(
+        self, variable: Variable, number: int, at: Mapping[str, NDArray[np.intp]]
+    ) -> NDArray[Any]:
+        """Return a variable of some cells of an old block (cells, inner), by their indices."""
+        pipeline, block = self.store.pipeline, self.store.blocks[number]
+        old = next(each for each in self.store.variables if each.name == variable.name)
+        starts = dict(zip(
+            (axis.name for axis in pipeline.experiment.scene_axes), block.starts, strict=True))
+        part = np.asarray(self.store.array(variable.name)[region(old, pipeline, block)])
+        return variable.fitted(part[tuple(
+            at[name] - starts.get(name, 0) for name in old.dimensions(pipeline) if name in at)])
+
 
 # --------------------------------------------------------------------------------------------------
 # Finished cells of other stores, copied into a new one: grids grow, halves are joined.
@@ -232,12 +244,26 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
             source.store.pipeline.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
         ):
             numbers = numbers * count + at[axis.name] // extent
+        present = {variable.name for variable in source.store.variables}
         taken = np.zeros_like(available)
         wanted = exists & ~available
         for number in source.done.intersection(np.unique(numbers[wanted]).tolist()):
             cells = np.nonzero(wanted & (numbers == number))
-            taken[_copied(source, number, variables, order, cells, at, values)] = True
-        present = {variable.name for variable in source.store.variables}
+            inside = {name: index[cells] for name, index in at.items()}
+            flags = {v.name: source.read(v, number, inside) for v in variables if v.name in LOST}
+            # A cell is finished if its flags say that it was run. With a configuration of a scene
+            # (or of a detection), what it shares is copied.
+            ended = ~np.isin(flags["estimate"], (EstimateStatus.not_run, EstimateStatus.not_needed))
+            for name, lost in LOST.items():
+                ended &= ~np.isin(flags[name], lost)
+            inside = {name: index[ended] for name, index in inside.items()}
+            finished = tuple(index[ended] for index in cells)
+            taken[finished] = True
+            for variable in variables if ended.any() else ():
+                if variable.name in present:
+                    target = tuple(finished[order.index(name)]
+                                   for name in variable.dimensions(pipeline) if name in order)
+                    values[variable.name][target] = source.read(variable, number, inside)
         lacking = [variable for variable in variables if variable.name not in present]
         rows = np.flatnonzero(taken.reshape(len(block), -1).any(axis=1))
         if lacking and len(rows):  # what follows from the parameters alone
@@ -251,42 +277,3 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
         available |= taken
     searches = pipeline.size(Stage.detection)
     return ReusedCells(values, available.reshape(len(block), searches, -1), processors)
-
-
-def _copied(
-    source: Source, number: int, variables: Sequence[Variable], order: Sequence[str],
-    cells: tuple[NDArray[np.intp], ...], at: dict[str, NDArray[np.intp]],
-    values: dict[str, NDArray[Any]],
-) -> tuple[NDArray[np.intp], ...]:
-    """Copy the finished ones of some ``cells`` of an old block into ``values``; return these.
-
-    A cell is finished if its flags say that it was run. With a configuration of a scene (or of a
-    detection), what it shares is copied.
-    """
-    store, pipeline = source.store, source.store.pipeline
-    block = store.blocks[number]
-    axes = pipeline.experiment.scene_axes
-    first = dict(zip((axis.name for axis in axes), block.starts, strict=True))
-    inside = {name: index[cells] - first.get(name, 0) for name, index in at.items()}
-    present = {variable.name: variable for variable in store.variables}
-
-    def read(variable: Variable) -> NDArray[Any]:
-        """Return a variable of the cells (cells, inner)."""
-        old = present[variable.name]
-        part = np.asarray(store.array(variable.name)[region(old, pipeline, block)])
-        names = [name for name in old.dimensions(pipeline) if name in inside]
-        return variable.fitted(part[tuple(inside[name] for name in names)])
-
-    flags = {v.name: read(v) for v in variables if v.name in LOST}
-    ended = ~np.isin(flags["estimate"], (EstimateStatus.not_run, EstimateStatus.not_needed))
-    for name, lost in LOST.items():
-        ended &= ~np.isin(flags[name], lost)
-    inside = {name: index[ended] for name, index in inside.items()}
-    finished = tuple(index[ended] for index in cells)
-    if ended.any():
-        for variable in variables:
-            if variable.name in present:
-                names = [n for n in variable.dimensions(source.new) if n in order]
-                target = tuple(finished[order.index(name)] for name in names)
-                values[variable.name][target] = read(variable)
-    return finished

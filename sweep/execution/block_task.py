@@ -209,6 +209,7 @@ def _computed(
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     need = np.broadcast_to(needed[:, None, None], shape).copy()
     reused = read_cells(pipeline, block, sources) if sources and need.any() else None
+    processors: set[str] = set() if reused is None else reused.processors
     if reused is not None:
         need &= ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
@@ -217,14 +218,13 @@ def _computed(
     seconds: dict[str, list[float]] = {stage: [] for stage in cells.seconds}
     if len(rows):
         indices = [index[rows] for index in block.indices()]
-        computed = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
-        for name, columns in computed.columns.items():
+        some = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
+        for name, columns in some.columns.items():
             cells.columns[name][:, rows] = columns
-        seconds, cells.failures = computed.seconds, computed.failures
-    values = {
-        v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
-        for v in store.variables
-    }
+        seconds, cells.failures = some.seconds, some.failures
+        processors.add(processor())
+    values = {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
+              for v in store.variables}
     if reused is not None:
         values = {v.name: _merged(v, values, reused) for v in store.variables}
     lengths = dict(zip(
@@ -232,16 +232,12 @@ def _computed(
     for v in store.variables:
         mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
         values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
-    processors = {processor()} if len(rows) else set()
     return values, Receipt(
         run_id=store.run_id,
-        processors=tuple(sorted(processors | (set() if reused is None else reused.processors))),
+        processors=tuple(sorted(processors)),
         scenes=len(block),
-        computed={
-            "scenes": len(rows),
-            "detections": int(need.any(axis=2).sum()),
-            "estimates": int(need.sum()),
-        },
+        computed={"scenes": len(rows), "detections": int(need.any(axis=2).sum()),
+                  "estimates": int(need.sum())},
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
         seconds=seconds,

@@ -45,6 +45,7 @@ from sweep.analysis.requirements import (
     Requirable,
     combined_decision,
     decide,
+    described,
     draws_needed,
     excess_of,
     kept_by,
@@ -444,9 +445,7 @@ def _cause(cell: xr.Dataset, together: Sequence[str]) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
     worst = largest_cell(cell, excess_of(cell).where(failing, -np.inf))
-    at = {name: worst[name].item() for name in together}
-    where = ", ".join(f"{name} = {value:g}" if isinstance(value, float) else f"{name} = {value}"
-                      for name, value in at.items())
+    where = described({name: worst[name].item() for name in together}, " = ")
     return {"limited_by": str(worst["requirement"].item()), "fails_where": where,
             "failing_value": float(worst["value"])}
 
@@ -987,14 +986,14 @@ def precision_reached(
     needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
     out = out.assign(
         settled=~needs.any([*configuration, "quantity"]), run=table["run"], poses=table["poses"])
-    for name, *described in (
+    for name, *words in (
         ("value", "value"), ("half_width", "half-width of the interval, as was wanted"),
         ("used", "poses that the value is of", "1"),
         ("draws", "random draws that these are worth", "1"),
         ("reached", "whether the interval is as narrow as was wanted", "", Reached),
         ("settled", "whether no configuration and quantity needs more trials", "1"),
     ):
-        out[name].attrs = cf_attributes(*described)
+        out[name].attrs = cf_attributes(*words)
     return out.assign_coords(
         {name: each for name, each in table.coords.items() if {*each.dims} <= {*kept}},
     ).assign_coords({name: ("quantity", listed) for name, listed in (

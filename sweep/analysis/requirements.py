@@ -895,14 +895,14 @@ def kept_by(table: xr.Dataset, required: Sequence[Requirement]) -> xr.DataArray:
     return stacked(keeps, "requirement").transpose(*table["value"].dims)
 
 
-def described(values: Mapping[str, Any]) -> str:
+def described(values: Mapping[str, Any], equals: str = "=") -> str:
     """Return values of axes as text.
 
     >>> described({"distance_m": 0.30000000000000004, "solver": "ippe"})
     'distance_m=0.3, solver=ippe'
     """
     return ", ".join(
-        f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={label(value)}"
+        f"{name}{equals}{f'{value:.6g}' if isinstance(value, float) else label(value)}"
         for name, value in values.items())
 
 

@@ -335,7 +335,7 @@ def as_json(choice: Choice) -> dict[str, Any]:
     return {
         "answer": known if choice.decision is Decision.met else None, "known": known,
         "decision": choice.decision, "sentences": [headline(choice)],
-        "best": choice.best, "next": choice.next, "along": choice.rule.along,
+        "best": choice.best, "along": choice.rule.along,
         "confidence": CONFIDENCE, "conditions": choice.conditions,
         "budget_ms": choice.budget_ms, "alternatives": listed,
         "poses": choice.poses, "grid_poses": choice.grid_poses,

@@ -74,61 +74,46 @@ def choice_costs(
         Called with the current step, and the share of it that is done.
     """
     axes = {axis.name: axis for axis in pipeline.axes}
-    conditions = _conditions(pipeline, rule)
-    samples: dict[tuple[tuple[str, int], ...], list[int]] = {}
+    settings = [axis.name for axis in (
+        *pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation))]
+    every = list(itertools.product(*(range(len(axes[name])) for name in rule.at_all)))
+    count = min(len(every), MAX_CONDITIONS)
+    conditions = [every[k * (len(every) - 1) // max(count - 1, 1)] for k in range(count)]
+    # The indices along all axes of the alternatives that are measured; alternatives that differ in
+    # settings alone share their scenes.
+    places: dict[int, dict[str, int]] = {}
     for k, answer in enumerate(found):
-        if rule.along and answer.value is None:
-            continue
-        scene = {name: _position(axes[name].values, value)
-                 for name, value in answer.alternative.items()
-                 if axes[name].stage is Stage.scene}
-        if rule.along:
-            scene[rule.along] = _position(axes[rule.along].values, answer.value)
-        samples.setdefault(tuple(scene.items()), []).append(k)
+        if not rule.along or answer.value is not None:
+            chosen = {**answer.alternative, **({rule.along: answer.value} if rule.along else {})}
+            places[k] = {name: [each == value for each in axes[name].values].index(True)
+                         for name, value in chosen.items()}
+    scenes = {k: tuple((name, i) for name, i in place.items() if name not in settings)
+              for k, place in places.items()}
+    samples = list(dict.fromkeys(scenes.values()))
     if not samples:
         return [None] * len(found)
-    count = len(samples) * len(conditions)
-    drawn = [sample_scenes(pipeline, {**dict(scene), **condition}, count)
-             for scene in samples for condition in conditions]
-    words = f"measuring the cost of {len(found):,} alternative{'s' if len(found) > 1 else ''}"
+    drawn = [
+        sample_scenes(pipeline, {**dict(scene), **dict(zip(rule.at_all, condition, strict=True))},
+                      len(samples) * len(conditions))
+        for scene in samples for condition in conditions]
+    words = f"measuring the cost of alternatives ({len(found):,})"
     report(words, 0.0)
     with Interrupts() as interrupts:
         costs = measure(
             pipeline, drawn, limit_s, interrupts, lambda share: report(words, share))
-    # (conditions, detector settings * estimators)
-    ends = [np.asarray(end).reshape(count, -1) for end in median_interval(1e3 * costs.total)]
-    settings = [axis.name for stage in (Stage.detection, Stage.estimation)
-                for axis in pipeline.axes_of(stage)]
-    lengths = [len(axes[name]) for name in settings]
+    ends = np.stack(median_interval(1e3 * costs.total)).reshape(
+        3, len(samples), len(conditions), *(len(axes[name]) for name in settings))
     out: list[Cost | None] = [None] * len(found)
-    for number, members in enumerate(samples.values()):
-        rows = slice(number * len(conditions), (number + 1) * len(conditions))
-        for k in members:
-            index = [_position(axes[name].values, found[k].alternative[name]) for name in settings]
-            column = int(np.ravel_multi_index(index, lengths)) if settings else 0
-            of_one = np.array([end[rows, column] for end in ends])
-            if not np.isnan(of_one[0]).all():
-                worst = int(np.nanargmax(of_one[0]))
-                ms, low, high = of_one[:, worst].tolist()
-                out[k] = Cost(ms, low, high, {
-                    name: axes[name].values[i] for name, i in conditions[worst].items()})
+    for k, place in places.items():
+        of_one = np.moveaxis(ends, (0, 2), (-2, -1))[
+            (samples.index(scenes[k]), *(place[name] for name in settings))]
+        if not np.isnan(of_one[0]).all():
+            worst = int(np.nanargmax(of_one[0]))
+            ms, low, high = of_one[:, worst].tolist()
+            out[k] = Cost(ms, low, high, {
+                name: axes[name].values[i]
+                for name, i in zip(rule.at_all, conditions[worst], strict=True)})
     return out
-
-
-def _position(values: Sequence[Any], value: Any) -> int:
-    """Return the index of a value, which a dataset may have as another type of number."""
-    return next(k for k, each in enumerate(values) if each == value)
-
-
-def _conditions(pipeline: Pipeline, rule: StoppingRule) -> list[dict[str, int]]:
-    """Return the indices along the axes of conditions, of all, or of some from all over them."""
-    lengths = {axis.name: len(axis) for axis in pipeline.axes if axis.name in rule.at_all}
-    total = math.prod(lengths.values())
-    count = min(total, MAX_CONDITIONS)
-    numbers = (k * (total - 1) // max(count - 1, 1) for k in range(count))
-    return [
-        dict(zip(lengths, map(int, np.unravel_index(k, tuple(lengths.values()))), strict=True))
-        if lengths else {} for k in numbers]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -189,15 +174,6 @@ class Choice:
         """The number of the alternative that is chosen; None if none meets everything."""
         good = [k for k, answer in enumerate(self.answers) if answer.met and self.within_budget(k)]
         return min(good, key=self.rank, default=None)
-
-    @cached_property
-    def next(self) -> int | None:
-        """The number of the alternative that would be better and fails; None if there is none."""
-        if self.best is None or self.rule.along:
-            return None if self.best is None or self.answers[self.best].next is None else self.best
-        cheaper = [k for k, answer in enumerate(self.answers)
-                   if not answer.met and self.rank(k) < self.rank(self.best)]
-        return max(cheaper, key=self.rank, default=None)
 
     @cached_property
     def front(self) -> tuple[int, ...]:

@@ -184,14 +184,13 @@ def sample_scenes(
         else generator.integers(0, cells, count)
     )
     indices = []
-    for axis, length in zip(reversed(axes), reversed(lengths), strict=True):
-        numbers, index = numbers // length, numbers % length
+    for axis, index in zip(axes, np.unravel_index(numbers, lengths) if axes else (), strict=True):
         if axis.name in fixed:
-            index = np.full(count, fixed[axis.name])
+            index = np.full(count, fixed[axis.name])  # noqa: PLW2901
         elif axis.name == TRIAL:
-            index = generator.integers(0, len(axis), count)
+            index = generator.integers(0, len(axis), count)  # noqa: PLW2901
         indices.append(index.astype(np.intp))
-    return indices[::-1]
+    return indices
 
 
 # --------------------------------------------------------------------------------------------------
@@ -298,9 +297,8 @@ def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
 
     OpenCV's own works in this thread, plug-ins may have threads of their own.
     """
-    if all(isinstance(setting, DetectorSetting) for setting in settings):
-        return time.thread_time
-    return time.process_time
+    of_opencv = all(isinstance(setting, DetectorSetting) for setting in settings)
+    return time.thread_time if of_opencv else time.process_time
 
 
 def _prepared(
@@ -351,15 +349,14 @@ def _searched(
 
     Of more than ``most`` scenes, so many are taken from all over the sample.
     """
-    count = len(indices[0]) if indices else 1
     batch = scenes_at(pipeline.experiment, indices)
-    rows = np.flatnonzero(batch.visible)
-    if 0 < len(rows) < count:
-        return _searched(pipeline, [index[rows] for index in indices], most)
-    if count > most:
-        chosen = (2 * np.arange(most) + 1) * count // (2 * most)
-        return _searched(pipeline, [index[chosen] for index in indices], most)
-    wanted = np.full((count, len(pipeline.experiment.detectors)), len(rows) > 0)
+    visible = np.flatnonzero(batch.visible)
+    rows = visible if len(visible) else np.arange(len(batch.scenes))
+    if len(rows) > most:
+        rows = rows[(2 * np.arange(most) + 1) * len(rows) // (2 * most)]
+    if len(rows) < len(batch.scenes):
+        batch = scenes_at(pipeline.experiment, [index[rows] for index in indices])
+    wanted = np.full((len(rows), len(pipeline.experiment.detectors)), len(visible) > 0)
     return batch, detections_of(batch, wanted, [], keep=True)[0]
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
-import math
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,8 +12,8 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import covariance_trust, efficiency, renderer_bias
-from sweep.analysis.comparisons import corners_of
 from sweep.analysis.dataset import computed_scenes
+from sweep.analysis.estimator import INTERVAL
 from sweep.analysis.summaries import guarded_error_statistics
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
@@ -24,7 +22,6 @@ from sweep.experiment.grid import TRIAL, Axis
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
-from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
 from sweep.plugins.loading import printing_to_stderr
@@ -43,9 +40,6 @@ from sweep.tradeoff.costs import (
 )
 from sweep.tradeoff.pareto import WRONG, WRONG_BELIEF, configuration_label
 from sweep.typing import Floats
-
-#: Values and the low and high ends of their intervals, arrays of one shape.
-Interval = tuple[Floats, Floats, Floats]
 
 #: Share of the time limit that is left for the costs, however long the accuracy takes.
 MIN_SHARE = 0.3
@@ -93,12 +87,10 @@ def measure_trade(
     Raises
     ------
     StoreError
-        If there is no finished store, it has no results, or it was made with other versions.
+        If there is no finished store, or it was made with other versions.
     ArgumentError
-        If ``per`` names no axis of the scenes, or there is no time.
+        If ``per`` names no axis of the scenes.
     """
-    if not 0 < limit_s < math.inf:
-        raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
     started = time.perf_counter()
     store = open_store(url, "r+")
     if not store.finished:
@@ -113,19 +105,13 @@ def measure_trade(
     per = list(dict.fromkeys((*per, *(axis.name for axis in stored.experiment.target_axes))))
     _check(url, stored, results, per)
     # The same versions and files must be measured as were run.
-    pipeline = Pipeline.from_text(
-        stored.text, name=stored.name, source=url, folder=stored.folder,
-    )
-    lines = differences(pipeline, stored, store.fingerprint)
-    if lines:
+    pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)
+    if lines := differences(pipeline, stored, store.fingerprint):
         raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
     renderers = None
     report = progress or (lambda _what, _share: None)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(changing(url, store.storage))
-        interrupts = stack.enter_context(Interrupts())
-        if pipeline.plugins:
-            stack.enter_context(printing_to_stderr())
+    # Plug-ins may print.
+    with changing(url, store.storage), Interrupts() as interrupts, printing_to_stderr():
         if "renderer" in results.dims:
             names = [str(name) for name in results["renderer"].values.tolist()]
             report("measuring renderers", 0.0)
@@ -152,8 +138,6 @@ def _check(url: str, pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
         if name not in axes:
             known = nearest(name, axes) or f"; there are {', '.join(axes) or 'none'}"
             raise ArgumentError("per", name, f"no axis of the scene{known}")
-    if results["estimate"].size == 0:
-        raise StoreError(f"{url}: there are no results")
     if "renderer" in per:
         raise ArgumentError("per", "renderer", "renderers are compared with exact in any case")
     if "renderer" in axes and REFERENCE not in results["renderer"].values.tolist():
@@ -170,26 +154,13 @@ def _trade(
     """Return the trade, measured until a time of `time.perf_counter` of at most ``limit_s``."""
     report("reading the accuracy", 0.0)
     axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
-    settings = [axis.name for axis in axes]
-    kept = [*per, *settings]
-    nees = results.get("nees", xr.DataArray(np.nan)) * _corner_noise_scale(pipeline, results, per)
-    accuracy = xr.merge(
-        [
-            guarded_error_statistics(results, kept),
-            efficiency(results, kept),
-            covariance_trust(results.assign(nees=nees), kept),
-            _bound(results, per),
-        ],
-        compat="no_conflicts", join="exact",
-    ).compute()
-    trade = _flattened(pipeline, accuracy, axes)
-    lengths = [results.sizes[name] for name in per]
-    conditions = list(np.ndindex(*lengths))
-    configurations = trade.sizes["treatment"]
-    measuring = (
-        f"measuring {configurations:,} configuration{'s' if configurations > 1 else ''} under "
-        f"{len(conditions):,} condition{'s' if len(conditions) > 1 else ''}"
-    )
+    kept = [*per, *(axis.name for axis in axes)]
+    trade, settings = _flattened(pipeline, xr.merge([
+        guarded_error_statistics(results, kept), efficiency(results, kept),
+        covariance_trust(results, kept)], compat="no_conflicts", join="exact"), axes)
+    conditions = list(np.ndindex(*(results.sizes[name] for name in per)))
+    measuring = (f"measuring configurations ({len(settings):,}) under conditions "
+                 f"({len(conditions):,})")
     report(measuring, 0.0)
     samples = [
         _without_crashed(pipeline, results, [
@@ -201,31 +172,25 @@ def _trade(
         pipeline, samples, max(deadline - time.perf_counter(), MIN_SHARE * limit_s), interrupts,
         lambda share: report(measuring, share),
     )
-
-    def add(name: str, meaning: str, unit: str, interval: Interval) -> None:
-        shaped = [np.asarray(end).reshape(*lengths, configurations) for end in interval]
-        _add(trade, (*per, "treatment"), name, meaning, unit, shaped)
-
-    total = costs.total
-    add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
-    add("cost_ratio", "cost over the baseline's", "1", any_process_interval(costs.ratio))
-    each = np.broadcast_to(costs.detection[..., None], total.shape)
-    add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
-    add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
+    detection = np.broadcast_to(costs.detection[..., None], costs.total.shape)
+    for name, meaning, unit, interval in (
+        ("cost_ms", "detection and estimation of a frame", "ms",
+         median_interval(1e3 * costs.total)),
+        ("cost_ratio", "cost over the baseline's", "1", any_process_interval(costs.ratio)),
+        ("detection_ms", "detection of a frame", "ms", median_interval(1e3 * detection)),
+        ("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation)),
+    ):
+        _add(trade, (*per, "treatment"), name, meaning, unit, interval)
     whole = whole_frames_of(pipeline)
-    trade = trade.isel(treatment=distinct(pipeline, _settings(axes)))
-    trade.attrs = {
+    return trade.isel(treatment=distinct(pipeline, settings)).assign_attrs({
         "title": pipeline.heading,
         "poses": int(computed_scenes(results).sum()),
         "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
-        "rounds": len(total),
+        "rounds": len(costs.total),
         "frames": int(np.nansum(costs.frames)),
         "sampled": sum(len(sample[0]) if sample else 1 for sample in samples),
-        "covariance": "of the solvers with the corners' noise as it was measured under each "
-                      "condition; of photometric from its likelihood",
-    }
-    return trade
+    })
 
 
 def _without_crashed(
@@ -255,97 +220,33 @@ def _without_crashed(
 
 def _add(
     table: xr.Dataset, dims: Sequence[str], name: str, meaning: str, unit: str,
-    interval: Sequence[Any],
+    interval: Sequence[Floats],
 ) -> None:
     """Add a variable and the ends of its 95 % interval to a dataset."""
-    for ending, words, values in zip(
-        ("", "_low", "_high"),
-        ("", ", lower end of the 95 % interval", ", upper end of the 95 % interval"),
-        interval, strict=True,
-    ):
-        table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
-
-
-def _settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return the value along each axis of every combination, the last axis fastest."""
-    names = [axis.name for axis in axes]
-    return [dict(zip(names, chosen, strict=True))
-            for chosen in itertools.product(*(axis.values for axis in axes))]
+    for (ending, words), values in zip(INTERVAL.items(), interval, strict=True):
+        table[name + ending] = (
+            dims, np.reshape(values, [table.sizes[dim] for dim in dims]),
+            {"long_name": words + meaning, "units": unit})
 
 
 def _flattened(
     pipeline: Pipeline, accuracy: xr.Dataset, axes: Sequence[Axis]
-) -> xr.Dataset:
+) -> tuple[xr.Dataset, list[dict[str, Any]]]:
     """Return a dataset with one dimension ``treatment``, by label, for the settings' axes.
 
-    Those with a wrong belief are marked: they show what an error costs, and are no choices.
+    With it the settings of each. Those with a wrong belief are marked: they show what an error
+    costs, and are no choices.
     """
     names = [axis.name for axis in axes]
+    settings = [dict(zip(names, values, strict=True))
+                for values in itertools.product(*(axis.values for axis in axes))]
     wrong = wrong_configurations(pipeline, axes)
-    labels = [
-        configuration_label(used_settings(pipeline, values)) + WRONG * believed_wrongly
-        for values, believed_wrongly in zip(_settings(axes), wrong, strict=True)
-    ]
-    if not axes:
-        return accuracy.expand_dims(treatment=labels)
-    flat = accuracy.stack(treatment=names, create_index=False)
-    flat = flat.assign_coords(treatment=("treatment", labels))
+    labels = [configuration_label(used_settings(pipeline, values)) + WRONG * believed_wrongly
+              for values, believed_wrongly in zip(settings, wrong, strict=True)]
+    flat = accuracy.stack(treatment=names, create_index=False) if axes else (
+        accuracy.expand_dims("treatment"))
     marks = {WRONG_BELIEF: ("treatment", np.array(wrong))} if any(wrong) else {}
-    return flat.assign_coords(marks)
-
-
-def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:
-    """Return the RMS bound of rotation and range over the poses with a bound."""
-    bound = results["bound_std"].astype(np.float64).load()
-    over = [dim for dim in bound.dims if dim not in (*per, "pose_parameter")]
-    turns = bound.sel(pose_parameter=[f"rotation_{axis}" for axis in "xyz"])
-    turn = (turns**2).sum("pose_parameter", skipna=False).mean(over) ** 0.5
-    depth = bound.sel(pose_parameter="translation_z", drop=True) / results["true_tvec_m"].sel(
-        xyz="z", drop=True
-    ).load()
-    shift = (depth**2).mean(over) ** 0.5
-    return xr.Dataset(
-        {
-            "bound_rotation_deg": (turn * (180 / np.pi)).assign_attrs(
-                long_name="RMS bound of the rotation error", units="degree"),
-            "bound_range_percent": (100 * shift).assign_attrs(
-                long_name="RMS bound of the depth error, of the true depth", units="percent"),
-        }
-    )
-
-
-def _corner_noise_scale(
-    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
-) -> xr.DataArray:
-    """Return the factor from squared deviations under the assumed to the measured corner noise.
-
-    1 for estimators whose covariance does not come from the corners' noise. Those of a chessboard's
-    points have the noise of its corners, all others that of markers' corners.
-    """
-    searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
-    axes = pipeline.axes_of(Stage.estimation)
-    estimators = pipeline.experiment.estimators
-
-    def measured(name: str) -> xr.DataArray:
-        error = results[name].astype(np.float64)
-        over = [dim for dim in error.dims if dim not in (*per, *searched)]
-        return (error**2).mean(over).compute()
-
-    def over_estimators(values: Sequence[Any], kind: type) -> xr.DataArray:
-        names = [axis.name for axis in axes]
-        return xr.DataArray(
-            np.array(values, dtype=kind).reshape([len(axis) for axis in axes]), dims=names,
-            coords={name: results[name] for name in names})
-
-    noise = measured(corners_of(results))
-    chessboard = [setting.points == "chessboard" for setting in estimators]
-    if any(chessboard):
-        noise = noise.where(
-            ~over_estimators(chessboard, bool), measured("chessboard_corner_error_px"))
-    # None, an estimator without such a noise, is NaN.
-    assumed = over_estimators([setting.corner_noise_px for setting in estimators], float)
-    from_images = over_estimators([build(setting).needs_images for setting in estimators], bool)
-    return (assumed**2 / noise).where(~from_images, 1.0)
+    return flat.assign_coords({"treatment": ("treatment", labels), **marks}), settings
 
 
 def _renderers(
@@ -358,7 +259,7 @@ def _renderers(
     ])
     reference = names.index(REFERENCE)
     seconds, rms, largest = measure_renderers(pipeline, samples, reference, limit_s, interrupts)
-    changed = renderer_bias(results, REFERENCE).compute()
+    changed = renderer_bias(results, REFERENCE)
     _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
          median_interval(1e3 * seconds))
     _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
@@ -368,5 +269,4 @@ def _renderers(
         ("grey_max", "largest difference from the exact image", largest),
     ):
         changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
-    changed.attrs = {"title": pipeline.heading, "reference": REFERENCE}
-    return changed
+    return changed.assign_attrs(title=pipeline.heading, reference=REFERENCE)

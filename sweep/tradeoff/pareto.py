@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sweep.errors import ArgumentError
+from sweep.analysis.dataset import each_cell
+from sweep.analysis.requirements import described
+from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # The Pareto front of configurations: those that no other beats in both cost and accuracy.
 #
 # A `trade` dataset has the dimension ``treatment``, the configurations by label, and may have
 # scene axes beside it; each combination of their values is a condition.
-
-Booleans = NDArray[np.bool_]
 
 #: Coordinate of a trade: whether a configuration believes something known not to be true.
 WRONG_BELIEF = "wrong_belief"
@@ -31,7 +31,7 @@ CRITERIA = tuple(
 )
 
 
-def pareto_front(cost: ArrayLike, error: ArrayLike) -> Booleans:
+def pareto_front(cost: ArrayLike, error: ArrayLike) -> Masks:
     """Return which of n points no other point dominates.
 
     A point dominates another if neither its cost nor its error is larger and one of them is
@@ -47,21 +47,12 @@ def pareto_front(cost: ArrayLike, error: ArrayLike) -> Booleans:
     -------
     (n,) whether each point is on the front.
 
-    Raises
-    ------
-    ArgumentError
-        If the two are not of one shape (n,).
-
     Examples
     --------
     >>> pareto_front([1, 2, 3, 4], [0.9, 0.5, 0.7, np.inf]).tolist()
     [True, True, False, False]
     """
     cost, error = np.asarray(cost, dtype=np.float64), np.asarray(error, dtype=np.float64)
-    if cost.ndim != 1 or cost.shape != error.shape:
-        raise ArgumentError(
-            "error", error.shape, f"expected the shape (n,) of the cost, which has {cost.shape}"
-        )
     finite = np.isfinite(cost) & np.isfinite(error)
     no_worse = (cost[:, None] <= cost) & (error[:, None] <= error)
     better = (cost[:, None] < cost) | (error[:, None] < error)
@@ -96,14 +87,9 @@ def conditions_of(trade: xr.Dataset) -> Iterator[tuple[str, dict[str, Any], xr.D
 
     If ``trade`` has one condition alone, that is all of it, with an empty label.
     """
-    sizes = {str(name): size for name, size in trade["cost_ms"].sizes.items()
-             if name != "treatment"}
-    for index in np.ndindex(*sizes.values()):
-        part = trade.isel(dict(zip(sizes, index, strict=True)))
-        values = {name: part[name].item() for name in sizes}
-        label = ", ".join(f"{name} = {value:g}" if isinstance(value, float) else f"{name} = {value}"
-                          for name, value in values.items())
-        yield label, values, part
+    dims = [str(name) for name in trade["cost_ms"].dims if name != "treatment"]
+    for values, part in each_cell(trade, dims):
+        yield described(values, " = "), values, part
 
 
 # --------------------------------------------------------------------------------------------------

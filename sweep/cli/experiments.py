@@ -480,9 +480,6 @@ def verify(
             [f"{what:9} {plain(each.where, 300)}: {plain(each.what, 300)}" for each in damages],
             f"{what:9} and {len(damages) - MAX_LINES:,} more; --json lists all")
     lines += [plain(each.what, 600) for each in unstable]
-    if report.left_over:
-        lines.append(f"{len(report.left_over):,} files do not belong to the store, such as "
-                     f"{plain(report.left_over[0])}; --repair deletes them")
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})")
     state = "damaged" if damaged else "not deterministic" if unstable else "sound"
@@ -494,7 +491,7 @@ def verify(
     url = quoted(store)
     if unstable and not damaged:
         then = f"sweep plugins check {quoted(unstable[0].where)}", "tries it on its own"
-    elif (report.damage or report.left_over) and not repair:
+    elif report.damage and not repair:
         then = f"sweep verify {url} --repair", "repairs it"
     elif report.damage:
         then = f"sweep run {url} --overwrite", "computes all of it again"

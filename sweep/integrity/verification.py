@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -34,7 +33,6 @@ from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle, lock
 from sweep.store.blocks import Receipt, RunStore
-from sweep.store.locations import translate_errors
 from sweep.store.provenance import differences
 
 # --------------------------------------------------------------------------------------------------
@@ -210,7 +208,7 @@ class IntegrityReport:
     blocks, blocks_done
         Blocks of the grid, and how many are committed.
     files, bytes
-        Stored files that belong to the store, and their size.
+        Files that were read, and their size.
     sampled
         Scenes that were recomputed.
     not_sampled
@@ -223,8 +221,6 @@ class IntegrityReport:
         is last in ``damage``.
     repaired
         Damages that have been repaired.
-    left_over
-        Files that do not belong to the store, such as those that a killed process was writing.
     processors
         Features of the processors that computed the blocks -> how many blocks.
     """
@@ -240,51 +236,36 @@ class IntegrityReport:
     damage: list[Damage] = field(default_factory=list)
     unstable: str = ""
     repaired: list[Damage] = field(default_factory=list)
-    left_over: list[str] = field(default_factory=list)
     processors: dict[str, int] = field(default_factory=dict)
 
 
 # --------------------------------------------------------------------------------------------------
 # Blocks: every chunk fits the checksum at its end, and the receipt lists the same.
 
-#: Blocks that are read and checked at a time, and that are submitted at a time.
-THREADS, WINDOW = 4, 256
-
-
 def check_blocks(
     store: RunStore, numbers: Sequence[int], report: IntegrityReport
 ) -> dict[int, Receipt]:
-    """Check blocks in several threads; return the receipts of those without damage, by number."""
+    """Check every file of blocks; return the receipts of those without damage, by number."""
     sound: dict[int, Receipt] = {}
-    with ThreadPoolExecutor(THREADS) as pool:
-        # A window at a time: there may be very many.
-        for start in range(0, len(numbers), WINDOW):
-            some = numbers[start : start + WINDOW]
-            for size, receipt, damage in pool.map(partial(_checked_block, store), some):
-                report.bytes += size
-                report.damage += damage
-                if receipt is not None and receipt.block is not None and not damage:
-                    sound[receipt.block] = receipt
+    for number, receipt, fault in blocks.receipts_or_faults(store, numbers):
+        faults = {blocks.receipt_key(number): fault} if fault else {}
+        checksums = {} if receipt is None else receipt.checksums
+        names = {store.chunks.key(variable.name, number): variable.name
+                 for variable in store.variables}
+        for key, content in zip(names, files.read_files(store.storage, list(names)), strict=True):
+            if content is None:
+                faults[key] = "missing"
+            elif not files.is_sound(content) or files.checksum_of(content) != checksums.get(
+                    names[key], files.checksum_of(content)):
+                faults[key] = lifecycle.CHANGED
+            report.bytes += len(content or b"")
+        report.files += 1 + len(names)
+        report.damage += [Damage(key, what, number) for key, what in faults.items()]
+        if receipt is not None and not faults:
+            sound[number] = receipt
     report.processors = dict(Counter(
         name for receipt in sound.values() for name in receipt.processors))
     return sound
-
-
-def _checked_block(store: RunStore, number: int) -> tuple[int, Receipt | None, list[Damage]]:
-    """Return the size of a block's chunks, its receipt if that is sound, and the damages."""
-    ((_, receipt, fault),) = blocks.receipts_or_faults(store, [number])
-    faults = {blocks.receipt_key(number): fault} if fault else {}
-    checksums = {} if receipt is None else receipt.checksums
-    keys = {store.chunks.key(variable.name, number): variable.name for variable in store.variables}
-    contents = files.read_files(store.storage, list(keys))
-    for (key, name), content in zip(keys.items(), contents, strict=True):
-        if content is None:
-            faults[key] = "missing"
-        elif not files.is_sound(content) or files.checksum_of(content) != checksums.get(
-                name, files.checksum_of(content)):
-            faults[key] = lifecycle.CHANGED
-    size = sum(len(content or b"") for content in contents)
-    return size, receipt, [Damage(key, what, number) for key, what in faults.items()]
 
 
 def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport) -> None:
@@ -483,43 +464,18 @@ def report_on(store: RunStore, sample: int) -> IntegrityReport:
     """Check a store, and recompute up to ``sample`` scenes; none with a sample of 0."""
     done = blocks.committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
-    numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
-    listed, others = _listed(store, numbers if report.finished else done)
     listing = lifecycle.read_listed(store, tables=True)
-    others -= {"zarr.json", *listing, *map(blocks.receipt_key, numbers)}
-    others = {key for key in others if not key.startswith(f"{lock.LOCKS}/")}
-    report.files = listed - len(others)
-    report.bytes = sum(len(content or b"") for content in listing.values())
+    report.files, report.bytes = 1 + len(listing), sum(map(len, filter(None, listing.values())))
     faults = lifecycle.changed_files(store, listing)
     report.damage = [Damage(key, fault) for key, fault in faults.items()]
     if not lifecycle.is_root_sound(store):
         report.damage.append(Damage("zarr.json", lifecycle.CHANGED))
+    numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
     sound = check_blocks(store, numbers, report)
     if report.finished:
         check_needed(store, sound, report)
     check_scenes(store, sample, sound, report)
-    if not lock.is_written(store.storage):
-        # Of an unfinished store, no file of a block that a run will write again.
-        report.left_over = sorted(key for key in others if report.finished or not (
-            key.startswith(f"{blocks.BEGUN}/") or store.chunks.number(key) is not None))
     return report
-
-
-def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[str]]:
-    """Return how many files there are, and the keys of those that are no chunk of a checked block.
-
-    There may be 25 million files.
-    """
-    async def others() -> tuple[int, set[str]]:
-        count, left = 0, set()
-        async for key in store.storage.list_prefix(""):
-            count += 1
-            number = store.chunks.number(key)
-            if number is None or number not in checked:
-                left.add(key)
-        return count, left
-
-    return files.sync(others())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -557,14 +513,12 @@ def repair(
     store = lifecycle.open_unchecked(url, "r+")
     before = report_on(store, sample)
     lasting = [each for each in before.damage if before.unstable and each.where == before.unstable]
-    if before.damage == lasting and not before.left_over:
+    if before.damage == lasting:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
     if numbers:
         computable(store)
     with lock.changing(url, store.storage):
-        with translate_errors(url, "written"):
-            files.delete_files(store.storage, before.left_over)
         if any(each.block is None for each in before.damage if each not in lasting):
             lifecycle.reopen(store)
         store = lifecycle.open_store(url, "r+")

@@ -517,16 +517,14 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
 
     finished = store.finished
     done = blocks.check_whole(store, finished=finished)
+    small = store.pipeline.experiment.bytes_of(math.prod(store.blocks.lengths)) <= read_bytes
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
             dataset: xr.Dataset = xr.open_zarr(
-                store.storage, chunks=None, consolidated=False, zarr_format=3)
-            if dataset.nbytes <= read_bytes:
-                dataset = dataset.load()
-            else:
-                dataset = xr.open_zarr(
-                    store.storage, chunks=_together(store), consolidated=False, zarr_format=3)
+                store.storage, chunks=None if small else _together(store), consolidated=False,
+                zarr_format=3)
+            dataset = dataset.load() if small else dataset
             # Short, and asked for one by one.
             together = [
                 name for axis in store.pipeline.axes if axis.zipped for name in axis.columns]
@@ -712,19 +710,23 @@ def read_pipeline(
     StoreError
         If the store cannot be read.
     """
+    found = _pipeline_or_file(source)
+    if isinstance(found, str):
+        return Pipeline.from_toml(found, settings)
+    return Pipeline.from_text(
+        found.text, settings, name=found.name, source=found.source, folder=found.folder)
+
+
+def _pipeline_or_file(source: Pipeline | str | os.PathLike[str]) -> Pipeline | str:
+    """Return a pipeline itself, that of a store, or the path of a file."""
     if isinstance(source, Pipeline):
-        return _with_settings(source, settings, source.source)
-    if not names_store(source):
-        return Pipeline.from_toml(os.fspath(source), settings)
+        return source
     url = os.fspath(source)
+    if not names_store(url):
+        return url
     if "://" not in url and not (Path(url) / "zarr.json").exists():
         raise refusal([f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
-    return _with_settings(open_store(url).pipeline, settings, f"{url} (its pipeline)")
-
-
-def _with_settings(pipeline: Pipeline, settings: Sequence[str], source: str) -> Pipeline:
-    return Pipeline.from_text(
-        pipeline.text, settings, name=pipeline.name, source=source, folder=pipeline.folder)
+    return open_store(url).pipeline
 
 
 def document_of(
@@ -732,12 +734,8 @@ def document_of(
 ) -> dict[str, Any] | None:
     """Return the document of a pipeline, its file or its store; None if it cannot be read."""
     try:
-        if isinstance(source, Pipeline):
-            text = source.text
-        elif names_store(source):
-            text = open_store(os.fspath(source)).pipeline.text
-        else:
-            text = read_regular(os.fspath(source), MAX_BYTES).decode()
+        found = _pipeline_or_file(source)
+        text = read_regular(found, MAX_BYTES).decode() if isinstance(found, str) else found.text
         document = read_document(text)
         apply_settings(document, parse_settings(settings))
     except (OSError, ValueError, SweepError):

@@ -8,7 +8,6 @@ import os
 import re
 import sys
 import tempfile
-import uuid
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ from zarr.storage import FsspecStore, LocalStore
 
 from sweep.errors import StoreError
 from sweep.messages import nearest_file, plain
-from sweep.store.files import delete_files, read_files, write_document
+from sweep.store.files import read_files
 
 # --------------------------------------------------------------------------------------------------
 # Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
@@ -242,11 +241,6 @@ def check_writable(url: str) -> None:
     if is_remote(checked_url(url)):
         if url.partition("://")[0].lower() in ("http", "https"):
             raise StoreError(f"{url}: can only be read; choose a path or s3://")
-        trial = f".sweep-{uuid.uuid4().hex}"
-        with translate_errors(url, "written"):
-            storage = storage_at(url, read_only=False)
-            write_document(storage, trial, {})
-            delete_files(storage, [trial])
         return
     with translate_errors(url, "written"):
         around = enclosing_store(Path(url).absolute().parent)

@@ -256,7 +256,7 @@ def limit(
     # The child imports its packages while this process does.
     with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
         source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
-        limits, summary = library.limit_search.search_limits(
+        limits, summary = library.runner.search_limits(
             source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
             store=store, progress=report, child=child, **options)
     for line in summary.warnings if summary is not None else ():

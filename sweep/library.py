@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sweep.diagnosis import diagnosis, observations
     from sweep.evaluation import block, inspection
     from sweep.exchange import answers, export, score
-    from sweep.execution import forecast, limit_search, progress, runner, status
+    from sweep.execution import forecast, progress, runner, status
     from sweep.experiment import parameters, pipeline, sampling
     from sweep.fitting import folders
     from sweep.integrity import verification

@@ -136,7 +136,7 @@ def limit(
     figure = library.output_file.figure_file(output)
     SESSION.stopped = CONTINUES
     with Child(BLOCK_TASK) as child, library.progress.progress_display() as display:
-        limits, summary = library.limit_search.search_limits(
+        limits, summary = library.runner.search_limits(
             pipeline, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
             settings=settings, store=store, begin=announce_compilation, workers=workers,
             scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=display,

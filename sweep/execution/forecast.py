@@ -10,7 +10,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -298,23 +298,71 @@ SAMPLED_RECEIPTS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Demand:
-    """The cost of a run.
+class Forecast:
+    """The expected cost of a run.
 
     Attributes
     ----------
-    seconds, workers
-        Time, with so many workers.
-    bytes
-        Bytes that it writes, before compression.
-    files
-        How many files it makes.
+    poses, results
+        Cells of the scene axes; estimates, which are poses times configurations.
+    block, blocks
+        Scenes of a block along each scene axis; number of blocks.
+    files, bytes
+        Files that the run makes; bytes that it writes, before compression.
+    worker_bytes
+        Memory of a worker.
+    pose_s, sampled
+        Mean seconds a pose, all configurations included; scenes that were measured.
+    over
+        Whether the measurement was abandoned: a pose takes more than ``pose_s``.
+    workers, seconds
+        Number of workers, and how long they would take.
+    least_share
+        Share of the poses that is computed in any case: of a run in waves the first wave. All else
+        is that of all poses.
     """
 
-    seconds: float
-    workers: int
-    bytes: int
+    poses: int
+    results: int
+    block: tuple[int, ...]
+    blocks: int
     files: int
+    bytes: int
+    worker_bytes: int
+    pose_s: float
+    sampled: int
+    over: bool
+    workers: int
+    seconds: float
+    least_share: float
+
+
+def forecast_of(
+    pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int, left: int | None = None
+) -> Forecast:
+    """Return the expected cost of a run; of its time, files and bytes for ``left`` of its blocks.
+
+    A block has a file for each variable, and its receipt.
+    """
+    poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
+    left_poses = math.ceil(poses * left / max(len(blocks), 1))
+    # Of a child that ended, the memory was at most this.
+    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    return Forecast(
+        poses=poses,
+        results=pipeline.size(*Stage),
+        block=blocks.extents,
+        blocks=len(blocks),
+        files=left * (len(pipeline.experiment.variables) + 1),
+        bytes=pipeline.experiment.bytes_of(left_poses),
+        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
+        pose_s=timing.scene_s,
+        sampled=timing.sampled,
+        over=timing.over,
+        workers=workers,
+        seconds=START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1)),
+        least_share=least_share(pipeline),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,31 +387,10 @@ def free_disk(url: str) -> FreeDisk | None:
     return None
 
 
-def demand_of(
-    pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int
-) -> Demand:
-    """Return the cost of the ``left`` of a run's blocks.
-
-    A block has a file for each variable, and its receipt.
-    """
-    poses = math.ceil(pipeline.size(Stage.scene) * left / max(blocks, 1))
-    files = left * (len(pipeline.experiment.variables) + 1)
-    return Demand(poses * scene_s / workers, workers, pipeline.experiment.bytes_of(poses), files)
-
-
-def objections(
-    demand: Demand, free: FreeDisk | None, *, up_to: bool = False
-) -> list[str]:
+def objections(demand: Forecast, free: FreeDisk | None, *, up_to: bool = False) -> list[str]:
     """Return why a run has to be confirmed; nothing if it need not be.
 
     ``up_to``: the demand is the most that it may take.
-
-    Examples
-    --------
-    >>> objections(Demand(3e5, 2, 10**13, 9), FreeDisk(10**12, None))
-    ['takes about 3.5 days with 2 workers', 'writes 10 TB before compression, and 1 TB are free']
-    >>> objections(Demand(60, 2, 10**9, 9), FreeDisk(10**12, None))
-    []
     """
     found, about = [], "up to" if up_to else "about"
     if demand.seconds > MAX_S:
@@ -379,14 +406,11 @@ def objections(
     return found
 
 
-def check_affordable(
-    url: str, pipeline: Pipeline, scene_s: float, workers: int, blocks: int, left: int
-) -> None:
-    """Raise StoreError if the ``left`` of a run's blocks have to be confirmed.
+def check_affordable(url: str, pipeline: Pipeline, demand: Forecast) -> None:
+    """Raise StoreError if a run has to be confirmed.
 
     A run whose sampling stops is judged by all its trials: how many it needs, nobody knows.
     """
-    demand = demand_of(pipeline, scene_s, workers, blocks, left)
     if found := objections(demand, free_disk(url), up_to=pipeline.stopping is not None):
         raise StoreError(
             f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
@@ -394,11 +418,11 @@ def check_affordable(
         )
 
 
-def scene_s_of(store: RunStore, done: AbstractSet[int]) -> float:
-    """Return the mean seconds a scene of some committed blocks; assumed if there are none."""
+def timing_of(store: RunStore, done: AbstractSet[int]) -> Timing:
+    """Return the cost of a scene of some committed blocks; assumed if there are none."""
     some = sorted(done)[:SAMPLED_RECEIPTS]
     spent = [receipt.wall_s / receipt.scenes for _, receipt in receipts(store, some)]
-    return statistics.fmean(spent) if spent else BLOCK_S / len(store.blocks[0])
+    return Timing(statistics.fmean(spent) if spent else BLOCK_S / len(store.blocks[0]), len(spent))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -410,38 +434,6 @@ PLAN_S = 12.0
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
 
-
-
-@dataclass(frozen=True, slots=True)
-class Forecast(Demand):
-    """The expected cost of a run.
-
-    Attributes
-    ----------
-    poses, results
-        Cells of the scene axes; estimates, which are poses times configurations.
-    block, blocks
-        Scenes of a block along each scene axis; number of blocks.
-    worker_bytes
-        Memory of a worker.
-    pose_s, sampled
-        Mean seconds a pose, all configurations included; scenes that were measured.
-    over
-        Whether the measurement was abandoned: a pose takes more than ``pose_s``.
-    least_share
-        Share of the poses that is computed in any case: of a run in waves the first wave. All else
-        is that of all poses.
-    """
-
-    poses: int
-    results: int
-    block: tuple[int, ...]
-    blocks: int
-    worker_bytes: int
-    pose_s: float
-    sampled: int
-    over: bool
-    least_share: float
 
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
@@ -474,26 +466,12 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
             f"a measured scene crashed its process ({last_line(error)}); "
             "`sweep run` isolates it and computes the others"
         ) from None
-    poses, least = pipeline.size(Stage.scene), least_share(pipeline)
-    small = workers is None and least * poses * timing.scene_s < SMALL_RUN_S
-    count = workers or (1 if small else default_workers())
+    least = least_share(pipeline) * pipeline.size(Stage.scene) * timing.scene_s
+    here = default_workers()
+    count = workers or (1 if least < SMALL_RUN_S else here)
     blocks = blocks_of(pipeline, timing.scene_s, count)
-    busy = min(count, default_workers(), len(blocks))
-    demand = demand_of(pipeline, timing.scene_s, busy, len(blocks), len(blocks))
-    # The child ended: its memory was at most this.
-    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    return Forecast(
-        START_S + demand.seconds, count, demand.bytes, demand.files,
-        poses=poses,
-        results=pipeline.size(*Stage),
-        block=blocks.extents,
-        blocks=len(blocks),
-        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
-        pose_s=timing.scene_s,
-        sampled=timing.sampled,
-        over=timing.over,
-        least_share=least,
-    )
+    expected = forecast_of(pipeline, timing, blocks, min(count, here))
+    return replace(expected, workers=count)
 
 
 def least_share(pipeline: Pipeline) -> float:

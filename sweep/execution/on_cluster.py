@@ -126,8 +126,8 @@ def _checked_address(address: str) -> str:
     except TimeoutError:
         reason = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
     except Exception as error:
-        reason = (f"cannot connect: {exception_line(error)}; "
-                  f"expected an address such as tcp://host:8786, or {LOCAL}")
+        reason = (f"expected an address such as tcp://host:8786, or {LOCAL}; "
+                  f"cannot connect: {exception_line(error)}")
     else:
         if kind == "Scheduler":
             return address

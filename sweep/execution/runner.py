@@ -8,9 +8,10 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sweep.errors import (
@@ -21,20 +22,15 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast
+from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
-from sweep.execution.reuse import is_reusable, match
-from sweep.execution.status import (
-    Summary,
-    Totals,
-    close,
-    drop_failed,
-    failed_blocks,
-    summary_of,
-)
+from sweep.execution.status import Summary, Totals, close, drop_failed, failed_blocks, summary_of
 from sweep.execution.waves import InWaves, Work, condition_count
+from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import search_settings, texts_in
 from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.measure.flags import DetectionStatus
@@ -47,6 +43,7 @@ from sweep.store.lock import changing, is_written, writing
 from sweep.store.provenance import differences
 
 if TYPE_CHECKING:
+    import xarray as xr
     from distributed import Client
 
     from sweep.execution.on_cluster import Cluster
@@ -143,12 +140,13 @@ def execute(
         child = stack.enter_context(child or Child(BLOCK_TASK))
         check_plugins(child, pipeline)
         if begun is not None and done:
-            scene_s, left = forecast.scene_s_of(begun, done), 1 - len(done) / len(begun.blocks)
+            timing = forecast.timing_of(begun, done)
+            left = 1 - len(done) / len(begun.blocks)
         else:
             timing = forecast.measure(
                 child, pipeline, time_limit_s or TIME_LIMIT_S, assumed_s=forecast.UNMEASURED_S)
             # In waves, nobody knows how much more than the first one is needed.
-            scene_s, left = timing.scene_s, forecast.least_share(pipeline)
+            left = forecast.least_share(pipeline)
         interrupts = stack.enter_context(Interrupts())
         executor: Executor
         if scheduler is not None or client is not None:
@@ -156,14 +154,14 @@ def execute(
 
             executor = stack.enter_context(connected(pipeline, scheduler, client, workers))
         else:
-            large = left * pipeline.size(Stage.scene) * scene_s >= SMALL_RUN_S
+            large = left * pipeline.size(Stage.scene) * timing.scene_s >= SMALL_RUN_S
             executor = stack.enter_context(Children(
                 child, workers or default_workers(), at_once=large or workers is not None))
         cut = begun.blocks if begun is not None else forecast.blocks_of(
-            pipeline, scene_s, executor.threads, block_s, time_limit_s)
+            pipeline, timing.scene_s, executor.threads, block_s, time_limit_s)
         if not (yes or sources):
-            forecast.check_affordable(
-                url, pipeline, scene_s, executor.threads, len(cut), len(cut) - len(done))
+            forecast.check_affordable(url, pipeline, forecast.forecast_of(
+                pipeline, timing, cut, executor.threads, len(cut) - len(done)))
         if begun is None:
             if overwrite and exists(url):
                 lifecycle.remove_store(url)
@@ -172,7 +170,7 @@ def execute(
             begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
             begun, again = drop_failed(begun)
-        limit_s = forecast.block_time_limit_s(time_limit_s, scene_s * len(begun.blocks[0]))
+        limit_s = forecast.block_time_limit_s(time_limit_s, timing.scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
     return summary_of(lifecycle.open_store(url), computed, time.perf_counter() - started, again)
@@ -193,7 +191,7 @@ def recompute(
         If blocks failed.
     """
     _check_arguments(workers, None, None, None, time_limit_s)
-    each_s = forecast.scene_s_of(store, blocks.committed(store)) * len(store.blocks[0])
+    each_s = forecast.timing_of(store, blocks.committed(store)).scene_s * len(store.blocks[0])
     limit_s = forecast.block_time_limit_s(time_limit_s, each_s)
     with (
         Interrupts() as interrupts, Child(BLOCK_TASK) as child,
@@ -389,3 +387,86 @@ def _continuable_errors(without: str = "") -> Iterator[None]:
         first, *others = str(error).splitlines()
         advice = f"{first}; run it again{without} to continue"
         raise RunError("\n".join([advice, *others])) from None
+
+
+# --------------------------------------------------------------------------------------------------
+# A search for limits: a run along an axis, or a store that has the answer.
+
+#: The most trials of a cell where nothing says how many.
+MAX_TRIALS = 2400
+
+
+def search_limits(
+    source: Pipeline | str | os.PathLike[str], *, require: Sequence[str] = (), along: str = "",
+    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+    max_trials: int | None = None,
+    settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
+    begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
+) -> tuple[xr.Dataset, Summary | None]:
+    """Run a search, and return its limits and the run's summary, None if nothing had to run.
+
+    Parameters
+    ----------
+    source
+        A pipeline, its file, or a store: one of a search is continued, and one of equally many
+        trials everywhere is analysed as it is.
+    require, along, per, at_all, max_trials, store
+        As `sweep.limit` has them.
+    settings
+        As ``--set`` takes them.
+    begin
+        Is called with the pipeline before it is run.
+    options
+        Of `sweep.execution.runner.execute`.
+
+    Raises
+    ------
+    PipelineError, StoreError, RunError, ArgumentError
+        As `sweep.limit`.
+    """
+    from sweep.analysis.decisions import requirement_limits  # noqa: PLC0415  (slow to import)
+
+    chosen = search_settings(require, along, per, at_all, max_trials)
+    if not isinstance(source, Pipeline) and lifecycle.names_store(source):
+        stored = lifecycle.open_store(os.fspath(source))
+        if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
+            if not stored.finished:
+                raise StoreError(lifecycle.unfinished_line(stored))
+            results = lifecycle.open_dataset(os.fspath(source))
+            limits = requirement_limits(results, require, along, per, at_all)
+            return limits.assign_attrs(store=os.fspath(source)), None
+        if store is None and not settings:
+            store = source
+    pipeline = _with_search(source, settings, chosen)
+    rule = pipeline.stopping
+    assert rule is not None  # noqa: S101  (the section [search] has been read)
+    begin(pipeline)
+    if store is None:
+        store = Path("runs") / f"{pipeline.name}-limit-{rule.along}.zarr"
+    summary = execute(pipeline, store, **options)
+    limits = requirement_limits(lifecycle.open_dataset(summary.store))
+    return limits.assign_attrs(store=summary.store), summary
+
+
+def _with_search(
+    source: Pipeline | str | os.PathLike[str], settings: Sequence[str], chosen: Sequence[str]
+) -> Pipeline:
+    """Return a pipeline with the section [search] of its document and of what is chosen."""
+    document = lifecycle.document_of(source)
+    if document is None and not isinstance(source, Pipeline):
+        return lifecycle.read_pipeline(source, settings)  # it says why
+    document = document or {}
+    own = document.get(SEARCH, {})
+    given = {*(own if isinstance(own, dict) else ()), *(
+        each.partition("=")[0].partition(".")[2] for each in chosen)}
+    more = [] if "max_trials" in given else search_settings(max_trials=MAX_TRIALS)
+    if "all" not in given and not texts_in(document):
+        raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
+    if "along" not in given:
+        raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
+    pipeline = lifecycle.read_pipeline(source, [*settings, *chosen, *more])
+    if pipeline.requirements:
+        from sweep.analysis.requirements import check_required  # noqa: PLC0415  (slow to import)
+
+        check_required(pipeline.requirements, pipeline.source)
+    return pipeline

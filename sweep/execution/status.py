@@ -276,10 +276,10 @@ def close(store: RunStore) -> None:
         "detection": totals.detection.tolist(), "estimate": totals.estimate.tolist(),
         "processors": dict(totals.processors),
     }
-    if store.pipeline.stopping is not None:
+    if (rule := store.pipeline.stopping) is not None:
         counts["sampled"] = {
             "needed": totals.needed, "conditions": condition_count(store.pipeline),
-            "unsettled": unsettled_count(store),
+            "unsettled": unsettled_count(store, rule),
         }
     finish(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
 

@@ -58,8 +58,9 @@ class InWaves:
     """
 
     def __init__(self, store: RunStore, only: AbstractSet[int] | None = None) -> None:
-        self._rule, sampling = _rule_of(store), make_rule(store.pipeline)
-        assert sampling is not None  # noqa: S101  (there is a section that says so)
+        rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
+        assert rule is not None and sampling is not None  # noqa: PT018, S101  (a section says so)
+        self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._read = sorted({"detection", *sampling.variables})
         self._only = only
@@ -138,9 +139,8 @@ def condition_count(pipeline: Pipeline) -> int:
         pipeline.experiment.scene_axes, _conditions(pipeline), strict=True) if kept)
 
 
-def unsettled_count(store: RunStore) -> int:
+def unsettled_count(store: RunStore, rule: StoppingRule) -> int:
     """Return how many conditions of a complete store would need more than ``max_trials``."""
-    rule = _rule_of(store)
     decider = Decider.of(store, rule)
     decision = Decision(rule, len(rule.ends), tuple(range(len(rule.ends))))
     pooled = tuple(k for k, kept in enumerate(_conditions(store.pipeline)) if not kept)
@@ -153,9 +153,3 @@ def _conditions(pipeline: Pipeline) -> list[bool]:
     per = getattr(pipeline.stopping, "per", None)
     return [axis.name != TRIAL and (per is None or axis.name in per)
             for axis in pipeline.experiment.scene_axes]
-
-
-def _rule_of(store: RunStore) -> StoppingRule:
-    if store.pipeline.stopping is None:
-        raise TypeError(store.url)
-    return store.pipeline.stopping

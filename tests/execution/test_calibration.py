@@ -23,7 +23,7 @@ from sweep.execution.forecast import (
     Timing,
     block_time_limit_s,
     blocks_of,
-    demand_of,
+    forecast_of,
     measure,
 )
 from sweep.experiment.grid import Blocks
@@ -91,7 +91,7 @@ def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_
         f"[pose]\njitter_px = 0.5\n[axes]\n{axes}\ntrial = {lengths[-1]}")
     blocks = blocks_of(pipeline, scene_s, 64)
     assert len(blocks) <= MAX_BLOCKS
-    assert demand_of(pipeline, scene_s, 64, len(blocks), len(blocks)).files <= 3_000_000
+    assert forecast_of(pipeline, Timing(scene_s, 1), blocks, 64).files <= 3_000_000
     assert math.prod(blocks.extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS
 
 

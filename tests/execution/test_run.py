@@ -15,8 +15,7 @@ import sweep
 from support.commands import started
 from support.stores import GRID, by_hand, same
 from sweep.errors import ArgumentError, MachineFaultError, StoreError
-from sweep.execution.block_task import compute_block
-from sweep.execution.reuse import match
+from sweep.execution.block_task import compute_block, match
 from sweep.execution.runner import execute
 from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline

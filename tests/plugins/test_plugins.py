@@ -22,8 +22,7 @@ from sweep.analysis.dataset import parameter_value
 from sweep.cli import main
 from sweep.errors import OtherExperimentError, PipelineError, PluginError, StoreError
 from sweep.evaluation.inspection import scene_image
-from sweep.execution.block_task import other_here
-from sweep.execution.reuse import match
+from sweep.execution.block_task import match, other_here
 from sweep.execution.runner import execute
 from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline

@@ -14,8 +14,7 @@ import sweep
 from support.stores import by_hand, editable, same
 from sweep.cli import main
 from sweep.errors import StoreError
-from sweep.execution.block_task import compute_block
-from sweep.execution.reuse import match
+from sweep.execution.block_task import compute_block, match
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline

@@ -33,27 +33,13 @@ from sweep.typing import Floats
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 
 SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-#: Text; secondary text and lines; grid lines; shaded areas; background.
-INK, FAINT, RULE, STRIP, PAPER = "#282828", "#7a7a7a", "#e6e6e6", "#f3f3f3", "#ffffff"
+#: Text; secondary text and lines; background.
+INK, FAINT, PAPER = "#282828", "#7a7a7a", "#ffffff"
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
-#: Settings of matplotlib in which every panel is drawn.
-MATPLOTLIB_STYLE: Any = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "sweep",
-    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "sans-serif"],
-    "text.parse_math": False,
-    "axes.edgecolor": FAINT, "axes.labelcolor": INK, "axes.titlecolor": INK,
-    "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.titleweight": "bold",
-    "axes.labelsize": 8.5, "axes.linewidth": 0.7, "axes.axisbelow": True,
-    "axes.spines.top": False, "axes.spines.right": False,
-    "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "xtick.color": FAINT, "ytick.color": FAINT,
-    "xtick.labelcolor": INK, "ytick.labelcolor": INK,
-    "grid.color": RULE, "grid.linewidth": 0.7, "text.color": INK,
-    "legend.frameon": False, "legend.fontsize": 8.5, "legend.labelcolor": INK,
-    "font.size": 8.5, "lines.linewidth": 1.5, "figure.constrained_layout.use": True,
-}
+#: Settings of matplotlib in which every panel is drawn, whatever the user's own are.
+STYLE = Path(__file__).parent / "templates" / "figure.mplstyle"
 
 #: Inches of a panel, and of a line of its legend.
 WIDTH, HEIGHT, LINE_HEIGHT = 4.4, 3.2, 0.15
@@ -357,7 +343,7 @@ def panels_file(panels: Sequence[Panel], suffix: str) -> bytes:
     columns = min(len(panels), COLUMNS)
     heights = [max(panel.height for panel in panels[k : k + columns])
                for k in range(0, len(panels), columns)]
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(fname=STYLE):
         canvas = Canvas((columns * WIDTH, sum(heights)))
         grid = canvas.add_gridspec(len(heights), columns, height_ratios=heights)
         for k, panel in enumerate(panels):

@@ -134,10 +134,6 @@ def figure(
 # The figures.
 
 
-def _by_size(data: ReportData) -> Figure | None:
-    return None if data.size is None else _along(data, data.size)
-
-
 def _along(data: ReportData, name: str) -> Figure:
     """Return the figure of rates and errors along an axis, the area, or a drawn parameter.
 
@@ -196,10 +192,10 @@ def _configurations(data: ReportData) -> Figure | None:
     known = report_data.configurations(data)
     if not known.several:
         return None
-    axes = {axis.name: axis for axis in data.pipeline.axes}
-    covers = [name for name, some in known.axes.items()
-              if len(some) == data.length(name)
-              and (not axes[name].is_numeric or data.length(name) < MIN_DRAWN)]
+    covers = [
+        axis.name for axis in data.pipeline.axes
+        if len(known.axes.get(axis.name, ())) == len(axis)
+        and (not axis.is_numeric or len(axis) < MIN_DRAWN)]
     return figure(
         data, known.summary, {}, "configurations",
         f"Configurations compared: {', '.join(known.axes)}",
@@ -281,7 +277,7 @@ WEAKEST = 24
 
 def _ranking(data: ReportData) -> Figure | None:
     """Return the weakest marker IDs of the first configuration's detector."""
-    if data.length(IDS) < 2:
+    if data.results.sizes.get(IDS, 1) < 2:
         return None
     known = report_data.configurations(data)
     settings = {axis.name for axis in data.pipeline.axes_of(Stage.detection)} & known.axes.keys()
@@ -295,7 +291,7 @@ def _ranking(data: ReportData) -> Figure | None:
     table = table_of(summary, "IDs by detection rate, with 95 % intervals", dims, (
         *RATES, Column("expected, %", "expected_rate", 100), Column("p, adjusted", "p_adjusted"),
         Column("weak", "weak")), data.results, counted="looked_for")
-    rates, weak = table.column(DETECTED.heading), table.column("weak")
+    rates, weak = (table.frame[name].tolist() for name in (DETECTED.heading, "weak"))
     order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k].value))
     return Figure(
         "ranking", f"Marker IDs, the weakest first{whose}", sentences(
@@ -410,7 +406,8 @@ def threshold_tables(data: ReportData) -> list[Table]:
 
 #: Makers of figures, None for a store that a figure does not fit; add one here.
 FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
-    _by_size, _bias, _configurations, _trade, _ambiguity, _outcomes, _frame, _ranking, _bound,
+    lambda data: None if data.size is None else _along(data, data.size), _bias, _configurations,
+    _trade, _ambiguity, _outcomes, _frame, _ranking, _bound,
 )
 
 

@@ -46,8 +46,9 @@ def check_output_file(path: Path) -> None:
         If it is a folder, or if it cannot be written.
     """
     with write_errors_explained(path):
-        if _is_replaced(path):
-            check_folder_writable(_target(path).parent)
+        target = _target(path)
+        if target is not None:
+            check_folder_writable(target.parent)
 
 
 def write_output_file(path: Path, content: bytes) -> None:
@@ -59,8 +60,9 @@ def write_output_file(path: Path, content: bytes) -> None:
         As :func:`check_output_file`, or if the disk is full.
     """
     with write_errors_explained(path):
-        if _is_replaced(path):
-            write_whole(_target(path), content)
+        target = _target(path)
+        if target is not None:
+            write_whole(target, content)
             return
         descriptor = _standard_stream(path)
         with open(path if descriptor is None else os.dup(descriptor), "wb") as file:  # noqa: PTH123
@@ -90,22 +92,18 @@ def write_errors_explained(path: Path) -> Iterator[None]:
         raise StoreError(f"{plain(path, 300)}: cannot be written: {reason_of(error)}") from None
 
 
-def _is_replaced(path: Path) -> bool:
-    """Return whether a path is, or will be, a file of its own; StoreError if it is a folder."""
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return True
-    if path.is_dir():
-        raise StoreError(f"{path}: cannot be written: it is a folder; choose a file in it")
-    return path.is_file() and not is_standard_stream(path)
+def _target(path: Path) -> Path | None:
+    """Return the file that a path names, behind links; None for what cannot be replaced.
 
-
-def _target(path: Path) -> Path:
-    """Return the file that a path names, behind links; StoreError if its folder is missing.
-
-    Without a link it stays relative: the folders above the current one need not be readable.
+    StoreError if it is a folder, or its folder is missing. Without a link it stays relative: the
+    folders above the current one need not be readable.
     """
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        path.stat()  # of a link in a circle, or a name that is too long, it raises
+        if path.is_dir():
+            raise StoreError(f"{path}: cannot be written: it is a folder; choose a file in it")
+        if not path.is_file() or is_standard_stream(path):
+            return None
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     if not target.parent.is_dir():
         raise StoreError(f"{path}: cannot be written: folder {target.parent} not found")

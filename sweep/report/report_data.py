@@ -114,20 +114,15 @@ class ReportData:
 
     # Roles of the axes.
 
-    def length(self, name: str) -> int:
-        """Return the number of an axis' values; 0 if the axis does not exist."""
-        axis = self.pipeline.axis(name)
-        return len(axis) if axis is not None else 0
-
     @property
     def size_axis(self) -> str | None:
         """The axis along which the marker's size in the image changes."""
-        return next((name for name in SIZE_AXES if self.length(name) > 1), None)
+        return next((name for name in SIZE_AXES if self.results.sizes.get(name, 1) > 1), None)
 
     @property
     def angle_axis(self) -> str | None:
         """The axis along which the marker is turned away: the tilt, or the viewing angle."""
-        return next((name for name in ANGLES if self.length(name) > 1), None)
+        return next((name for name in ANGLES if self.results.sizes.get(name, 1) > 1), None)
 
     @functools.cached_property
     def areas(self) -> Floats:
@@ -192,19 +187,13 @@ class ReportData:
         Raises
         ------
         KeyError
-            If the axis does not exist.
+            If there is none of that name.
         """
-        if name == AREA:
-            return {name: bins_of(self.areas, DRAWN_BINS)}
-        values = self.results[name]
-        if name in self.drawn_parameters:
-            return {name: bins_of(np.ravel(values).astype(np.float64), DRAWN_BINS)}
         axis = self.pipeline.axis(name)
-        if axis is None:
-            raise KeyError(name)
-        if len(axis) <= most or not axis.is_numeric:
+        if axis is not None and (len(axis) <= most or not axis.is_numeric):
             return {name: None}
-        return {name: bins_of(values.values.astype(np.float64), most)}
+        values = self.areas if name == AREA else np.ravel(self.results[name]).astype(np.float64)
+        return {name: bins_of(values, DRAWN_BINS if axis is None else most)}
 
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
@@ -453,8 +442,8 @@ def grouped(
 def notes_of(data: ReportData, groups: Groups) -> str:
     """Return sentences for the reader about bins, and configurations that are left out."""
     return " ".join([*(
-        f"{len(some)} of the {data.length(name):,} values of {name} are shown."
+        f"{len(some)} of the {data.results.sizes[name]:,} values of {name} are shown."
         for name, some in configurations(data).axes.items()
-        if len(some) < data.length(name) and name not in groups), *(
+        if len(some) < data.results.sizes[name] and name not in groups), *(
         f"Values of {name} are grouped into {len(edges) - 1} bins of about as many each."
         for name, edges in groups.items() if edges is not None)])

@@ -260,11 +260,6 @@ class Table:
         """The columns' headings."""
         return list(map(str, self.frame.columns))
 
-    def column(self, heading: str) -> list[Any]:
-        """Return the cells of a column."""
-        cells: list[Any] = self.frame[heading].tolist()
-        return cells
-
     @property
     def rows(self) -> list[list[str]]:
         """The texts of all rows."""

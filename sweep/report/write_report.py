@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 import os
 import re
 import shlex
@@ -155,7 +153,6 @@ def check_output(output: Path, folders: Sequence[Path]) -> None:
             if folder.is_dir():
                 check_folder_writable(folder)
             elif os.path.lexists(folder):
-                folder.stat()  # a link that leads nowhere, or in a circle
                 raise StoreError(f"{folder}: cannot hold figures: it is a file; choose a folder")
             else:
                 check_output_file(folder)  # it can be made
@@ -183,24 +180,13 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
         ``pipeline`` and ``file``: the pipeline's text, and the name of its file.
     """
     run, pipeline = data.run_metadata, data.pipeline
-    fingerprint: dict[str, Any] = dict(run.get("fingerprint", {}))
-    environment: dict[str, Any] = dict(run.get("environment", {}))
-    versions = {"sweep": environment.get("sweep"), "OpenCV": fingerprint.get("opencv"),
-                "NumPy": fingerprint.get("numpy"), "Numba": fingerprint.get("numba"),
-                "Python": environment.get("python")}
-    files = dict(fingerprint.get("files", {}))
-    digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
         "Store": data.store,
         "Camera": "; ".join([pipeline.facts.camera_line, *pipeline.facts.camera_notes]),
         "Run": " to ".join(str(run[name]) for name in ("created", "finished_at") if name in run),
         "Sampling": sampling_text(data.results),
-        "Versions": ", ".join(f"{name} {value}" for name, value in versions.items() if value),
-        "Processor": str(environment.get("cpu", "unknown")),
-        "Seed": str(fingerprint.get("seed", pipeline.seed)),
-        "Fingerprint": f"{digest[:16]} (numbers {fingerprint.get('numbers', '?')})",
-        "Files": ", ".join(f"{name} (SHA-256 {sha256[:12]}\u2026)"
-                           for name, sha256 in files.items()),
+        **{name: _recorded(value) for part in ("environment", "fingerprint")
+           for name, value in dict(run.get(part, {})).items()},
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
     store = shlex.quote(data.store)
@@ -221,6 +207,12 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
         "pipeline": pipeline.text,
         "file": f"{pipeline.name}.toml",
     }
+
+
+def _recorded(value: Any) -> str:
+    """Return what a run recorded of itself as text; of digests the first digits."""
+    return ", ".join(f"{name} {text:.20}" for name, text in value.items()) if isinstance(
+        value, Mapping) else str(value)
 
 
 def _meaning(axis: Axis) -> str:

@@ -25,9 +25,8 @@ from sweep.messages import nearest, plain, refusal
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey, read_regular
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
-from sweep.photographs.cameras import camera_of_file, lens_of
+from sweep.photographs.cameras import camera_of_file, cameras_of, lens_of
 from sweep.photographs.folder import detect_markers
-from sweep.photographs.pose_fit import cameras_of
 from sweep.typing import Floats, Integers
 
 # Columns of numbers; further ones are refused, empty cells are unknown.
@@ -333,7 +332,7 @@ def _detected(
     corners = []
     for row, (image, wanted) in enumerate(zip(images, table["marker_id"], strict=True)):
         try:
-            ids, quads = detect_markers(find, decode_grey(str(image)), dictionary)
+            ids, quads, _ = detect_markers(find, decode_grey(str(image)), dictionary)
         except (OSError, ValueError) as error:
             raise ArgumentError("observations", plain(image), str(error)) from None
         chosen = quads if np.isnan(wanted) else quads[ids == wanted]

@@ -24,7 +24,7 @@ from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
-from sweep.photographs.pose_fit import Lens, cameras_of
+from sweep.photographs.cameras import Lens, cameras_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

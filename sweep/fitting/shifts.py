@@ -16,7 +16,7 @@ from sweep.fitting.photograph_fit import CORNERS, OWN, MarkerState, products
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.solver import marker_frame, of_board
-from sweep.photographs.pose_fit import fit_pose
+from sweep.photographs.cameras import fit_pose
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

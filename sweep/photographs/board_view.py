@@ -157,7 +157,7 @@ MAX_SIZE_ERROR = 0.08
 #: Share of the markers of a single photograph that must lie there, and how many tell.
 MIN_OWN, MIN_JUDGED = 0.6, 4
 
-#: Photographs in which other dictionaries, and halves side by side, are searched for.
+#: Photographs in which other dictionaries are searched for.
 MAX_TRIED = 3
 
 
@@ -172,7 +172,7 @@ def check_board(
     ArgumentError
         One line: the fault, and which board fits.
     """
-    _check_halves(board, find, photographs)
+    _check_halves(seen, photographs)
     ids = sorted({each for one in seen for each in one.ids.tolist()})
     fault = ""
     if not ids:
@@ -315,22 +315,12 @@ def _others(path: Path) -> Iterator[tuple[str, Board]]:
         ), other
 
 
-def _check_halves(
-    board: Board, find: FindFunction, photographs: Sequence[Photograph]
-) -> None:
+def _check_halves(seen: Sequence[SeenMarkers], photographs: Sequence[Photograph]) -> None:
     """Refuse images of two cameras side by side: most of their markers are in both halves."""
-    both = whole = 0
-    for _, _, image in photographs[:MAX_TRIED]:
-        height, width = image.shape
-        if width < 2 * height:
-            continue
-        left, right = (
-            set(detect_markers(find, half, board.dictionary).ids.tolist())
-            for half in (image[:, : width // 2], image[:, width // 2 :])
-        )
-        both += len(left & right)
-        whole += len(left | right)
-    if whole >= MIN_JUDGED and both > whole / 2:
+    height, width = photographs[0].image.shape
+    twice = sum(one.repeated for one in seen)
+    every = twice + sum(len(one.ids) for one in seen)
+    if width >= 2 * height and every >= MIN_JUDGED and twice > every / 2:
         raise ArgumentError(
             "folders", plain(photographs[0].path.parent, 300),
             "most markers are in both halves of the images: of two cameras side by side give the "

@@ -1,4 +1,4 @@
-"""Cameras of photographs: from files, or calibrated from the photographs themselves."""
+"""Cameras of photographs, from files or calibrated from them; and poses of what they see."""
 
 from __future__ import annotations
 
@@ -9,31 +9,202 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError
 from sweep.experiment.pipeline import file_and_camera
 from sweep.measure import intrinsics
 from sweep.measure.flags import CalibrationStatus
+from sweep.measure.solver import GuardedPoints
 from sweep.messages import plain
 from sweep.model.calibration import MAX_BYTES, Calibration, calibration_of, read_tree
+from sweep.model.camera import Cameras
 from sweep.model.image_file import read_regular
+from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.board_view import FoundCorners
-from sweep.photographs.pose_fit import Lens, fitted_board
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 
-class KnownCamera(NamedTuple):
-    """A camera: its lens, the errors of its numbers as far as known, and a line on it.
+class Lens(NamedTuple):
+    """A camera as OpenCV takes it: matrix (3, 3) and coefficients (0, 4, 5, 8, 12 or 14)."""
 
-    ``sd`` are their standard deviations, ``covariance`` (c, c) is None if it is not known.
+    matrix: Floats
+    distortion: Floats
+
+    @staticmethod
+    def of(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]) -> Lens:
+        """Return a camera from its numbers."""
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Lens(matrix, np.array(distortion, dtype=np.float64))
+
+    def project(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
+        """Return the images (n, 2) of points (n, 3) of a target."""
+        return self.derivatives(points, rotation, translation)[0]
+
+    def derivatives(
+        self, points: Floats, rotation: Floats, translation: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return images (n, 2) with derivatives by the pose (2 n, 6) and by the camera (2 n, c).
+
+        The pose changes by a rotation vector in the camera's frame, about the target's origin,
+        and by a translation. The derivative by a point in the camera's frame is OpenCV's by the
+        translation. The camera's numbers are fx, fy, cx, cy and the coefficients.
+        """
+        turned = points @ rotation.T
+        image, jacobian = cv2.projectPoints(
+            np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
+            self.distortion if len(self.distortion) else None,
+        )
+        slopes = np.asarray(jacobian, dtype=np.float64)
+        by_point = slopes[:, 3:6].reshape(-1, 2, 3)
+        by_turn = np.cross(turned[:, None, :], by_point)
+        return (
+            np.asarray(image, dtype=np.float64).reshape(-1, 2),
+            np.concatenate([by_turn, by_point], axis=2).reshape(-1, 6),
+            slopes[:, 6 : 10 + len(self.distortion)],
+        )
+
+
+def lens_of(calibration: Calibration) -> Lens:
+    """Return the camera of a calibration."""
+    return Lens.of(
+        calibration.fx_px, calibration.fy_px, calibration.cx_px, calibration.cy_px,
+        calibration.distortion,
+    )
+
+
+def cameras_of(lens: Lens, count: int) -> Cameras:
+    """Return ``count`` equal cameras as solvers take them."""
+    matrix, packed = lens.matrix, pack(tuple(lens.distortion.tolist()))
+    view = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    return Cameras(
+        np.repeat(view[None], count, axis=0), np.repeat(packed[None], count, axis=0),
+        np.full(count, bool(packed[:14].any())),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# The pose of a rigid target from many points: least squares, with its covariance.
+
+MAX_STEPS = 20
+
+#: Step, in rad and in shares of the distance, below which the iteration ends.
+CONVERGED = 1e-9
+
+#: Residuals beyond this many robust standard deviations are left out.
+OUTLIER = 4.0
+
+MIN_OUTLIER_PX = 0.5
+
+#: Corners of a board, without the marker's own, from which its pose is taken for known.
+MIN_CORNERS = 6
+
+
+class FittedPose(NamedTuple):
+    """A fitted pose.
+
+    Attributes
+    ----------
+    rotation, translation
+        (3, 3) and (3,) m, target to camera.
+    covariance
+        (6, 6) rotation vector in the camera's frame (rad), position (m): from the residuals'
+        variance, as if they were independent.
+    residuals
+        (n, 2) px of all points.
+    used
+        (n,) which points are no outliers.
     """
 
-    lens: Lens
-    sd: tuple[float, ...] = ()
-    line: str = ""
-    covariance: Floats | None = None
+    rotation: Floats
+    translation: Floats
+    covariance: Floats
+    residuals: Floats
+    used: Masks
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the used residuals' lengths."""
+        return float(np.sqrt((self.residuals[self.used] ** 2).sum(axis=1).mean()))
+
+
+def fit_pose(
+    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats,
+    used: Masks | None = None,
+) -> FittedPose | None:
+    """Return the pose of least squares from a start; None without 4 points, or if it diverges.
+
+    Gauss-Newton steps in the camera's frame: a rotation vector, as OpenCV's functions have it, is
+    singular at the half turn of a board that faces the camera. Without ``used`` outliers are left
+    out: those beyond :data:`OUTLIER` robust standard deviations, in two rounds.
+
+    Parameters
+    ----------
+    lens
+        The camera.
+    points, pixels
+        (n, 3) m and (n, 2) px.
+    rotation, translation
+        The start.
+    used
+        (n,) the points to use.
+    """
+    chosen = np.ones(len(points), dtype=bool) if used is None else used
+    for last in ((False, False, True) if used is None else (True,)):
+        if chosen.sum() < 4:
+            return None
+        solved = _gauss_newton(lens, points[chosen], pixels[chosen], rotation, translation)
+        if solved is None:
+            return None
+        rotation, translation, covariance = solved
+        residuals = lens.project(points, rotation, translation) - pixels
+        if not last:
+            length = np.linalg.norm(residuals, axis=1)
+            # The median length of a two-dimensional normal residual is 1.177 standard deviations.
+            spread = float(np.median(length)) / 1.177
+            chosen = length <= max(OUTLIER * spread, MIN_OUTLIER_PX)
+    return FittedPose(rotation, translation, covariance, residuals, chosen)
+
+
+def _gauss_newton(
+    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
+) -> tuple[Floats, Floats, Floats] | None:
+    """Return rotation, translation and covariance; None if the steps diverge."""
+    for _ in range(MAX_STEPS):
+        image, design, _ = lens.derivatives(points, rotation, translation)
+        residual = (pixels - image).ravel()
+        if not (np.isfinite(design).all() and np.isfinite(residual).all()):
+            return None
+        step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
+        rotation = rotation_of_vector(step[None, :3])[0] @ rotation
+        translation = translation + step[3:]
+        if not translation[2] > 0:
+            return None
+        shift = np.linalg.norm(step[3:]) / np.linalg.norm(translation)
+        if np.linalg.norm(step[:3]) < CONVERGED and shift < CONVERGED:
+            normal = design.T @ design
+            if np.linalg.cond(normal) > 1e18:
+                return None
+            variance = float(residual @ residual) / max(len(residual) - 6, 1)
+            return rotation, translation, np.asarray(variance * np.linalg.inv(normal), np.float64)
+    return None
+
+
+def fitted_board(lens: Lens, found: FoundCorners) -> FittedPose | None:
+    """Return a board's pose; None with too few corners."""
+    if len(found.points) < MIN_CORNERS:
+        return None
+    guard = GuardedPoints.of(found.points, found.pixels, cameras_of(lens, 1))
+    fits = [
+        fit_pose(lens, found.points, found.pixels, *start)
+        for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE) for start in guard.poses(method)
+    ]
+    good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
+    return min(
+        good, key=lambda fit: float(np.median((fit.residuals**2).sum(axis=1))), default=None
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -95,21 +266,13 @@ def stereo_of_file(written: str, size: tuple[int, int]) -> tuple[StereoCamera, l
     return StereoCamera(lens_of(cameras[0]), lens_of(cameras[1]), u @ vt, translation), cameras
 
 
-def lens_of(calibration: Calibration) -> Lens:
-    """Return the camera of a calibration."""
-    return Lens.of(
-        calibration.fx_px, calibration.fy_px, calibration.cx_px, calibration.cy_px,
-        calibration.distortion,
-    )
+def covariance_of(calibration: Calibration) -> Floats | None:
+    """Return the covariance (c, c) of a camera's numbers, fx, fy, cx, cy and coefficients first.
 
-
-def known_camera(calibration: Calibration) -> KnownCamera:
-    """Return the camera of a calibration, with the errors of its numbers as far as it has them."""
-    covariance = None
-    if calibration.covariance:
-        count = math.isqrt(len(calibration.covariance))
-        covariance = np.reshape(np.array(calibration.covariance), (count, count))
-    return KnownCamera(lens_of(calibration), calibration.sd, covariance=covariance)
+    None if it is not known.
+    """
+    count = math.isqrt(len(calibration.covariance))
+    return np.reshape(calibration.covariance, (count, count)) if count else None
 
 
 @contextlib.contextmanager
@@ -231,16 +394,18 @@ def _median_rms(lens: Lens, found: Sequence[FoundCorners]) -> float:
 #: Photographs with a board from which a camera is calibrated.
 MIN_PHOTOGRAPHS = 4
 
-#: Corners of a board in a photograph that is used.
-MIN_CORNERS = 12
+#: Corners of a board in a photograph from which a camera is calibrated.
+MIN_CALIBRATING = 12
 
 #: RMS of the corners beside the calibrated camera that is refused, in images of 800 px or less; in
 #: larger ones it grows with the width.
 MAX_RMS_PX = 2.0
 
 
-def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCamera:
-    """Calibrate a camera with five coefficients (:func:`sweep.measure.intrinsics.calibrate`).
+def calibrate(
+    size: tuple[int, int], found: Sequence[FoundCorners]
+) -> tuple[Calibration, str]:
+    """Return a camera with five coefficients, and a line (:mod:`sweep.measure.intrinsics`).
 
     Parameters
     ----------
@@ -254,16 +419,16 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCame
     ArgumentError
         If too few photographs show enough of the board.
     """
-    used = [each for each in found if len(each.points) >= MIN_CORNERS]
+    used = [each for each in found if len(each.points) >= MIN_CALIBRATING]
     made = intrinsics.calibrate(
         [each.points for each in used], [each.pixels for each in used], size
     )
     limit, fault = MAX_RMS_PX * max(1.0, size[0] / 800), ""
     if len(used) < MIN_PHOTOGRAPHS:
         fault = (
-            f"expected {MIN_PHOTOGRAPHS} photographs with at least {MIN_CORNERS} corners of the "
-            f"board, from different sides; there are {len(used)}; take more, or give the file of a "
-            "calibration"
+            f"expected {MIN_PHOTOGRAPHS} photographs with at least {MIN_CALIBRATING} corners of "
+            f"the board, from different sides; there are {len(used)}; take more, or give the file "
+            "of a calibration"
         )
     elif made.status != CalibrationStatus.calibrated:
         fault = (
@@ -289,7 +454,10 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCame
         "(standard deviations; truth_std has of them what truth and estimates do not share)"
     )
     covariance = _covariance(lens, [used[i] for i in made.used], made)
-    return KnownCamera(lens, tuple(made.std.tolist()), line, covariance)
+    return Calibration(
+        *size, fx, fy, cx, cy, tuple(distortion), tuple(made.std.tolist()),
+        tuple(covariance.ravel().tolist()),
+    ), line
 
 
 def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:

@@ -142,10 +142,14 @@ def _conversions(content: bytes) -> list[str]:
 # Markers that are detected in a photograph.
 
 class SeenMarkers(NamedTuple):
-    """Markers in a photograph: IDs (k,), each once, and corners (k, 4, 2) px."""
+    """Markers in a photograph: IDs (k,), each once, and corners (k, 4, 2) px.
+
+    ``repeated`` IDs are there more than once, and left out.
+    """
 
     ids: Integers
     quads: Floats
+    repeated: int = 0
 
     def among(self, ids: Sequence[int]) -> tuple[Integers, Floats]:
         """Return the places (n,) in ``ids`` of those that are there, and their corners."""
@@ -170,5 +174,6 @@ def detect_markers(
         return SeenMarkers(np.empty(0, dtype=np.int64), np.empty((0, 4, 2)))
     numbers = np.asarray(ids).ravel().astype(np.int64)
     once = ~pd.Series(numbers).duplicated(keep=False).to_numpy()
+    repeated = len(np.unique(numbers[~once]))
     corners = np.concatenate(list(quads)).astype(np.float64).reshape(-1, 4, 2)
-    return SeenMarkers(numbers[once], corners[once])
+    return SeenMarkers(numbers[once], corners[once], repeated)

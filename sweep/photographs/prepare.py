@@ -24,14 +24,14 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
 from sweep.model.board import Board
+from sweep.model.calibration import VIEW, Calibration
 from sweep.model.image_file import Part
 from sweep.photographs.board_view import FoundCorners, check_board, find_corners
 from sweep.photographs.cameras import (
-    KnownCamera,
     calibrate,
     camera_of_file,
     check_resolution,
-    known_camera,
+    lens_of,
     stereo_of_file,
 )
 from sweep.photographs.folder import (
@@ -89,7 +89,7 @@ class Side(NamedTuple):
 
     folder: Folder
     part: Part
-    camera: KnownCamera
+    camera: Calibration
     truth: Poses
 
 
@@ -151,25 +151,24 @@ def prepare(
         for each, one in zip(found[0].photographs, seen[0], strict=True)
     ]
     if stereo is not None:
-        rig, calibrations = stereo_of_file(str(stereo), first.size)
-        cameras = [known_camera(each) for each in calibrations]
+        rig, cameras = stereo_of_file(str(stereo), first.size)
         truth = [
             partner_poses(each, first.size, markers.ids, markers.sizes_m, seen[k], seen[1 - k])
             for k, each in enumerate((rig, rig.swapped()))
         ]
     else:
-        cameras = [_camera(first, camera, corners)]
-        lines += [each.line for each in cameras if each.line]
+        one, said = _camera(first, camera, corners)
+        cameras, lines = [one], lines + said
     if poses is not None:
         given, said = poses_of_file(
-            Path(poses), first, markers.ids, markers.sizes_m, cameras[0].lens, seen[0]
+            Path(poses), first, markers.ids, markers.sizes_m, lens_of(cameras[0]), seen[0]
         )
         truth, lines = [given], lines + said
     elif target is not None and (stereo is None or one_camera):
         by_board, said = _poses_of_board(first, cameras[0], camera, target, corners)
         truth, lines = [by_board], lines + said
     elif stereo is None:
-        truth = [own_poses(cameras[0].lens, markers.ids, markers.sizes_m, seen[0])]
+        truth = [own_poses(lens_of(cameras[0]), markers.ids, markers.sizes_m, seen[0])]
     sides = [
         Side(*each) for each in zip(found, parts, cameras, truth, strict=not one_camera)
     ][: 1 if one_camera else None]
@@ -285,19 +284,20 @@ def _detected(
 
 def _camera(
     folder: Folder, camera: PathName | None, corners: Sequence[FoundCorners]
-) -> KnownCamera:
-    """Return the camera of a file, or by a board's corners."""
+) -> tuple[Calibration, list[str]]:
+    """Return the camera of a file, or by a board's corners with a line on it."""
     if str(camera) != CALIBRATE:
-        return known_camera(camera_of_file(str(camera), folder.size))
+        return camera_of_file(str(camera), folder.size), []
     if not corners:
         raise ArgumentError(
             "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
         )
-    return calibrate(folder.size, corners)
+    calibration, line = calibrate(folder.size, corners)
+    return calibration, [line]
 
 
 def _poses_of_board(
-    folder: Folder, camera: KnownCamera, written: PathName | None, board: Board,
+    folder: Folder, camera: Calibration, written: PathName | None, board: Board,
     corners: Sequence[FoundCorners],
 ) -> tuple[Poses, list[str]]:
     """Return the poses of a board's markers in the order of their IDs, and a line on them."""
@@ -306,7 +306,7 @@ def _poses_of_board(
         return poses, []
     rms = float(np.median([each.rms_px for each in boards]))
     if written is not None and str(written) != CALIBRATE:
-        check_resolution(str(written), camera.lens, folder.size, corners, rms)
+        check_resolution(str(written), lens_of(camera), folder.size, corners, rms)
     line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
     return poses, [line if np.isnan(halves) else (
         f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "
@@ -387,10 +387,9 @@ def _document(
 ) -> dict[str, Any]:
     """Return the pipeline's document; ``names`` are those of the records."""
     (width, height), shots = sides[0].folder.size, sides[0].folder.photographs
-    fx, fy, cx, cy = ("fx_px", (0, 0)), ("fy_px", (1, 1)), ("cx_px", (0, 2)), ("cy_px", (1, 2))
     numbers = [
-        {key: float(each.camera.lens.matrix[place]) for key, place in (fx, fy, cx, cy)}
-        | {"distortion": each.camera.lens.distortion.tolist()} for each in sides
+        {name: getattr(each.camera, name) for name in VIEW}
+        | {"distortion": list(each.camera.distortion)} for each in sides
     ]
     camera: dict[str, Any] = {"width_px": width, "height_px": height}
     scene, axes = dict[str, Any](), dict[str, Any](trial=len(shots))

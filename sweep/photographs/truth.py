@@ -16,19 +16,22 @@ from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
 from sweep.messages import plain, refusal
 from sweep.model.board import Board
+from sweep.model.calibration import Calibration
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import side_lengths
 from sweep.photographs.board_view import FoundCorners, own_corners
-from sweep.photographs.cameras import KnownCamera, StereoCamera
-from sweep.photographs.folder import Folder, SeenMarkers
-from sweep.photographs.pose_fit import (
+from sweep.photographs.cameras import (
     MIN_CORNERS,
     FittedPose,
     Lens,
+    StereoCamera,
     cameras_of,
+    covariance_of,
     fit_pose,
     fitted_board,
+    lens_of,
 )
+from sweep.photographs.folder import Folder, SeenMarkers
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -296,7 +299,7 @@ MIN_HALF = 5
 
 
 def board_poses(
-    board: Board, camera: KnownCamera, size: tuple[int, int], found: Sequence[FoundCorners]
+    board: Board, camera: Calibration, size: tuple[int, int], found: Sequence[FoundCorners]
 ) -> tuple[Poses, list[FittedPose], float]:
     """Return the poses of a board's markers in photographs, of markers wholly in them.
 
@@ -316,7 +319,8 @@ def board_poses(
         The root mean square of the differences between the poses of two halves of the corners,
         over the prediction from the residuals' variance; NaN if no photograph has corners enough.
     """
-    lens, boards = camera.lens, [fitted_board(camera.lens, each) for each in found]
+    lens, camera_covariance = lens_of(camera), covariance_of(camera)
+    boards = [fitted_board(lens, each) for each in found]
     ratio = _halves_ratio(lens, boards, found, 1 if len(board.chessboard_m) else 4)
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     frames = [marker_frame(each)[1] for each in board.corners_m]
@@ -336,9 +340,9 @@ def board_poses(
             if fitted is None:
                 continue
             variance = raised**2 * np.diag(fitted.covariance)
-            if camera.covariance is not None:
+            if camera_covariance is not None:
                 variance = variance + unshared_variance(
-                    lens, camera.covariance, fitted, (corners.points[without] - centre) @ axes,
+                    lens, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
                     (board.corners_m[k] - centre) @ axes,
                 )
             poses.put((photograph, column[k]), fitted.rotation, fitted.translation,

@@ -25,8 +25,7 @@ from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
 from sweep.photographs.board_view import FoundCorners
-from sweep.photographs.cameras import calibrate, camera_of_file, known_camera
-from sweep.photographs.pose_fit import Lens, fit_pose
+from sweep.photographs.cameras import Lens, calibrate, camera_of_file, covariance_of, fit_pose
 from sweep.photographs.prepare import prepare
 from sweep.photographs.truth import unshared_variance
 from sweep.photographs.twins import twin_pipeline
@@ -253,9 +252,10 @@ def seen(number, rng, sd_px):
 def test_the_covariance_of_a_calibration_has_opencvs_standard_deviations():
     rng = np.random.default_rng(1)
     turned = [seen(number, rng, 0.2) for number in range(len(POSES))]
-    made = calibrate(SIZE, turned)
-    assert np.sqrt(np.diag(made.covariance)) == pytest.approx(made.sd, rel=1e-3)
-    correlation = made.covariance[0, 1] / np.sqrt(made.covariance[0, 0] * made.covariance[1, 1])
+    made, _ = calibrate(SIZE, turned)
+    covariance = covariance_of(made)
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(made.sd, rel=1e-3)
+    correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
     assert correlation > 0.5  # both focal lengths rest on the same depths
 
 
@@ -300,6 +300,7 @@ def test_a_files_covariance_is_that_of_its_numbers(tmp_path):
     path = tmp_path / "camera.json"
     matrix = np.diag(np.arange(1.0, 10.0)).ravel().tolist()
     path.write_text(camera()[:-1] + f', "covariance_intrinsics": {matrix}}}')
-    known = known_camera(camera_of_file(str(path), SIZE))
-    assert known.covariance.shape == (4 + len(known.lens.distortion),) * 2
-    assert np.diag(known.covariance).tolist() == list(range(1, 10))
+    known = camera_of_file(str(path), SIZE)
+    covariance = covariance_of(known)
+    assert covariance.shape == (4 + len(known.distortion),) * 2
+    assert np.diag(covariance).tolist() == list(range(1, 10))

@@ -241,8 +241,8 @@ def read_answers(
                 values | {name: each[line] for name, each in more.items()}))
 
     stems = table["image"].str.replace(STEM, "", regex=True)
-    judge(~stems.isin(images.keys()), "image {image} is not among those that were exported; "
-          f"expected a name such as {next(iter(images), '')}.png")
+    judge(~stems.isin(images.keys()), "image {image} is not among the images; "
+          f"expected a name such as {next(iter(images), '')}")
     # An image without an ID and without numbers was searched in vain.
     table = table[(table.iloc[:, 1:] != "").any(axis=1)]
     stems = stems[table.index]

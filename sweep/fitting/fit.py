@@ -21,7 +21,6 @@ from sweep.fitting.photograph_fit import (
     Views,
     fit_photograph,
     is_saturated,
-    photograph_noise,
     photograph_views,
 )
 from sweep.fitting.shifts import (
@@ -280,9 +279,7 @@ def _terms(
     black = of_photographs(lambda state: state.levels[0])
     white = of_photographs(lambda state: state.levels.sum())
     ground = of_photographs(lambda state: state.marker.ground, np.median)
-    noises = [photograph_noise(fit.states) for fit in fits]
-    photographs = [(fit.states, noise) for fit, noise in zip(fits, noises, strict=True)]
-    edges = edge_field(photographs)
+    edges = edge_field(fits)
     ragged = _field_terms("ragged edges", "edge_px", edges)
     # The mean profile of edges that are shifted is wider by the variance of their shifts.
     widened = edges.size_px.value**2 if ragged[0].kept and "edge_px" not in refused else 0.0
@@ -293,8 +290,8 @@ def _terms(
                tested[VARIANCE]),
         judged("sharpening", "sharpening", optics[AMOUNT], tested[AMOUNT]),
         judged("bloom (tone)", "bloom", optics[BLOOM], tested[BLOOM]),
-        *_noise((black.value, white.value), np.transpose(noises)), *ragged,
-        *_geometry(photographs, edges, of_photographs(_scale)),
+        *_noise((black.value, white.value), np.transpose([fit.noise for fit in fits])), *ragged,
+        *_geometry(fits, edges, of_photographs(_scale)),
     ]
 
 
@@ -337,15 +334,13 @@ def _scale(state: MarkerState) -> float:
     return 1.0 + float((state.shifts * arms).sum() / (arms**2).sum())
 
 
-def _geometry(
-    photographs: Sequence[tuple[Sequence[MarkerState], Floats]], edges: Field, scale: Estimate
-) -> list[Term]:
+def _geometry(fits: Sequence[PhotographFit], edges: Field, scale: Estimate) -> list[Term]:
     """Return the print's size beside the file's, and the field of shifts of markers."""
     size = judged("print's size", "marker_scale", scale, absent=1.0)
-    first, field = photographs[0][0][0].marker.shown, None
+    first, field = fits[0].states[0].marker.shown, None
     reason = "too few photographs or markers"
     if first.source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
-        field = geometry_field(photographs, edges, scale.value)
+        field = geometry_field(fits, edges, scale.value)
     else:
         reason = "only beside a board or exact poses"
         size = Term(size.name, size.parameter).left_out(reason)

@@ -443,10 +443,13 @@ class PhotographFit(NamedTuple):
         eliminated in it, which would be taken for bloom.
     states
         Its markers.
+    noise
+        (2,) variance of pixels on black and on white (:func:`photograph_noise`).
     """
 
     parameters: Floats
     states: tuple[MarkerState, ...]
+    noise: Floats
 
 
 def fit_photograph(
@@ -480,7 +483,7 @@ def fit_photograph(
     result = shared.copy()
     if moved.any():
         result[moved] += _shared_step(states, moved, uneven=True)
-    return PhotographFit(result, tuple(states))
+    return PhotographFit(result, tuple(states), photograph_noise(states))
 
 
 def _with_shared(state: MarkerState, shared: Floats, own: Masks) -> MarkerState:

@@ -12,7 +12,7 @@ from scipy import special
 from scipy.linalg import block_diag
 
 from sweep.analysis.intervals import TAIL
-from sweep.fitting.photograph_fit import CORNERS, OWN, MarkerState, products
+from sweep.fitting.photograph_fit import CORNERS, OWN, MarkerState, PhotographFit, products
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.solver import marker_frame, of_board
@@ -163,22 +163,19 @@ EDGE_LENGTHS = np.geomspace(0.1, 3.0, 60)
 MIN_LENGTH_PX = 1.0
 
 
-def edge_field(photographs: Sequence[tuple[Sequence[MarkerState], Floats]]) -> Field:
-    """Return the field of shifts of edges in photographs, each with its states and its noise (2,).
-
-    The noise is the variance on black and on white.
-    """
+def edge_field(fits: Sequence[PhotographFit]) -> Field:
+    """Return the field of shifts of edges in photographs."""
     t = ALONG_MODULES * ((np.arange(16) + 0.5) / 8 - 1)
     apart = np.array([0.0, 1.0])[:, None, None, None]
     # Squares of means along a module, and their products with those along the next one.
     means = np.exp(
         -0.5 * ((t[:, None] - t - apart) / EDGE_LENGTHS[:, None, None]) ** 2
     ).mean(axis=(2, 3))
-    found = [edge_sums(*each) for each in photographs]
+    found = [edge_sums(each) for each in fits]
     known = [each for each in found if (each[1] > 0).all()]
     if not known:
         return Field()
-    module_px = np.mean([state.marker.module_px for states, _ in photographs for state in states])
+    module_px = np.mean([state.marker.module_px for fit in fits for state in fit.states])
     field = field_of(
         np.array([sums for sums, _ in known]),
         np.array([counts[:, None] * means for _, counts in known]), EDGE_LENGTHS * module_px,
@@ -186,15 +183,15 @@ def edge_field(photographs: Sequence[tuple[Sequence[MarkerState], Floats]]) -> F
     return field._replace(length_px=field.length_px.mapped(lambda px: max(px, MIN_LENGTH_PX)))
 
 
-def edge_sums(states: Sequence[MarkerState], noise: Floats) -> tuple[Floats, Floats]:
+def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
     """Return sums (2,) of products of shifts of a photograph's edges in px², and their counts (2,).
 
     First of squares, less the share of the pixels' noise; their count is the degrees of freedom.
     Then of two edges on one line of modules that follow on each other.
     """
-    variance = float(np.nanmean(noise)) + QUANTISATION_VARIANCE
+    variance = float(np.nanmean(fit.noise)) + QUANTISATION_VARIANCE
     sums, counts = np.zeros(2), np.zeros(2)
-    for state in states:
+    for state in fit.states:
         shifts = [_edges_along(state, axis) for axis in range(2)]
         bright = np.concatenate([each[0].ravel() for each in shifts])
         information = np.concatenate([each[2].ravel() for each in shifts])
@@ -274,25 +271,24 @@ MIN_SHIFTED_MARKERS = 3
 
 
 def geometry_field(
-    photographs: Sequence[tuple[Sequence[MarkerState], Floats]], edges: Field, scale: float
+    fits: Sequence[PhotographFit], edges: Field, scale: float
 ) -> Field | None:
     """Return the field of shifts of markers; None with too few photographs that say it.
 
     Parameters
     ----------
-    photographs
-        The states of each, and its noise (2,), as for :func:`edge_field`.
+    fits
+        Of the photographs.
     edges
         Shifts of single edges, which move corners as noise does.
     scale
         Size of the markers over the board's.
     """
-    lengths = LENGTHS * photographs[0][0][0].marker.shown.width_px
+    lengths = LENGTHS * fits[0].states[0].marker.shown.width_px
     known = [
-        _geometry_sums(states, noise, edges, *beside, lengths)
-        for states, noise in photographs
-        if len(states) >= MIN_SHIFTED_MARKERS and np.isfinite(noise).any()
-        and (beside := _beside_truth(states, scale)) is not None
+        _geometry_sums(fit, edges, *beside, lengths) for fit in fits
+        if len(fit.states) >= MIN_SHIFTED_MARKERS and np.isfinite(fit.noise).any()
+        and (beside := _beside_truth(fit.states, scale)) is not None
     ]
     if len(known) < MIN_PHOTOGRAPHS:
         return None
@@ -331,21 +327,20 @@ def _beside_truth(
 
 
 def _geometry_sums(
-    states: Sequence[MarkerState], noise: Floats, edges: Field, shifts: Floats, explained: Floats,
-    lengths_px: Floats,
+    fit: PhotographFit, edges: Field, shifts: Floats, explained: Floats, lengths_px: Floats
 ) -> tuple[Floats, Floats]:
     """Return a photograph's sums (2,) of squares, and the shares (2, L) of fields in them.
 
     The expected shares of the pixels' noise and of single edges are taken off. ``shifts`` (8 n,)
     and ``explained`` (8 n, k) are the corners' (:func:`_beside_truth`).
     """
-    count, size = len(states), CORNERS * len(states)
+    count, size = len(fit.states), CORNERS * len(fit.states)
     q, _ = np.linalg.qr(explained)
     residual = np.eye(size) - q @ q.T
     centres = np.kron(np.eye(count), np.tile(np.eye(2), 4) / 2)
     parts = (residual - centres.T @ centres @ residual, centres @ residual)
     forms = [part.T @ part for part in parts]
-    noises, points, *weights = zip(*(_corners(each, noise) for each in states), strict=True)
+    noises, points, *weights = zip(*(_corners(each, fit.noise) for each in fit.states), strict=True)
     moved = [block_diag(*each) for each in weights]
     every = np.concatenate(points)
     distances = ((every[:, None] - every[None]) ** 2).sum(axis=2)
@@ -356,7 +351,7 @@ def _geometry_sums(
         return np.array([float((form * shifted).sum()) for form in forms])
 
     cell_px = float(np.mean([
-        state.marker.modules * state.marker.module_px for state in states
+        state.marker.modules * state.marker.module_px for state in fit.states
     ])) / CELLS
     of_noise = np.array([float((form * block_diag(*noises)).sum()) for form in forms])
     added = sums(edges.covariance(distances, cell_px)) + of_noise

@@ -24,7 +24,7 @@ from sweep.model.image_file import read_regular
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.board_view import FoundCorners
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 
 class Lens(NamedTuple):
@@ -336,7 +336,7 @@ SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "
 
 
 def check_resolution(
-    written: str, lens: Lens, size: tuple[int, int], found: Sequence[FoundCorners], rms_px: float
+    written: str, lens: Lens, size: Integers, found: Sequence[FoundCorners], rms_px: float
 ) -> None:
     """Refuse a camera of a file that fits the board far better in another resolution.
 

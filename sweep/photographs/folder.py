@@ -151,7 +151,7 @@ class SeenMarkers(NamedTuple):
     quads: Floats
     repeated: int = 0
 
-    def among(self, ids: Sequence[int]) -> tuple[Integers, Floats]:
+    def among(self, ids: Sequence[int] | Integers) -> tuple[Integers, Floats]:
         """Return the places (n,) in ``ids`` of those that are there, and their corners."""
         place = pd.Index(ids).get_indexer(self.ids)
         return place[place >= 0].astype(np.int64), self.quads[place >= 0]

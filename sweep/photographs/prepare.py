@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,10 +42,9 @@ from sweep.photographs.folder import (
     read_folder,
     reference_detector,
 )
-from sweep.photographs.truth import Poses, board_poses, own_poses, partner_poses, poses_of_file
+from sweep.photographs.truth import board_poses, own_poses, partner_poses, poses_of_file
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
-from sweep.typing import Floats
 
 PathName = str | os.PathLike[str]
 
@@ -70,27 +69,6 @@ class Prepared(NamedTuple):
     lines: tuple[str, ...]
     photographs: int
     markers: int
-
-
-class WantedMarkers(NamedTuple):
-    """The markers that are looked for: dictionary, increasing IDs (M,) and sides (M,) in m.
-
-    ``board`` is the document of the board's file as JSON; empty without one.
-    """
-
-    dictionary: str
-    ids: tuple[int, ...]
-    sizes_m: Floats
-    board: str = ""
-
-
-class Side(NamedTuple):
-    """The photographs of one camera, and the true poses of their markers."""
-
-    folder: Folder
-    part: Part
-    camera: Calibration
-    truth: Poses
 
 
 @single_threaded()  # OpenCV's calibration is the same to the bit only then
@@ -145,39 +123,42 @@ def prepare(
     lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
     if stereo is not None:
         _check_pairs(found)
-    markers, seen = _detected(target, document, board, settings, found)
-    first, corners = found[0], [] if target is None else [
+    dictionary, sizes, seen = _detected(target, board, settings, found)
+    sizes_m, first = np.array(list(sizes.values())), found[0]
+    corners = [] if target is None else [
         find_corners(each.image, target, one)
-        for each, one in zip(found[0].photographs, seen[0], strict=True)
+        for each, one in zip(first.photographs, seen[0], strict=True)
     ]
     if stereo is not None:
         rig, cameras = stereo_of_file(str(stereo), first.size)
-        truth = [
-            partner_poses(each, first.size, markers.ids, markers.sizes_m, seen[k], seen[1 - k])
-            for k, each in enumerate((rig, rig.swapped()))
-        ]
     else:
-        one, said = _camera(first, camera, corners)
-        cameras, lines = [one], lines + said
+        calibration, said = _camera(first, camera, corners)
+        rig, cameras, lines = None, [calibration], lines + said
+    described = json.dumps(document, sort_keys=True) if document else ""
+    records = [
+        _without_truth(folder, part, sizes, described, Path(home))
+        for folder, part in zip(found, parts, strict=True)
+    ]
+    lens, said = lens_of(cameras[0]), []
     if poses is not None:
-        given, said = poses_of_file(
-            Path(poses), first, markers.ids, markers.sizes_m, lens_of(cameras[0]), seen[0]
-        )
-        truth, lines = [given], lines + said
-    elif target is not None and (stereo is None or one_camera):
-        by_board, said = _poses_of_board(first, cameras[0], camera, target, corners)
-        truth, lines = [by_board], lines + said
-    elif stereo is None:
-        truth = [own_poses(lens_of(cameras[0]), markers.ids, markers.sizes_m, seen[0])]
-    sides = [
-        Side(*each) for each in zip(found, parts, cameras, truth, strict=not one_camera)
-    ][: 1 if one_camera else None]
-    lines += _summary(sides)
-    pipeline = _write_record(
-        sides, markers, settings, Path(home), name or name_of(Path(folders[0])),
-        overwrite=overwrite,
+        truth, said = poses_of_file(records[0], Path(poses), lens, sizes_m, seen[0])
+        records = [truth]
+    elif target is not None and (rig is None or one_camera):
+        truth, said = _poses_of_board(records[0], cameras[0], camera, target, corners)
+        records = [truth]
+    elif rig is None:
+        records = [own_poses(records[0], lens, sizes_m, seen[0])]
+    else:
+        records = [
+            partner_poses(record, one, sizes_m, seen[k], seen[1 - k])
+            for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=True))
+        ][: 1 if one_camera else None]
+    lines += [*said, *_summary(records, first)]
+    pipeline = _write_records(
+        records, cameras, dictionary, sizes, settings, Path(home),
+        name or name_of(Path(folders[0])), first, overwrite=overwrite,
     )
-    known = sum(int(each.truth.known.sum()) for each in sides)
+    known = sum(int(each.shown.sum()) for each in records)
     return Prepared(pipeline, tuple(lines), len(first.photographs), known)
 
 
@@ -242,12 +223,12 @@ def _check_pairs(found: Sequence[Folder]) -> None:
 
 
 def _detected(
-    board: Board | None, document: dict[str, Any], path: PathName | None, settings: Sequence[str],
-    found: Sequence[Folder],
-) -> tuple[WantedMarkers, list[list[SeenMarkers]]]:
-    """Return the markers that are looked for, and those seen in each photograph of each camera.
+    board: Board | None, path: PathName | None, settings: Sequence[str], found: Sequence[Folder]
+) -> tuple[str, dict[int, float], list[list[SeenMarkers]]]:
+    """Return dictionary and sides (m, by increasing ID) of the markers, and those that are seen.
 
-    Refuses settings that say what the board says, and a board that is not in the photographs.
+    These are of each photograph of each camera. Settings that say what the board says are refused,
+    and a board that is not in the photographs.
     """
     given = {setting_name(each) for each in settings}
     if board is not None and (twice := given & {"dictionary", "size_m", "marker_id"}):
@@ -257,11 +238,10 @@ def _detected(
             "board", "none", "expected the file of a board, or `--set dictionary=...` and "
             "`--set size_m=...` of single markers",
         )
-    fixed: dict[str, Any] = {} if board is not None else dict(
+    fixed: dict[str, Any] = {"dictionary": board.dictionary} if board is not None else dict(
         Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set").fixed
     )
-    dictionary = str(fixed["dictionary"]) if board is None else board.dictionary
-    find = reference_detector()
+    find, dictionary = reference_detector(), str(fixed["dictionary"])
     seen = [
         [detect_markers(find, each.image, dictionary) for each in folder.photographs]
         for folder in found
@@ -270,16 +250,15 @@ def _detected(
     if board is not None:
         check_board(Path(str(path)), board, every, find, found[0].photographs)
         sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
-        order, content = np.argsort(board.marker_ids), json.dumps(document, sort_keys=True)
-        ids = tuple(board.marker_ids[k] for k in order.tolist())
-        return WantedMarkers(dictionary, ids, np.round(sides[order], 12), content), seen
-    ids = tuple(sorted({each for one in every for each in one.ids.tolist()}))
+        sizes = dict(sorted(zip(board.marker_ids, np.round(sides, 12).tolist(), strict=True)))
+        return dictionary, sizes, seen
+    ids = sorted({each for one in every for each in one.ids.tolist()})
     if not ids:
         raise ArgumentError(
             "settings", f"dictionary={dictionary}",
             "no photograph shows a marker of it; give the dictionary of the markers",
         )
-    return WantedMarkers(dictionary, ids, np.full(len(ids), float(fixed["size_m"]))), seen
+    return dictionary, dict.fromkeys(ids, float(fixed["size_m"])), seen
 
 
 def _camera(
@@ -297,77 +276,84 @@ def _camera(
 
 
 def _poses_of_board(
-    folder: Folder, camera: Calibration, written: PathName | None, board: Board,
+    record: PhotographRecord, camera: Calibration, written: PathName | None, board: Board,
     corners: Sequence[FoundCorners],
-) -> tuple[Poses, list[str]]:
-    """Return the poses of a board's markers in the order of their IDs, and a line on them."""
-    poses, boards, halves = board_poses(board, camera, folder.size, corners)
+) -> tuple[PhotographRecord, list[str]]:
+    """Return a record with the poses of a board's markers, and a line on them."""
+    truth, boards, halves = board_poses(record, board, camera, corners)
     if not boards:
-        return poses, []
+        return truth, []
     rms = float(np.median([each.rms_px for each in boards]))
     if written is not None and str(written) != CALIBRATE:
-        check_resolution(str(written), lens_of(camera), folder.size, corners, rms)
+        check_resolution(str(written), lens_of(camera), record.size, corners, rms)
     line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
-    return poses, [line if np.isnan(halves) else (
+    return truth, [line if np.isnan(halves) else (
         f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "
         "residuals predict"
     )]
 
 
-def _summary(sides: Sequence[Side]) -> list[str]:
+def _summary(records: Sequence[PhotographRecord], folder: Folder) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
-    truth = [each.truth for each in sides]
-    known = np.concatenate([each.known for each in truth])
-    with_pose = np.array([each.known.any(axis=1) for each in truth])
-    photographs = [each.folder.photographs for each in sides]
-    if not known.any():
+    shown = np.array([each.shown for each in records])
+    if not shown.any():
         raise ArgumentError(
-            "folders", plain(photographs[0][0].path.parent, 300),
+            "folders", plain(folder.photographs[0].path.parent, 300),
             "no photograph shows a whole marker whose pose is known",
         )
-    empty = [photographs[side][k].path.name for side, k in np.argwhere(~with_pose).tolist()]
+    with_pose = shown.any(axis=2)
+    empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
     count = int(with_pose.any(axis=0).sum())
     lines = [f"no pose of a marker is known in {named(empty)}: not counted"] if empty else []
     if count == 1:
         lines.append(
             "one photograph: errors and rates have no intervals, which several photographs give"
         )
-    std = np.concatenate([each.std[each.known] for each in truth])
-    distance = np.concatenate([each.translation[each.known][:, 2] for each in truth])
-    source = TruthSource(int(truth[0].source[truth[0].known][0])).name.replace("_", " ")
-    spread = ""
+    std, translation, sources = (
+        np.array([getattr(each, name) for each in records])[shown]
+        for name in ("std", "translation", "source")
+    )
+    source, spread = TruthSource(int(sources[0])).name.replace("_", " "), ""
     if np.isfinite(std).any():
         turn = np.degrees(np.linalg.norm(std[:, :3], axis=1))
         spread = (
             f"; median standard deviations {np.nanmedian(turn):.2g}° and "
-            f"{100 * np.nanmedian(std[:, 5] / distance):.2g} % of the range"
+            f"{100 * np.nanmedian(std[:, 5] / translation[:, 2]):.2g} % of the range"
         )
-    what = "photographs" if len(truth) == 1 else "pairs of photographs"
-    return [*lines, f"{int(known.sum()):,} markers in {count:,} {what}; truth: {source}{spread}"]
+    what = "photographs" if len(records) == 1 else "pairs of photographs"
+    return [*lines, f"{int(shown.sum()):,} markers in {count:,} {what}; truth: {source}{spread}"]
 
 
 # --------------------------------------------------------------------------------------------------
 # The record of photographs beside their store, and the pipeline that names it.
 
-def _write_record(
-    sides: Sequence[Side], markers: WantedMarkers, settings: Sequence[str], home: Path, name: str,
+def _without_truth(
+    folder: Folder, part: Part, ids: Iterable[int], board: str, home: Path
+) -> PhotographRecord:
+    """Return the record, in ``home``, of photographs whose markers' poses are not known."""
+    numbers = np.array(list(ids), dtype=np.int64)
+    grid = len(folder.photographs), len(numbers)
+    return PhotographRecord(
+        tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in folder.photographs),
+        tuple(each.digest for each in folder.photographs), part, *folder.size, numbers,
+        np.full((*grid, 3, 3), np.nan), np.full((*grid, 3), np.nan), np.full((*grid, 6), np.nan),
+        np.zeros(grid, dtype=np.uint8), board,
+    )
+
+
+def _write_records(
+    records: Sequence[PhotographRecord], cameras: Sequence[Calibration], dictionary: str,
+    sizes: Mapping[int, float], settings: Sequence[str], home: Path, name: str, folder: Folder,
     *, overwrite: bool,
 ) -> Pipeline:
     """Write the records, and return the experiment."""
-    names = [f"{name}{SUFFIX}"] if len(sides) == 1 else [
+    names = [f"{name}{SUFFIX}"] if len(records) == 1 else [
         f"{name}-{side}{SUFFIX}" for side in ("left", "right")
     ]
     with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
-        for record, side in zip(names, sides, strict=True):
-            shots, poses = side.folder.photographs, side.truth
-            content = PHOTOGRAPH_RECORDS.content(PhotographRecord(
-                tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in shots),
-                tuple(each.digest for each in shots), side.part, *side.folder.size,
-                np.array(markers.ids, dtype=np.int64), poses.rotation, poses.translation,
-                poses.std, poses.source, markers.board,
-            ))
-            path = home / record
+        for each, record in zip(names, records, strict=True):
+            path, content = home / each, PHOTOGRAPH_RECORDS.content(record)
             used = (home / f"{name}.zarr").exists() and path.exists()
             if used and path.read_bytes() != content and not overwrite:
                 raise StoreError(
@@ -375,41 +361,29 @@ def _write_record(
                     "refer to; choose another store, or overwrite it"
                 )
             write_whole(path, content)
-    return Pipeline.from_dict(
-        _document(sides, markers, names),
-        [each for each in settings if setting_name(each) not in ("dictionary", "size_m")],
-        name=name, source="photographs", folder=home,
-    )
-
-
-def _document(
-    sides: Sequence[Side], markers: WantedMarkers, names: Sequence[str]
-) -> dict[str, Any]:
-    """Return the pipeline's document; ``names`` are those of the records."""
-    (width, height), shots = sides[0].folder.size, sides[0].folder.photographs
-    numbers = [
-        {name: getattr(each.camera, name) for name in VIEW}
-        | {"distortion": list(each.camera.distortion)} for each in sides
-    ]
+    (width, height), shots = folder.size, folder.photographs
+    columns = {
+        "photographs": names,
+        **{key: [getattr(each, key) for each in cameras[: len(names)]] for key in VIEW},
+        "distortion": [list(each.distortion) for each in cameras[: len(names)]],
+    }
     camera: dict[str, Any] = {"width_px": width, "height_px": height}
+    marker: dict[str, Any] = {"dictionary": dictionary}
     scene, axes = dict[str, Any](), dict[str, Any](trial=len(shots))
-    if len(sides) == 1:
-        camera |= numbers[0]
-        if sides[0].camera.sd:
-            camera["calibration_sd"] = list(sides[0].camera.sd)
-        scene["photographs"] = names[0]
+    if len(records) == 1:
+        scene["photographs"], *_ = columns.pop("photographs")
+        camera |= {key: values[0] for key, values in columns.items()}
+        if cameras[0].sd:
+            camera["calibration_sd"] = list(cameras[0].sd)
     else:
-        columns = {key: [each[key] for each in numbers] for key in numbers[0]}
-        axes["stereo_camera"] = {"zip": {"photographs": list(names), **columns}}
-    marker: dict[str, Any] = {"dictionary": markers.dictionary}
-    if len(set(markers.sizes_m.tolist())) == 1:
-        marker["size_m"] = float(markers.sizes_m[0])
-        axes["marker_id"] = list(markers.ids)
+        axes["stereo_camera"] = {"zip": columns}
+    if len(set(sizes.values())) == 1:
+        marker["size_m"], axes["marker_id"] = next(iter(sizes.values())), list(sizes)
     else:
-        axes["marker"] = {
-            "zip": {"marker_id": list(markers.ids), "size_m": markers.sizes_m.tolist()}
-        }
-    return {
+        axes["marker"] = {"zip": {"marker_id": list(sizes), "size_m": list(sizes.values())}}
+    document = {
         "title": f"Photographs of {plain(shots[0].path.parent.name, 150)}", "camera": camera,
         "marker": marker, "scene": scene, "axes": axes,
     }
+    others = [each for each in settings if setting_name(each) not in ("dictionary", "size_m")]
+    return Pipeline.from_dict(document, others, name=name, source="photographs", folder=home)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.errors import PipelineError
 from sweep.exchange.answers import Conventions, read_answers
+from sweep.experiment.photographs import PhotographRecord
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
@@ -31,64 +31,37 @@ from sweep.photographs.cameras import (
     fitted_board,
     lens_of,
 )
-from sweep.photographs.folder import Folder, SeenMarkers
+from sweep.photographs.folder import SeenMarkers
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
-# Poses of markers in photographs, as they are gathered.
+# Poses of markers in photographs, as they are gathered in a record without any.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Poses:
-    """Poses of M markers in P photographs: NaN where a marker is not there, or its pose unknown.
+def unknown_poses(record: PhotographRecord) -> PhotographRecord:
+    """Return a record of the same photographs and markers without poses."""
+    return dataclasses.replace(
+        record, source=np.zeros_like(record.source),
+        **{name: np.full_like(getattr(record, name), np.nan)
+           for name in ("rotation", "translation", "std")},
+    )
 
-    Attributes
-    ----------
-    rotation, translation
-        (P, M, 3, 3) and (P, M, 3) m, marker to camera.
-    std
-        (P, M, 6) standard deviations: rotation vector (rad) and position (m), camera frame.
-    source
-        (P, M) :class:`~sweep.measure.flags.TruthSource`.
-    """
 
-    rotation: Floats
-    translation: Floats
-    std: Floats
-    source: NDArray[np.uint8]
-
-    @staticmethod
-    def none(photographs: int, markers: int) -> Poses:
-        """Return no pose of any marker."""
-        grid = (photographs, markers)
-        return Poses(
-            np.full((*grid, 3, 3), np.nan), np.full((*grid, 3), np.nan),
-            np.full((*grid, 6), np.nan), np.zeros(grid, dtype=np.uint8),
-        )
-
-    def put(
-        self, place: tuple[int, int], rotation: Floats, translation: Floats, source: TruthSource,
-        std: Floats | float = np.nan,
-    ) -> None:
-        """Take the pose of a photograph and a marker, by their numbers."""
-        self.rotation[place], self.translation[place] = rotation, translation
-        self.std[place], self.source[place] = std, source
-
-    @property
-    def known(self) -> Masks:
-        """Which poses there are, (P, M)."""
-        return np.asarray(np.isfinite(self.translation).all(axis=2))
+def put(
+    record: PhotographRecord, place: tuple[int, int], rotation: Floats, translation: Floats,
+    source: TruthSource, std: Floats | float = np.nan,
+) -> None:
+    """Write the pose of a photograph and a marker, by their numbers, into a record."""
+    record.rotation[place], record.translation[place] = rotation, translation
+    record.std[place], record.source[place] = std, source
 
 
 def are_within(
-    lens: Lens, size: tuple[int, int], corners: Floats, rotation: Floats, translation: Floats
+    record: PhotographRecord, lens: Lens, corners: Floats, rotation: Floats, translation: Floats
 ) -> Masks:
-    """Return which markers (M,), with these corners (M, 4, 3), are wholly in the frame at a pose.
-
-    ``size`` is the frame's width and height in px.
-    """
+    """Return which markers (M,), of corners (M, 4, 3), are wholly in the frame at a pose."""
     points = corners.reshape(-1, 3)
     pixels = lens.project(points, rotation, translation)
-    inside = ((pixels >= -0.5) & (pixels <= np.array(size) - 0.5)).all(axis=1)
+    inside = ((pixels >= -0.5) & (pixels <= record.size - 0.5)).all(axis=1)
     before = (points @ rotation.T + translation)[:, 2] > 0
     return np.asarray((inside & before).reshape(-1, 4).all(axis=1))
 
@@ -107,45 +80,43 @@ MAD_TO_STD = 1.4826
 
 
 def own_poses(
-    lens: Lens, ids: Sequence[int], sizes_m: Floats, seen: Sequence[SeenMarkers]
-) -> Poses:
-    """Return the poses of M markers in P photographs from their own corners.
-
-    ``ids`` and ``sizes_m`` (M,) are their IDs and sides.
-    """
-    poses = Poses.none(len(seen), len(sizes_m))
+    record: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+) -> PhotographRecord:
+    """Return a record with the poses of its M markers, of sides (M,), by their own corners."""
+    poses = unknown_poses(record)
     for photograph, one in enumerate(seen):
-        marker, quads = one.among(ids)
+        marker, quads = one.among(record.marker_id)
         rotation, translation = both_planar_solutions(
             quads, cameras_of(lens, len(quads)), sizes_m[marker]
         )
         for k, number in enumerate(marker.tolist()):
             if np.isfinite(rotation[k, 0]).all() and translation[k, 0, 2] > 0:
-                poses.put((photograph, number), rotation[k, 0], translation[k, 0], TruthSource.none)
+                put(poses, (photograph, number), rotation[k, 0], translation[k, 0],
+                    TruthSource.none)
     return poses
 
 
 def partner_poses(
-    stereo: StereoCamera, size: tuple[int, int], ids: Sequence[int], sizes_m: Floats,
-    left: Sequence[SeenMarkers], right: Sequence[SeenMarkers],
-) -> Poses:
-    """Return the poses of M markers in P left photographs, from the right ones of the same moment.
+    record: PhotographRecord, stereo: StereoCamera, sizes_m: Floats, left: Sequence[SeenMarkers],
+    right: Sequence[SeenMarkers],
+) -> PhotographRecord:
+    """Return a record with the poses in left photographs, from the right ones of the same moment.
 
     Their standard deviations are computed from the differences between left and right poses, over
     √2: robust ones over all markers, since a single marker's are not known.
 
     Parameters
     ----------
+    record
+        P left photographs of M markers.
     stereo
         The cameras.
-    size
-        Width and height of the left photographs in pixels.
-    ids, sizes_m
-        (M,) IDs and sides of the markers.
+    sizes_m
+        (M,) sides of the markers.
     left, right
         P each.
     """
-    poses, differences = Poses.none(len(right), len(sizes_m)), []
+    poses, differences, ids = unknown_poses(record), [], record.marker_id
     for photograph, (own, partner) in enumerate(zip(left, right, strict=True)):
         (own_marker, own_quads), (marker, quads) = own.among(ids), partner.among(ids)
         sides, own_sides = sizes_m[marker], sizes_m[own_marker]
@@ -163,9 +134,10 @@ def partner_poses(
         for k in np.flatnonzero(np.isfinite(error).any(axis=1)).tolist():
             best = int(np.nanargmin(error[k]))
             turn, shift = rotation[k, best], translation[k, best]
-            if not are_within(stereo.left, size, marker_corners(sides[k : k + 1]), turn, shift)[0]:
+            corners = marker_corners(sides[k : k + 1])
+            if not are_within(record, stereo.left, corners, turn, shift)[0]:
                 continue
-            poses.put((photograph, int(marker[k])), turn, shift, TruthSource.stereo_partner)
+            put(poses, (photograph, int(marker[k])), turn, shift, TruthSource.stereo_partner)
             for both in np.flatnonzero(at == k).tolist():
                 turns = rotation_difference(own_turns[both], np.repeat(turn[None], 2, axis=0))
                 angle = np.linalg.norm(turns, axis=1)
@@ -174,7 +146,7 @@ def partner_poses(
                     differences.append([*turns[j], *(own_places[both, j] - shift)])
     if len(differences) >= MIN_PAIRS:
         spread = MAD_TO_STD * np.median(np.abs(np.array(differences)), axis=0) / np.sqrt(2.0)
-        poses.std[poses.known] = spread
+        poses.std[poses.shown] = spread
     return poses
 
 
@@ -200,10 +172,9 @@ OTHER_UNIT = 1.5
 
 
 def poses_of_file(
-    path: Path, folder: Folder, ids: Sequence[int], sizes_m: Floats, lens: Lens,
-    seen: Sequence[SeenMarkers],
-) -> tuple[Poses, list[str]]:
-    """Return the poses that a file gives of markers wholly in their photographs, and lines.
+    record: PhotographRecord, path: Path, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+) -> tuple[PhotographRecord, list[str]]:
+    """Return a record with a file's poses of markers wholly in their photographs, and lines.
 
     Raises
     ------
@@ -211,58 +182,49 @@ def poses_of_file(
         If it cannot be read, is of other images or markers, or if most detected markers are not
         where its poses have them; in lines.
     """
-    names, faults = {each.path.stem: k for k, each in enumerate(folder.photographs)}, []
-    if len(names) < len(folder.photographs):
+    names, faults = {Path(each).stem: k for k, each in enumerate(record.paths)}, []
+    if len(names) < len(record.paths):
         raise refusal([f"{plain(path)}: expected photographs of different names without suffixes"])
     try:
         answers = read_answers(path, names, Conventions())
     except PipelineError as error:
-        raise PipelineError([_of_photographs(line) for line in error.faults]) from None
-    unknown = sorted(set(answers.marker_id.tolist()) - set(ids))
+        lines = [line.partition(", or pass --doubled")[0] for line in error.faults]
+        raise PipelineError(lines) from None
+    number = {each: k for k, each in enumerate(record.marker_id.tolist())}
+    unknown = sorted(set(answers.marker_id.tolist()) - number.keys())
     if unknown:
         faults.append(f"marker {unknown[0]}: expected one of the board or the photographs")
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
-    poses, number = Poses.none(len(names), len(ids)), {each: k for k, each in enumerate(ids)}
+    poses, cut = unknown_poses(record), 0
     if not faults:
         for photograph, marker_id, rotation, translation in zip(
             answers.image.tolist(), answers.marker_id.tolist(), answers.rotation,
             answers.translation, strict=True,
         ):
             place = photograph, number[marker_id]
-            poses.put(place, rotation, translation, TruthSource.poses_file)
-        faults += _faults(poses, ids, sizes_m, lens, seen)
+            put(poses, place, rotation, translation, TruthSource.poses_file)
+        faults += _faults(poses, lens, sizes_m, seen)
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])
-    cut = 0
-    for photograph, k in np.argwhere(poses.known).tolist():
+    for photograph, k in np.argwhere(poses.shown).tolist():
         pose = poses.rotation[photograph, k], poses.translation[photograph, k]
-        if not are_within(lens, folder.size, marker_corners(sizes_m[k : k + 1]), *pose)[0]:
+        if not are_within(record, lens, marker_corners(sizes_m[k : k + 1]), *pose)[0]:
             poses.translation[photograph, k] = np.nan
             cut += 1
     lines = [f"{cut:,} poses of markers that are not wholly in the frame: not counted"]
     return poses, lines if cut else []
 
 
-def _of_photographs(line: str) -> str:
-    """Return the line of a fault of answers to an export as one of photographs."""
-    line = line.partition("; delete one, or pass")[0]
-    if "is not among those that were exported" in line:
-        line, _, hint = line.partition("; expected a name such as ")
-        line = line.replace("is not among those that were exported", "is none of the photographs")
-        line += f"; expected a name such as {hint.removesuffix('.png')}" if hint else ""
-    return line
-
-
 def _faults(
-    poses: Poses, ids: Sequence[int], sizes_m: Floats, lens: Lens, seen: Sequence[SeenMarkers]
+    poses: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
 ) -> list[str]:
     """Return the fault of poses that are not where markers are detected, if there is one."""
-    own = own_poses(lens, ids, sizes_m, seen)
+    own = own_poses(poses, lens, sizes_m, seen)
     ranges = (np.linalg.norm(each.translation, axis=2) for each in (poses, own))
     ratios, distances = np.divide(*ranges), []
     for photograph, one in enumerate(seen):
-        marker, quads = one.among(ids)
+        marker, quads = one.among(poses.marker_id)
         for k, quad, side in zip(
             marker.tolist(), quads, side_lengths(quads).mean(axis=1).tolist(), strict=True
         ):
@@ -299,23 +261,23 @@ MIN_HALF = 5
 
 
 def board_poses(
-    board: Board, camera: Calibration, size: tuple[int, int], found: Sequence[FoundCorners]
-) -> tuple[Poses, list[FittedPose], float]:
+    record: PhotographRecord, board: Board, camera: Calibration, found: Sequence[FoundCorners]
+) -> tuple[PhotographRecord, list[FittedPose], float]:
     """Return the poses of a board's markers in photographs, of markers wholly in them.
 
     Parameters
     ----------
+    record
+        The photographs, and all markers of the board.
     board, camera
         The board and the camera.
-    size
-        Width and height of the photographs in px.
     found
         The board's corners in each photograph.
 
     Returns
     -------
     tuple
-        The poses, by increasing ID. The board's own ones in the photographs with corners enough.
+        A record with the poses. The board's own ones in the photographs with corners enough.
         The root mean square of the differences between the poses of two halves of the corners,
         over the prediction from the residuals' variance; NaN if no photograph has corners enough.
     """
@@ -325,11 +287,11 @@ def board_poses(
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     frames = [marker_frame(each)[1] for each in board.corners_m]
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
-    own, poses = own_corners(board), Poses.none(len(found), len(board))
+    own, poses = own_corners(board), unknown_poses(record)
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
         if pose is None:
             continue
-        shown = are_within(lens, size, board.corners_m, pose.rotation, pose.translation)
+        shown = are_within(record, lens, board.corners_m, pose.rotation, pose.translation)
         for k in np.flatnonzero(shown).tolist():
             without = pose.used & ~np.isin(corners.number, own[k])
             axes, centre = frames[k]
@@ -345,8 +307,8 @@ def board_poses(
                     lens, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
                     (board.corners_m[k] - centre) @ axes,
                 )
-            poses.put((photograph, column[k]), fitted.rotation, fitted.translation,
-                      TruthSource.board_without_this_marker, np.sqrt(variance))
+            put(poses, (photograph, column[k]), fitted.rotation, fitted.translation,
+                TruthSource.board_without_this_marker, np.sqrt(variance))
     return poses, [each for each in boards if each is not None], ratio
 
 

@@ -222,7 +222,7 @@ GOOD = "image,id,x0,y0,x1,y1,x2,y2,x3,y3\n{0},0,1,2,3,4,5,6,7,8\n"
 
 BAD = {
     "an unknown image": (GOOD.replace("{0}", "frame1.png"), ("line 2: image frame1.png is not "
-                         "among those that were exported; expected a name such as 000000-")),
+                         "among the images; expected a name such as 000000-")),
     "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", ("line 3: image {0} has ID 0 twice, here "
                       "and in line 2")),
     "a missing column": (GOOD.replace("y3", "yy3"), "line 1: no column y3; the header has "),

@@ -83,7 +83,7 @@ def test_a_file_of_poses_is_the_truth(faulty, tmp_path):
 @pytest.mark.parametrize(("changes", "expected"), [
     ({"scale": 1000.0}, "positions are .* times those of the detected markers; expected metres"),
     ({"sign": -1.0}, "most markers are not where its poses have them"),
-    ({"suffix": "_a"}, "image shot0_a is none of the photographs"),
+    ({"suffix": "_a"}, "image shot0_a is not among the images; expected a name such as shot0"),
 ])
 def test_poses_of_another_unit_frame_or_image_are_refused(faulty, tmp_path, changes, expected):
     with pytest.raises(PipelineError, match=expected):

@@ -129,12 +129,12 @@ class Pair:
 
 
 def paired_arrays(
-    first: dict[str, xr.DataArray], second: dict[str, xr.DataArray]
+    first: xr.Dataset, second: xr.Dataset, *names: str
 ) -> dict[str, xr.DataArray]:
-    """Return the arrays of two datasets by the names that `Pair` gives them."""
+    """Return variables of two datasets by the names that `Pair` gives them."""
     return {f"{side} {name}": array.reset_coords(drop=True)
-            for side, arrays in (("first", first), ("second", second))
-            for name, array in arrays.items()}
+            for side, results in (("first", first), ("second", second))
+            for name, array in pose_arrays(results, names).items()}
 
 
 def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
@@ -251,9 +251,8 @@ def paired_table(
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
-    names = dict.fromkeys(name for quantity in quantities for name in quantity.inputs)
-    inputs = paired_arrays(*(
-        pose_arrays(side, (*ERROR_INPUTS, *names)) for side in (first, second)))
+    inputs = paired_arrays(first, second, *ERROR_INPUTS, *(
+        name for quantity in quantities for name in quantity.inputs))
     inputs[DIFFERING] = sum(
         ((first[name] != second[name]).any("xyz").reset_coords(drop=True)
          for name in TRUTH if name in first and name in second), xr.DataArray(False))
@@ -405,9 +404,6 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     def kept(name: str) -> list[str]:
         return ["renderer", *(str(dim) for dim in results[name].dims if dim not in scene)]
 
-    def pairs(*names: str) -> dict[str, xr.DataArray]:
-        return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
-
     corners, whose = corners_of(results), "minus the reference's"
     of_detections: list[PairStatistic] = [
         Rate("detection_disagreement", "differing of compared",
@@ -431,9 +427,10 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
                 dtype=np.float64)))[..., None],
             lambda pair: pair.first.unflipped & pair.second.unflipped, units=ROTATION.units)]
     detections = aggregate(
-        results, pairs(*DETECTION_INPUTS, corners), kept("detection"), of_detections, Pair)
-    return detections.drop_vars("draws").assign(
-        aggregate(results, pairs(*ERROR_INPUTS), kept("estimate"), of_poses, Pair))
+        results, paired_arrays(others, results, *DETECTION_INPUTS, corners), kept("detection"),
+        of_detections, Pair)
+    return detections.drop_vars("draws").assign(aggregate(
+        results, paired_arrays(others, results, *ERROR_INPUTS), kept("estimate"), of_poses, Pair))
 
 
 def _corner_shift(pair: Pair, corners: str) -> Floats:
@@ -649,9 +646,9 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
             f"{stage}s": (_by_flags(kind, stage, flags, both, scene),
                           "poses by their flags in the first and in the second store", "1")}
     found = done["detection"]
-    corners = _summed([_moved(sides, name, found[0] & found[1])
+    corners = _summed([_corners_apart(sides, name, found[0] & found[1])
                        for name in CORNER_VARIABLES if name in read], scene)
-    poses = _summed([_motions(sides)], scene)
+    poses = _summed([_poses_apart(sides)], scene)
     differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
     columns |= {
         "computed_once": ((found[0] ^ found[1]).sum(scene),
@@ -695,34 +692,39 @@ def _by_flags(
     return found.assign_coords({label: [each.name for each in kind] for label in labels})
 
 
-def _moved(sides: Sequence[xr.Dataset], name: str, computed: xr.DataArray) -> xr.Dataset:
-    """Return which corners both have, one has and which differ, and how far, px."""
-    first, second = (side[name] for side in sides)
-    found = [xr.apply_ufunc(np.isfinite, each).all("xy") for each in (first, second)]
-    both = found[0] & found[1] & computed
+def _apart(
+    vectors: Sequence[xr.DataArray], present: Sequence[xr.DataArray], across: str
+) -> xr.Dataset:
+    """Return which vectors both have, one has and which differ, and the length between them."""
+    (first, second), both = vectors, present[0] & present[1]
     return xr.Dataset({
-        "both": both, "once": (found[0] ^ found[1]) & computed,
-        "differ": both & (first != second).any("xy"),
-        "distance": ((second.astype(np.float64) - first) ** 2).sum("xy") ** 0.5})
+        "both": both, "once": present[0] ^ present[1],
+        "differ": both & (first != second).any(across),
+        "distance": ((second.astype(np.float64) - first) ** 2).sum(across) ** 0.5})
 
 
-def _motions(sides: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return which poses both solved and which differ, and how far: m, degrees."""
+def _corners_apart(
+    sides: Sequence[xr.Dataset], name: str, computed: xr.DataArray
+) -> xr.Dataset:
+    """Return which corners differ, and how far, px."""
+    return _apart([side[name] for side in sides], [
+        xr.apply_ufunc(np.isfinite, side[name]).all("xy") & computed for side in sides], "xy")
+
+
+def _poses_apart(sides: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return which poses differ, and how far: m, degrees."""
     solved = [side["estimate"] == EstimateStatus.solved for side in sides]
-    both = solved[0] & solved[1]
-    positions, rotations = ([side[name].transpose(*both.dims, "xyz") for side in sides]
+    positions, rotations = ([side[name].transpose(*solved[0].dims, "xyz") for side in sides]
                             for name in ("translation_error_m", "rotation_error_rad"))
-    changed = [(first != second).any("xyz") for first, second in (positions, rotations)]
-    differ = both & (changed[0] | changed[1])
-    moved = positions[1].astype(np.float64) - positions[0]
+    moved = _apart(positions, solved, "xyz")
+    differ = moved["differ"] | _apart(rotations, solved, "xyz")["differ"]
     # Errors are rotations from the true one: R2 R1ᵀ = (R2 Rᵀ)(R1 Rᵀ)ᵀ.
     first, second = (rotation_of_vector(each.values[differ.values].astype(np.float64))
                      for each in rotations)
-    angle = xr.zeros_like(moved.isel(xyz=0, drop=True))
+    angle = xr.zeros_like(moved["distance"])
     angle.values[differ.values] = np.degrees(np.linalg.norm(
         vector_of_rotation(second @ np.swapaxes(first, -1, -2)), axis=-1))
-    return xr.Dataset({"both": both, "differ": differ, "angle": angle,
-                       "distance": (moved**2).sum("xyz") ** 0.5})
+    return moved.assign(differ=differ, angle=angle)
 
 
 def _summed(parts: Sequence[xr.Dataset], scene: Sequence[str]) -> xr.Dataset:

@@ -12,7 +12,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.poses import AXIS, DETECTION_INPUTS, ERROR_INPUTS, NOT_LOOKED_FOR
+from sweep.analysis.poses import (
+    AXIS,
+    DETECTION_INPUTS,
+    ERROR_INPUTS,
+    NOT_AVAILABLE,
+    NOT_LOOKED_FOR,
+)
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.document import SEARCH, read_document
 from sweep.experiment.draws import REPLICATES
@@ -20,7 +26,6 @@ from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAP
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
-from sweep.measure.flags import DetectionStatus
 from sweep.messages import shown
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plugins.declared import recorded_plugins
@@ -289,10 +294,6 @@ def replicate_order(results: xr.Dataset, draws: Sequence[str]) -> NDArray[np.int
 # them would be one of mostly hard ones. So what is pooled is pooled over the trials that all
 # pooled cells have: each counts as it does in a store of equally many trials. Cells in which no
 # pose was looked for have nothing to count, and do not lessen these trials.
-
-#: Flags of the trials that a cell does not have.
-NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
-
 
 def common_trials(
     results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]

@@ -274,6 +274,9 @@ def bearing_of(position_m: Floats) -> Floats:
 #: Flags of detection of the poses that are in no denominator.
 NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))
 
+#: Flags of detection of the poses that were not run.
+NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
+
 #: Name of the mask of the poses that count at all, if not all do.
 INSIDE = "inside"
 
@@ -365,15 +368,12 @@ class Poses:
     @cached_property
     def run(self) -> Masks:
         """Poses that were run."""
-        flags = self.detection
-        return np.asarray(
-            (flags != DetectionStatus.not_run) & (flags != DetectionStatus.not_needed))
+        return ~np.isin(self.detection, NOT_AVAILABLE)
 
     @cached_property
     def looked_for(self) -> Masks:
         """Poses whose detection is counted: run, visible and modelled."""
-        return np.asarray(functools.reduce(
-            np.logical_and, [self.detection != value for value in NOT_LOOKED_FOR]))
+        return ~np.isin(self.detection, NOT_LOOKED_FOR)
 
     @cached_property
     def detected(self) -> Masks:

@@ -21,7 +21,7 @@ from sweep.messages import plain
 from sweep.processor import differing_processors
 from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
-from sweep.store.lifecycle import finish, open_store, reopen
+from sweep.store.lifecycle import open_store, reopen, write_groups
 from sweep.store.lock import changing, is_written
 from sweep.typing import Integers
 
@@ -281,7 +281,7 @@ def close(store: RunStore) -> None:
             "needed": totals.needed, "conditions": condition_count(store.pipeline),
             "unsettled": unsettled_count(store, rule),
         }
-    finish(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
+    write_groups(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
 
 
 def _failure_table(totals: Totals) -> xr.Dataset:

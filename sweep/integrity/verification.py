@@ -33,7 +33,7 @@ from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle, lock
 from sweep.store.blocks import Receipt, RunStore
-from sweep.store.provenance import differences
+from sweep.store.provenance import differences, excerpt
 
 # --------------------------------------------------------------------------------------------------
 # Values as a store holds them, and the pipeline with which they are recomputed.
@@ -208,7 +208,7 @@ class IntegrityReport:
     blocks, blocks_done
         Blocks of the grid, and how many are committed.
     files, bytes
-        Files that were read, and their size.
+        Files that were read, and the size of the blocks' chunks.
     sampled
         Scenes that were recomputed.
     not_sampled
@@ -464,10 +464,9 @@ def report_on(store: RunStore, sample: int) -> IntegrityReport:
     """Check a store, and recompute up to ``sample`` scenes; none with a sample of 0."""
     done = blocks.committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
-    listing = lifecycle.read_listed(store, tables=True)
-    report.files, report.bytes = 1 + len(listing), sum(map(len, filter(None, listing.values())))
-    faults = lifecycle.changed_files(store, listing)
-    report.damage = [Damage(key, fault) for key, fault in faults.items()]
+    report.files = 1 + len(store.run_metadata["files"])
+    report.damage = [Damage(key, fault) for key, fault
+                     in lifecycle.damaged_files(store, tables=True).items()]
     if not lifecycle.is_root_sound(store):
         report.damage.append(Damage("zarr.json", lifecycle.CHANGED))
     numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
@@ -685,11 +684,8 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
         elif (row := axis.index_of(named)) is not None:
             index[axis.name] = row
         else:
-            known = ", ".join(f"({each})" if axis.zipped else str(each) for each in axis.values[:6])
-            more = f", ... {axis.values[-1]}" if len(axis) > 6 else ""
-            faults.append(
-                f"--at {name}={plain(value)}: not on the grid; its values are {known}{more}"
-            )
+            faults.append(f"--at {name}={plain(value)}: not on the grid; its values are "
+                          f"{excerpt(axis.values)}")
     if faults:
         raise refusal(faults)
     return index

@@ -245,22 +245,20 @@ def checksums(contents: Mapping[str, bytes]) -> dict[str, int]:
     return {key: crc32(content) for key, content in contents.items()}
 
 
-def changed_files(
-    store: RunStore, contents: Mapping[str, bytes | None]
-) -> dict[str, str]:
-    """Return which of the listed files are missing or changed, and which of the two, by key."""
-    written = store.run_metadata["files"]
+def damaged_files(store: RunStore, *, tables: bool) -> dict[str, str]:
+    """Return which listed files are missing or changed, and which of the two, by key.
+
+    Tables are left out if they do not matter.
+    """
+    within = tuple(f"{name}/" for name in TABLES)
+    listed = {key: crc for key, crc in store.run_metadata["files"].items()
+              if tables or not key.startswith(within)}
+    contents = files.read_files(store.storage, list(listed))
     return {
-        key: "missing" if content is None else CHANGED for key, content in contents.items()
-        if content is None or crc32(content) != written[key]
+        key: "missing" if content is None else CHANGED
+        for (key, crc), content in zip(listed.items(), contents, strict=True)
+        if content is None or crc32(content) != crc
     }
-
-
-def read_listed(store: RunStore, *, tables: bool) -> dict[str, bytes | None]:
-    """Return the contents of the listed files by key, with or without tables."""
-    keys = [key for key in store.run_metadata["files"]
-            if tables or not key.startswith(tuple(f"{name}/" for name in TABLES))]
-    return dict(zip(keys, files.read_files(store.storage, keys), strict=True))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -288,7 +286,7 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     """
     store = open_unchecked(url, mode)
     # Tables may be written at this moment, and blocks do not need them.
-    for key, fault in changed_files(store, read_listed(store, tables=False)).items():
+    for key, fault in damaged_files(store, tables=False).items():
         blocks.check_not_replaced(store)
         raise StoreError(
             f"{store.url}: damaged: {key}: {fault}; `sweep verify --repair` repairs it")
@@ -571,15 +569,7 @@ def _only_committed(
 # --------------------------------------------------------------------------------------------------
 # The end of a run in its store: groups beside the results, and the mark "finished".
 #
-# Two processes may close a store at once: they write the same files, and delete none.
-
-def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
-    """Close a complete store: write its groups, consolidate the metadata, mark it finished."""
-    metadata = {
-        **store.run_metadata, "finished": True, "finished_at": utc_now(), "counts": counts,
-    }
-    _write_groups(store, groups, metadata)
-
+# Two processes may close a store at once: they write the same files.
 
 def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
     """Mark a store unfinished, so that blocks of it can be computed again.
@@ -600,24 +590,14 @@ def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
             files.delete_folder(store.storage, name)
 
 
-def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
-    """Write a dataset to a group of a finished store, and consolidate the metadata again.
-
-    Files of an earlier dataset go first: with other dimensions, one's folder is the other's file.
-    """
-    listed = store.run_metadata["files"]
-    others = {key: crc for key, crc in listed.items() if not key.startswith(f"{name}/")}
-    metadata = {**store.run_metadata, "files": others}
-    if len(others) < len(listed):
-        with locations.translate_errors(store.url, "written"):
-            write_root(store, metadata)
-            files.delete_folder(store.storage, name)
-    _write_groups(store, {name: content}, metadata)
-
-
-def _write_groups(
-    store: RunStore, groups: Mapping[str, xr.Dataset], metadata: Mapping[str, Any]
+def write_groups(
+    store: RunStore, groups: Mapping[str, xr.Dataset], counts: Mapping[str, Any] | None = None
 ) -> None:
+    """Write groups of a complete store, and consolidate the metadata.
+
+    The store is closed by a record of its ``counts``. Files of earlier groups of these names go
+    first: with other dimensions, one's folder is the other's file.
+    """
     memory = MemoryStore()
     for name, content in groups.items():
         # Zarr 3 specifies strings of variable length, none of a fixed one.
@@ -630,10 +610,19 @@ def _write_groups(
     within = tuple(f"{name}/" for name in groups)
     contents = {key: content for key, content in files.files_in(memory).items()
                 if key.startswith(within)}
+    metadata = store.run_metadata
+    if counts is not None:
+        metadata |= {"finished": True, "finished_at": utc_now(), "counts": counts}
+    listed = metadata["files"]
+    others = {key: crc for key, crc in listed.items() if not key.startswith(within)}
     with locations.translate_errors(store.url, "written"):
+        if len(others) < len(listed):
+            write_root(store, {**metadata, "files": others})
+            for name in groups:
+                files.delete_folder(store.storage, name)
         files.delete_folder(store.storage, blocks.BEGUN)
         files.write_files(store.storage, contents)
-        write_root(store, {**metadata, "files": metadata["files"] | checksums(contents)})
+        write_root(store, {**metadata, "files": others | checksums(contents)})
 
 
 def write_root(

@@ -26,7 +26,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
 from sweep.plugins.loading import printing_to_stderr
 from sweep.plugins.recording import is_recording
-from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_group
+from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_groups
 from sweep.store.lock import changing
 from sweep.store.provenance import differences
 from sweep.tradeoff.costs import (
@@ -123,9 +123,8 @@ def measure_trade(
             results = results.sel(renderer=REFERENCE, drop=True)
         trade = _trade(pipeline, results, per, started + limit_s, limit_s, interrupts, report)
         trade.attrs.update(question or {})
-        if renderers is not None:
-            write_group(store, "cost/renderers", renderers)
-        write_group(store, "cost/tradeoff", trade)
+        write_groups(store, {"cost/tradeoff": trade} | (
+            {} if renderers is None else {"cost/renderers": renderers}))
     return trade, renderers
 
 

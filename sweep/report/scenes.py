@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
+from sweep.evaluation.results import compare
 from sweep.experiment.pipeline import Pipeline, cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
-from sweep.integrity.verification import compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.report.report_data import AREA, ReportData, store_errors
 from sweep.report.table import Table, coordinate, number, plural

@@ -15,12 +15,12 @@ from support.here import Here
 from support.stores import by_hand
 from sweep import cli
 from sweep.cli import main
-from sweep.evaluation.results import Failure
+from sweep.evaluation.results import Failure, compare
 from sweep.execution.runner import execute
 from sweep.execution.status import close
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
-from sweep.integrity.verification import compare, repair, verify
+from sweep.integrity.verification import repair, verify
 from sweep.store.blocks import MAX_CHARACTERS, MAX_PER_BLOCK, recorded
 
 TEXT = """

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 import xarray as xr
@@ -93,15 +94,6 @@ class AmbiguousPoses(Poses):
         return ambiguity_ratio(
             self["reprojection_error_px"], self["alternative_reprojection_error_px"])
 
-    @cached_property
-    def single(self) -> Masks:
-        """Solved poses without another solution."""
-        return np.asarray(self.solved & np.isnan(self["alternative_reprojection_error_px"]))
-
-    def kept(self, threshold: float) -> Masks:
-        """Return the solved poses whose ratio is at most a threshold."""
-        return np.asarray(self.solved & (self.ratio <= threshold))
-
 
 @describes
 def ambiguity(
@@ -172,66 +164,52 @@ def ambiguity(
     >>> [ThresholdChoice(choice).name for choice in table["choice"].values]
     ['not_needed', 'too_few_draws']
     """
-    tried = _checked_thresholds(thresholds)
-    if not (_is_number(flip_rate) and 0.0 < flip_rate < 1.0):
+    tried = np.array([*thresholds], dtype=np.float64)
+    if not (0 < tried.size <= MAX_THRESHOLDS and (tried >= 0).all()):
+        raise ArgumentError("thresholds", thresholds, "expected numbers of at least 0, "
+                            f"{MAX_THRESHOLDS} at most, such as 0.2, 0.4")
+    if not 0.0 < flip_rate < 1.0:
         raise ArgumentError(
             "flip_rate", flip_rate, "expected a number above 0 and below 1, such as 0.01")
-    if not (_is_number(min_kept) and 0.0 <= min_kept <= 1.0):
+    if not 0.0 <= min_kept <= 1.0:
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
     kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
     inputs = {name: array.compute() for name, array in pose_arrays(results, RATIO_INPUTS).items()}
     counts: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
-        Count("without_alternative", "solved poses without another solution",
-              lambda poses: poses.single)]
+        Count("without_alternative", "solved poses without another solution", lambda poses:
+              poses.solved & np.isnan(poses["alternative_reprojection_error_px"]))]
     table = aggregate(results, inputs, kept, counts, AmbiguousPoses, bins)
-    at_thresholds = [aggregate(results, inputs, kept, _rates(threshold), AmbiguousPoses, bins)
-                     for threshold in tried]
-    table = table.assign(stacked(at_thresholds, "threshold")).assign_coords(
-        threshold=("threshold", tried, cf_attributes(
-            "largest ratio of both reprojection errors that is kept", "1")))
+    levels = np.unique([*tried, np.inf])
+    table = table.assign(stacked([
+        aggregate(results, inputs, kept, _rates(level), AmbiguousPoses, bins) for level in levels
+    ], "threshold")).assign_coords(threshold=("threshold", levels, cf_attributes(
+        "largest ratio of both reprojection errors that is kept", "1")))
     tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
     return _with_choice(table, flip_rate, min_kept, tail)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.number))
-
-
-def _checked_thresholds(thresholds: Iterable[float]) -> list[float]:
-    """Return the thresholds, increasing, each once, and infinity; ArgumentError if any is bad."""
-    words = f"expected numbers of at least 0, {MAX_THRESHOLDS} at most, such as 0.2, 0.4"
-    try:
-        numbers = np.array([] if isinstance(thresholds, str) else list(thresholds), dtype="f8")
-    except (TypeError, ValueError):
-        raise ArgumentError("thresholds", thresholds, words) from None
-    if numbers.ndim != 1 or not 0 < numbers.size <= MAX_THRESHOLDS or not (numbers >= 0).all():
-        raise ArgumentError("thresholds", thresholds, words)
-    return sorted({*numbers.tolist(), np.inf})
 
 
 def _rates(threshold: float) -> list[Rate[AmbiguousPoses]]:
     """Return the rates at a threshold."""
     def kept(poses: AmbiguousPoses) -> Masks:
-        return poses.kept(threshold)
+        return np.asarray(poses.solved & (poses.ratio <= threshold))
 
     def rejected(poses: AmbiguousPoses) -> Masks:
-        return np.asarray(poses.solved & ~poses.kept(threshold))
+        return np.asarray(poses.solved & ~kept(poses))
 
+    counts = (("kept", "poses that the threshold keeps"),
+              ("kept_flipped", "flips that the threshold keeps"))
     return [
-        Rate("kept_rate", "kept of the solved poses", kept, lambda poses: poses.solved,
-             exact=True),
-        Rate("kept_flip_rate", "flips of the kept poses", lambda poses: poses.flipped, kept,
-             exact=True, counts=(("kept", "poses that the threshold keeps"),
-                                 ("kept_flipped", "flips that the threshold keeps"))),
-        Rate("flips_kept_rate", "kept of the flips", kept, lambda poses: poses.flipped,
-             exact=True),
-        Rate("right_rejected_rate", "rejected of the poses that are not flipped", rejected,
-             lambda poses: poses.unflipped, exact=True),
-        Rate("rejected_right_rate", "not flipped of the rejected poses",
-             lambda poses: poses.unflipped, rejected, exact=True),
-    ]
+        Rate(name, meaning, hits, of, exact=True, counts=counts if of is kept else ())
+        for name, meaning, hits, of in (
+            ("kept_rate", "kept of the solved poses", kept, attrgetter("solved")),
+            ("kept_flip_rate", "flips of the kept poses", attrgetter("flipped"), kept),
+            ("flips_kept_rate", "kept of the flips", kept, attrgetter("flipped")),
+            ("right_rejected_rate", "rejected of the poses that are not flipped", rejected,
+             attrgetter("unflipped")),
+            ("rejected_right_rate", "not flipped of the rejected poses", attrgetter("unflipped"),
+             rejected))]
 
 
 #: Variables at the chosen threshold: name there -> description.

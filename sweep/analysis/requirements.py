@@ -1,4 +1,4 @@
-"""Requirements: what may be required, and whether it is met, not met, or not decided."""
+"""Decisions: whether requirements are met, how far along an axis, which choice, how precisely."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -24,15 +24,21 @@ from sweep.analysis.dataset import (
     SIZE_AXES,
     as_names,
     axes_of,
+    computed_scenes,
     configuration_axes,
     describes,
     each_cell,
+    image_sides,
     is_replicated,
     kept_dimensions,
     largest_cell,
+    parameter_value,
+    require_poses,
     stacked,
+    stopping_rule,
 )
 from sweep.analysis.estimator import (
+    INTERVAL,
     PERCENTS,
     Bins,
     Count,
@@ -44,23 +50,25 @@ from sweep.analysis.estimator import (
     aggregate,
     draws_to_see,
     guarded,
+    stopped_level,
 )
-from sweep.analysis.intervals import clopper_pearson
+from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
 from sweep.analysis.poses import (
     ESTIMATE_INPUTS,
     QUANTITIES,
     SIGNED,
     Poses,
-    Quantity,
     pose_arrays,
 )
-from sweep.analysis.summaries import NEES_MEAN, RATIOS, quantiles_of, registered
+from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError, PipelineError
 from sweep.experiment.parameters import Stage
-from sweep.experiment.sampling import RequirementText, read_requirement
+from sweep.experiment.sampling import RequirementText, StoppingRule, read_requirement
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
+from sweep.model.marker import module_count
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Quantities that can be required: every output of a statistic that has an interval.
@@ -92,8 +100,6 @@ class Requirable:
         Of the output.
     statistic
         What computes it.
-    inputs
-        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
     largest
         The largest value that exists.
     percent
@@ -103,7 +109,6 @@ class Requirable:
     name: str
     units: str
     statistic: Any
-    inputs: tuple[str, ...]
     largest: float = math.inf
     percent: int | None = None
 
@@ -121,11 +126,6 @@ class Requirable:
     def signed(self) -> bool:
         """Whether the value has a sign: its absolute value is required."""
         return type(self.statistic) is Mean
-
-    @property
-    def variables(self) -> list[str]:
-        """The dataset's variables that it is computed of."""
-        return [*self.inputs]
 
     def level(self, share: float = 1.0) -> float:
         """Return the level of the interval by which it is decided with a share of the error."""
@@ -167,13 +167,14 @@ def requirable_arrays(
     """
     required = list(required)
     lacking = {each.name: missing for each in required
-               if (missing := [name for name in each.variables if name not in results])}
+               if (missing := [name for name in each.statistic.inputs if name not in results])}
     if lacking:
         raise DatasetError("\n".join(
             f"{name}: cannot be computed, for this store lacks {', '.join(missing)}"
             for name, missing in lacking.items()))
     return pose_arrays(
-        results, [*ESTIMATE_INPUTS, *(name for each in required for name in each.inputs)])
+        results, [*ESTIMATE_INPUTS, *(
+            name for each in required for name in each.statistic.inputs)])
 
 
 @functools.cache
@@ -187,25 +188,18 @@ def requirables() -> dict[str, Requirable]:
     """
     signed = [each for group in SIGNED.values() for each in group]
     quantities = [*QUANTITIES, *signed]
-    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN, *RATIOS]
-    return {each.name: each for record in records for each in _of_record(record, quantities)}
-
-
-def _of_record(
-    statistic: Statistic[Poses], quantities: Sequence[Quantity]
-) -> list[Requirable]:
-    """Return the outputs of a statistic that have an interval."""
-    outputs = {output.name: output for output in statistic.outputs()}
-    found = []
-    for name, output in outputs.items():
-        if f"{name}_low" not in outputs:
-            continue
-        largest = next((each.bound for each in quantities if each.bound is not None and (
-            name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
-        percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
-        found.append(Requirable(
-            name, output.units, statistic, statistic.inputs,
-            1.0 if isinstance(statistic, Rate) else largest, percent))
+    found = {}
+    for statistic in (*registered(quantities), *map(quantiles_of, signed), NEES_MEAN, *RATIOS):
+        outputs = {output.name: output for output in statistic.outputs()}
+        for name, output in outputs.items():
+            if f"{name}_low" not in outputs:
+                continue  # it has no interval
+            largest = next((each.bound for each in quantities if each.bound is not None and (
+                name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
+            percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
+            found[name] = Requirable(
+                name, output.units, statistic, 1.0 if isinstance(statistic, Rate) else largest,
+                percent)
     return found
 
 
@@ -857,15 +851,14 @@ def verdicts(table: xr.Dataset) -> list[Verdict]:
     for at, one in each_cell(
             table.transpose(*configuration, "requirement", *conditions),
             (*configuration, "requirement")):
-        counts = {each: int((one["decision"] == each).sum()) for each in Decision}
-        needed = one["draws_needed"].where(one["decision"] == Decision.undecided)
-        cell = worst_cell(one)
-        is_open = cell["decision"] == Decision.undecided
+        cell, is_open = worst_cell(one), one["decision"] == Decision.undecided
+        needed = float(one["draws_needed"].where(is_open).max())
         found.append(Verdict.at(
             cell, conditions, limit=float(one["limit"]),
-            draws_needed=float(needed.max()) if is_open else math.nan,
+            draws_needed=needed if cell["decision"] == Decision.undecided else math.nan,
             configuration={name: at[name] for name in configuration},
-            counts={each: count for each, count in counts.items() if count}))
+            counts={each: count for each in Decision
+                    if (count := int((one["decision"] == each).sum()))}))
     return found
 
 
@@ -954,3 +947,923 @@ def conditions(
     usual = [next((name for name in names if name in axes), "") for names in (
         (*SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES, boards)]
     return tuple(dict.fromkeys(filter(None, usual)))
+
+
+Decisions = NDArray[np.uint8]
+
+# --------------------------------------------------------------------------------------------------
+# One course along an axis, whose values stand in an order: of a limit from easy to hard, of the
+# smallest size that will do from the largest down. Values at which nothing can be judged, such as
+# sizes that do not fit into the image, are left out; a value beyond one that fails, on the other
+# side of a dip, ends nothing.
+#
+# That makes the error of what is decided that of a single decision: it is wrong only if, at the
+# first value that truly fails, the condition at which it fails is decided as met. Neither the
+# number of values nor that of conditions counts (Berger, "Multiparameter hypothesis testing and
+# acceptance sampling", Technometrics 24, 1982: an intersection-union test; Marcus, Peritz and
+# Gabriel, Biometrika 63, 1976: tests in a fixed order); the numbers of waves, after each of which a
+# decision is made, and of alternatives do (Bonferroni).
+
+class Course(NamedTuple):
+    """How far requirements are met along an axis: indices of its values.
+
+    Attributes
+    ----------
+    met
+        The last value at which, and at all judged ones before it, all is decided to be met.
+    possible
+        The same of values at which nothing is decided not to be met.
+    kept
+        The same of values whose estimates keep all limits; each -1 for none.
+    unmet
+        The first judged value that is not met, or undecided.
+    failing
+        The first judged value whose estimates do not keep a limit; each the number of values if
+        there is none.
+    """
+
+    met: int
+    possible: int
+    kept: int
+    unmet: int
+    failing: int
+
+
+def course(decision: Decisions, keeps: Masks, start: int = 0) -> Course:
+    """Return how far requirements are met.
+
+    Parameters
+    ----------
+    decision
+        (values, ...) of `Decision`, in the order of the course, at all conditions.
+    keeps
+        Of the same shape: where the estimates keep all limits.
+    start
+        The first value that counts.
+
+    Examples
+    --------
+    >>> met, failed = Decision.met, Decision.not_met
+    >>> decision = np.array([[met], [met], [failed], [met], [failed]], np.uint8)
+    >>> course(decision, decision == met)
+    Course(met=1, possible=1, kept=1, unmet=2, failing=2)
+    """
+    inner = tuple(range(1, decision.ndim))
+    keep = (keeps | (decision == Decision.not_applicable)).all(inner)
+    value = combined_decision(decision, inner)
+    judged = (value != Decision.not_applicable) & (np.arange(len(value)) >= start)
+
+    def ends(holds: Masks) -> tuple[int, int]:
+        """Return the last judged value up to which it holds, and the first where it does not."""
+        fails = np.flatnonzero(judged & ~holds)
+        first = int(fails[0]) if fails.size else len(value)
+        before = np.flatnonzero(judged[:first])
+        return int(before[-1]) if before.size else -1, first
+
+    (met, unmet), (kept, failing) = ends(value == Decision.met), ends(keep)
+    return Course(met, ends(value != Decision.not_met)[0], kept, unmet, failing)
+
+
+def error_shares(looks: float, decisions: int) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a search may spend.
+
+    Parameters
+    ----------
+    looks
+        How often an answer can be wrong: looks after each wave, and alternatives.
+    decisions
+        How many decisions are made at once for one answer: any false "not met" shortens it.
+    """
+    return ErrorShares(met=1.0 / looks, not_met=1.0 / (looks * decisions))
+
+
+# --------------------------------------------------------------------------------------------------
+# How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".
+
+class Reach(Flag):
+    """How far the requirements are met along the axis."""
+
+    not_run = flag(0, "Nothing could be judged.", counted=False)
+    found = flag(1, "They are met up to a value within the grid.", present=True)
+    never = flag(2, "They are not met at the easiest value.")
+    always = flag(3, "They are met at all values: the limit may lie beyond.", present=True)
+    within = flag(4, "They are met between two values, but not at the easiest.", present=True)
+
+
+#: Variables of limits: name -> meaning, and units; those of the axis if they are None.
+LIMITS: dict[str, tuple[str, str | None]] = {
+    "value": ("{} up to which all requirements are met", None),
+    "low": ("lower end of the interval: {} up to which all are met", None),
+    "high": ("upper end of the interval: {} up to which all are met", None),
+    "start": ("{} from which all requirements are met", None),
+    "fails_at": ("first {} at which one is not", None),
+    "farthest_beyond": ("farthest {} beyond it at which all are met again", None),
+    "failing_value": ("value of the requirement that fails there", ""),
+    "met_beyond": ("values beyond it at which all are met again", "1"),
+}
+
+#: Texts of limits: name -> meaning.
+LIMIT_TEXTS = {"limited_by": "requirement that fails", "fails_where": "where it fails"}
+
+
+@describes
+def requirement_limits(
+    results: xr.Dataset, require: Sequence[str] = (), along: str = "",
+    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+) -> xr.Dataset:
+    """Return how far along an axis all requirements are met, for each condition by itself.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run, of `sweep.limit` or with equally many trials everywhere.
+    require, along, per, at_all
+        As `sweep.limit` takes them; by default those that the run was made for.
+
+        ``along`` is an axis of the scene with numbers, such as ``distance_m``. It is read from easy
+        to hard: one that changes the size in the image towards smaller markers; another from the
+        end at which the requirements are met at more of the conditions, upwards if that is
+        undecided. ``per`` are dimensions that are kept: a limit for each of their values; without a
+        word all axes of the scene, while an empty list pools them. ``at_all`` are dimensions at all
+        of whose values the requirements must hold for a value of ``along`` to count, such as
+        ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*configuration, *per), computed.
+
+        - ``value``: the last value of the axis up to which, without a gap, the values of all
+          requirements keep their limits; NaN for never. ``start``: the value from which they do,
+          which is the easiest, or the first of the longest run of values if they do not there:
+          near 0 tilt poses flip, near the camera a marker is cut off.
+        - ``low``, ``high``: ends of its interval, in the axis' unit, which covers the limit of each
+          condition with 95 %, however often it was decided anew. Up to the end nearer to the easy
+          values they are decided to be met, beyond the other end a requirement is decided not to be
+          met. -inf or inf: the limit may lie beyond the grid's end. ``settled``: whether the
+          interval is a single value of the grid.
+        - ``reach`` (`Reach`).
+        - ``limited_by``: the requirement that first fails beyond ``value``, "" for none;
+          ``fails_at`` the value of the axis there; ``fails_where``: the values of ``at_all`` at
+          which it fails worst, as text "tilt_deg = 45"; ``failing_value``: the quantity's value
+          there.
+        - ``met_beyond``: at how many values beyond ``fails_at`` all requirements keep their limits
+          again; ``farthest_beyond`` the farthest of them, NaN for none. Detection is not
+          monotonic: above 0 there is a dip, which ends ``value``.
+        - ``poses`` (*per): how many scenes were computed for the condition, of all values.
+
+        With the dimension ``along``, for each of its values: ``decision`` (`Decision`) of all
+        requirements together; ``keeps``: whether all values keep their limits; ``trials`` (*per,
+        along): the most that a cell has there.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.check_requirements`; also if nothing says what is searched, and for an
+        axis without an order.
+
+    Notes
+    -----
+    Requirements must hold at all values of ``at_all`` and are judged at each value along the axis
+    after each wave: an end of the interval is wrong with 0.025 at most, of all these decisions
+    together (Bonferroni over values and requirements; `looks_factor` over waves). ``low`` (of a
+    limit upwards) is too large with the error probability of one decision: only the first value at
+    which a requirement fails could make it so.
+
+    Examples
+    --------
+    >>> limit = requirement_limits(results, ["detection >= 0.6"], "side_px").sel(solver="ippe")
+    >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
+    (20.0, 20.0, 40.0)
+    >>> limit["limited_by"].item(), limit["fails_at"].item()
+    ('detection_rate >= 0.6', 10.0)
+    """
+    rule = stopping_rule(results)
+    rule = rule if rule is not None and rule.kind == "along" else None
+    require = [require] if isinstance(require, str) and require else require
+    if not require or not along:
+        if rule is None:
+            raise ArgumentError("require" if not require else "along", along,
+                                "this store was not made by sweep limit, so that nothing says it")
+        require, along = require or rule.requirements, along or rule.along
+    if rule is not None and along == rule.along:
+        per = rule.per if per is None else per
+        at_all = rule.at_all if at_all is None else at_all
+    required = parse_requirements(require)
+    values = axis_values(results, along)
+    together = [name for name in as_names(at_all or ()) if name != along]
+    names = [name for name in (as_names(per) if per is not None else axes_of(results, Stage.scene))
+             if name != along and (per is not None or name not in (DRAWS, *together))]
+    if overlap := [name for name in together if name in names]:
+        raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
+    count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
+    table = decide(results, required, [*names, *together, along],
+                   shares=error_shares(looks_factor(len(rule.ends) if rule else 1), count))
+    table = table.assign(keeps=kept_by(table, required))
+    upwards = is_harder_upwards(
+        along, table["keeps"].transpose(along, ...).to_numpy()[np.argsort(values)])
+    order = np.argsort(values if upwards else -values, kind="stable")
+    table = table.isel({along: order})
+    inner = [*together, "requirement"]
+    applicable = table["decision"] != Decision.not_applicable
+    keeps = ((table["keeps"] | ~applicable).all(inner) & applicable.any(inner)).assign_attrs(
+        long_name="whether all values keep their limits", units="1")
+    decision = xr.apply_ufunc(
+        combined_decision, table["decision"], input_core_dims=[inner],
+        kwargs={"axis": tuple(range(-len(inner), 0))}).assign_attrs(
+        cf_attributes("whether all requirements are met", flags=Decision))
+    kept = [dim for dim in decision.dims if dim != along]
+    rows = []
+    for index in np.ndindex(*(table.sizes[dim] for dim in kept)):
+        at = dict(zip(kept, index, strict=True))
+        failing, row = _limit(values[order], upwards, *(
+            array.isel(at).to_numpy() for array in (decision, keeps)))
+        if failing is not None:
+            row |= _cause(table.isel({**at, along: failing}), together)
+        rows.append(row)
+
+    def column(name: str, missing: Any) -> Any:
+        found = np.array([row.get(name, missing) for row in rows])
+        return found.reshape([table.sizes[dim] for dim in kept])
+
+    units = str(results[along].attrs.get("units", ""))
+    variables: dict[str, Any] = {
+        name: (kept, column(name, np.nan), {
+            "long_name": meaning.format(along), "units": units if unit is None else unit})
+        for name, (meaning, unit) in LIMITS.items()}
+    variables |= {name: (kept, column(name, ""), {"long_name": meaning})
+                  for name, meaning in LIMIT_TEXTS.items()}
+    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8),
+                          cf_attributes("how far the requirements are met", flags=Reach))
+    variables |= {name: array.transpose(*kept, along)
+                  for name, array in (("decision", decision), ("keeps", keeps))}
+    coordinates = {name: value for name, value in table.coords.items()
+                   if set(value.dims) <= {*kept, along}}
+    found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
+    computed = computed_scenes(results)
+    cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
+    trials = computed.sum(DRAWS).compute()
+    return found.assign(
+        settled=(found["low"] == found["high"]).assign_attrs(
+            long_name="whether the interval is a single value of the grid", units="1"),
+        trials=trials.max(cells).assign_attrs(
+            long_name="trials of a cell, the most at this value", units="1"),
+        poses=trials.sum([*cells, along]).assign_attrs(
+            long_name="scenes that were computed, of all values", units="1"),
+    ).assign_attrs(
+        along=along, harder="upwards" if upwards else "downwards",
+        configuration_dims=[name for name in configuration_axes(results) if name in kept],
+        per=[*names], at_all=together, require=[*require])
+
+
+def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the values of an axis of the scene that has an order.
+
+    Raises
+    ------
+    ArgumentError
+        If there is no such axis, or its values are no numbers, or it is one of configurations.
+    """
+    axes = [name for name in axes_of(results)
+            if name != DRAWS and name not in configuration_axes(results)
+            and name in results.coords and results[name].dtype.kind in "fiu"]
+    if along not in axes:
+        raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
+                            f"are {', '.join(axes) or 'none'}")
+    values = results[along].to_numpy().astype(np.float64)
+    if len(set(values.tolist())) < len(values) or not np.isfinite(values).all():
+        raise DatasetError(f"{along}: has values that repeat or are not finite")
+    return values
+
+
+#: Whether markers are smaller in the image at large values of an axis that changes their size.
+SMALLER_UPWARDS = {
+    **dict.fromkeys(("distance_m", "hfov_deg", "vfov_deg", "dfov_deg", "pixel_size_um",
+                     "sensor_width_mm", "sensor_height_mm"), True),
+    **dict.fromkeys(("side_px", "size_m", "focal_length_mm", "fx_px", "width_px"), False)}
+
+
+def is_harder_upwards(along: str, keeps: NDArray[Any]) -> bool:
+    """Return whether large values of an axis are the hard ones.
+
+    Of an axis that does not change the size in the image they are, unless requirements are kept at
+    more conditions there; ``keeps`` (values, ...), from small to large, is true where they are.
+    """
+    return SMALLER_UPWARDS.get(along, bool(np.sum(keeps[0]) >= np.sum(keeps[-1])))
+
+
+def _limit(
+    values: Floats, upwards: bool, decision: Decisions, keeps: Masks
+) -> tuple[int | None, dict[str, Any]]:
+    """Return the limit of one condition along the axis, from easy to hard.
+
+    With it, before it: the index of the first value beyond that fails.
+    """
+    judged = decision != Decision.not_applicable
+    if not judged.any():
+        return None, {"reach": Reach.not_run}
+    # Where the easiest values fail, the limit is the end of the longest run of values that do not.
+    run, index = met_run(keeps, judged), np.arange(len(values))
+    gaps = np.flatnonzero(judged & ~keeps & (index < (run[0] if run else 0)))
+    start = int(gaps[-1]) + 1 if gaps.size else 0
+    found = course(decision, keeps, start)
+    none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+    met, possible, value = (none if k < 0 else float(values[k])
+                            for k in (found.met, found.possible, found.kept))
+    if (decision[start:] != Decision.not_met).all():
+        possible = beyond
+    low, high = sorted((met, possible))
+    row = {"value": value if np.isfinite(value) else np.nan, "low": low, "high": high,
+           "start": float(values[run[0]]) if run else np.nan, "met_beyond": 0.0}
+    if found.failing == len(values):
+        return None, {**row, "reach": Reach.within if gaps.size else Reach.always}
+    again = np.flatnonzero(judged & keeps & (index > found.failing))
+    return found.failing, {
+        **row, "fails_at": float(values[found.failing]), "met_beyond": float(len(again)),
+        "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
+        "reach": Reach.never if run is None else Reach.within if gaps.size else Reach.found}
+
+
+def met_run(
+    keeps: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]
+) -> tuple[int, int] | None:
+    """Return the first and the last index of the run of values that are kept, without a gap.
+
+    It is that from the first judged value on, or, if that is not kept, the longest; of several the
+    first. Values that are not judged (n,) neither count nor make a gap. None without any.
+
+    >>> met_run(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
+    (3, 4)
+    """
+    at = np.flatnonzero(judged)
+    # Runs begin and end where the mask changes.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keeps[at], [False]])))
+    if not edges.size:
+        return None
+    runs = edges.reshape(-1, 2)
+    first, end = runs[0] if runs[0, 0] == 0 else runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return int(at[first]), int(at[end - 1])
+
+
+def _cause(cell: xr.Dataset, together: Sequence[str]) -> dict[str, Any]:
+    """Return which requirement fails worst, where among ``together``, and its value there."""
+    failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
+    worst = largest_cell(cell, excess_of(cell).where(failing, -np.inf))
+    where = described({name: worst[name].item() for name in together}, " = ")
+    return {"limited_by": str(worst["requirement"].item()), "fails_where": where,
+            "failing_value": float(worst["value"])}
+
+
+@describes
+def detection_limit(
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
+) -> xr.Dataset:
+    """Return the smallest side of the black square from which on the marker is detected.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run with an axis that changes the size in the image: ``side_px``,
+        ``distance_m``, ``size_m``, or one of the camera. What is no coordinate is read from the
+        pipeline in its attributes.
+    rate
+        The detection rate that is asked for, above 0 and below 1.
+    per
+        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A dimension
+        ``dictionary`` is always kept, the axis of the size and the trials cannot be. Others are
+        pooled.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*detector settings, *per): `requirement_limits` of ``detection >= rate``, as
+        sides.
+
+        - ``side_px``: side in pixels, if the square were parallel to the image, down to which the
+          rate is reached without a gap; infinite for never. Its interval is in ``side_px_low`` and
+          ``side_px_high``: 0 or infinite, the limit may lie beyond the grid.
+        - ``side_px_per_module``: the same per module of the marker, with its interval.
+        - the axis, such as ``distance_m``: its value there, with its interval in
+          ``distance_m_low`` and ``distance_m_high``.
+        - ``reach``: whether the rate is reached within the grid (`Reach`).
+
+    Raises
+    ------
+    ArgumentError
+        For a rate outside (0, 1), and for ``per`` that cannot be kept, or leaves several axes of
+        the size.
+    DatasetError
+        If no axis changes the size, or it is drawn; if the dataset lacks variables of results, has
+        no poses, or a single draw of each.
+
+    Notes
+    -----
+    The interval is computed by `requirement_limits`, for each condition by itself.
+
+    Examples
+    --------
+    >>> limit = detection_limit(results, rate=0.6)
+    >>> limit["side_px"].item(), limit["side_px_high"].item(), Reach(limit["reach"].item()).name
+    (20.0, 40.0, 'found')
+    """
+    require_poses(results)
+    axes = axes_of(results)
+    results = results.isel(  # what has several estimators has been detected once
+        {name: 0 for name in axes if name not in results["detection"].dims}, drop=True)
+    if per is None:
+        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
+    per = kept_dimensions(
+        results, (*as_names(per), *(name for name in ("dictionary",) if name in axes)))
+    sides = image_sides(results)
+    if not sides.dims:
+        raise DatasetError("side_px or distance_m: no axis changes the size in the image; there "
+                           f"are {', '.join(axes) or 'none'}")
+    along, *others = [str(dim) for dim in sides.dims if dim not in per] or [""]
+    if others or not along:
+        raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
+                            f"the limit is along; there are {', '.join(map(str, sides.dims))}")
+    found = requirement_limits(results, [f"detection >= {rate:.12g}"], along, per)
+    names = parameter_value(results, "dictionary")
+    modules: Any = module_count(names) if isinstance(names, str) else xr.apply_ufunc(
+        np.vectorize(module_count), names)
+    smaller = found.attrs["harder"] == "upwards"
+    out = {"reach": found["reach"]}
+    for end, words in INTERVAL.items():
+        # Where the axis makes markers small as it grows, ends of sides are the other ends.
+        other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
+        at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
+        within = at.clip(float(sides[along].min()), float(sides[along].max()))
+        side = sides.sel({along: within}, method="nearest").drop_vars(along)
+        beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
+        side = side.where(np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
+        meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
+        out |= {
+            f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
+            f"side_px_per_module{end}": (side / modules).assign_attrs(
+                long_name=f"{meaning}, per module", units="px")}
+        if along != "side_px":
+            out[f"{along}{end}"] = found[end[1:] or "value"]
+    # Others along the axis, such as the distance of a side, do not belong to the answer.
+    return xr.Dataset({name: each.drop_vars(along, errors="ignore").reset_coords(drop=True)
+                       for name, each in out.items()})
+
+
+# --------------------------------------------------------------------------------------------------
+# The choice that meets requirements at all conditions: of a size, and among other settings.
+#
+# What a choice is stands in `sweep.experiment.sampling`. Every alternative, a combination of the
+# values of the axes ``among``, has its own answer: the course of the values from the safe end on.
+
+#: Probability with which an answer meets the requirements.
+CONFIDENCE = 0.95
+
+
+def needed(decision: Decisions, keeps: Masks) -> Masks:
+    """Return which cells need more trials, (..., values, conditions).
+
+    Those are the undecided conditions of the values up to the first that fails, or seems to: of
+    that one, only the conditions at which it seems to fail. What lies beyond it waits until it is
+    decided, and is never needed if it does fail.
+
+    Parameters
+    ----------
+    decision
+        (..., values, conditions) of `sweep.analysis.requirements.Decision`, in the order of the
+        course.
+    keeps
+        Of the same shape: where the estimates keep all limits.
+    """
+    undecided = decision == Decision.undecided
+    seems = undecided & ~keeps
+    value = combined_decision(decision, -1)
+    stops = (value == Decision.not_met) | seems.any(axis=-1)
+    before = np.cumsum(stops, axis=-1) == 0
+    first = stops & (np.cumsum(stops, axis=-1) == 1) & (value == Decision.undecided)
+    return np.asarray((undecided & before[..., None]) | (seems & first[..., None]))
+
+
+@dataclass(frozen=True, slots=True)
+class Nearest:
+    """The value that is nearest to meeting all, where none does.
+
+    Attributes
+    ----------
+    value
+        The value, None without an axis.
+    excess
+        How far it is beyond the limit of a requirement, relative to it.
+    cause
+        That requirement and its condition.
+    """
+
+    value: float | None
+    excess: float
+    cause: Cause
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer of one alternative.
+
+    Attributes
+    ----------
+    alternative
+        Values by axis, of the axes ``among``.
+    met
+        Whether any choice meets the requirements.
+    value
+        The smallest (largest) value of the axis from which on all larger (smaller) ones of the
+        grid meet them; None if there is no such axis, or no such value.
+    tightest
+        The requirement and condition at which the answer is nearest to failing.
+    next, next_cause
+        The next value, which fails or is undecided, and by what; None if all values meet them.
+        Without an axis ``next`` is None, and ``next_cause`` that of the alternative itself.
+    passing
+        Values beyond the next one that seem to meet all.
+    nearest
+        If none is met: the nearest alternative.
+    is_open
+        Whether it is undecided what the answer is: the next value may meet them, too.
+    possible
+        The last value that may do so: none before it is decided to fail.
+    """
+
+    alternative: Mapping[str, Any]
+    met: bool
+    value: float | None
+    tightest: Cause | None
+    next: float | None
+    next_cause: Cause | None
+    passing: tuple[float, ...]
+    nearest: Nearest | None
+    is_open: bool
+    possible: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ChoiceCells:
+    """Decisions at each value and condition of each alternative.
+
+    Attributes
+    ----------
+    table
+        Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *at_all, requirement),
+        the values in the order of the course; without the axis ``along`` if there is none. With
+        ``keeps``, whether the estimates keep their limits, ``excess``, how far they are beyond
+        them, and ``hopeless``: undecided, and no number of trials will tell.
+    rule, shares
+        The search, and the shares of the error probability that a decision may spend.
+    """
+
+    table: xr.Dataset
+    rule: StoppingRule
+    shares: ErrorShares
+
+    def of(self, name: str) -> NDArray[Any]:
+        """Return a variable (alternatives, values, conditions, requirements)."""
+        sizes = self.table.sizes
+        return self.table[name].to_numpy().reshape(
+            -1, sizes[self.rule.along] if self.rule.along else 1,
+            math.prod(sizes[name] for name in self.rule.at_all), sizes["requirement"])
+
+    @property
+    def decision(self) -> Decisions:
+        """Decisions (alternatives, values, conditions) on all requirements together."""
+        return combined_decision(self.of("decision"), -1)
+
+    @property
+    def keeps(self) -> Masks:
+        """Where (alternatives, values, conditions) the estimates keep all limits."""
+        return np.asarray(self.of("keeps").all(axis=-1))
+
+    @property
+    def hopeless(self) -> Masks:
+        """Where (alternatives, values, conditions) trials will not tell."""
+        return np.asarray(
+            self.of("hopeless").any(axis=-1) & (self.decision == Decision.undecided))
+
+    def needed(self) -> xr.DataArray:
+        """Return which cells need more trials, dimensions (*among, along, *at_all)."""
+        template = self.table["decision"].isel(requirement=0, drop=True)
+        decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
+        return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
+
+
+def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> ChoiceCells:
+    """Return the decisions of a dataset, of a whole store or of some of its alternatives.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As `sweep.analysis.check_requirements`.
+    """
+    required = parse_requirements(rule.requirements)
+    kept = [*rule.among, *([rule.along] if rule.along else []), *rule.at_all]
+    table = decide(results, required, kept, shares=shares).transpose(..., *kept, "requirement")
+    if rule.along:
+        table = table.sortby(rule.along, ascending=rule.largest)
+    # Where so few poses count that max_trials will not have enough, there is nothing to learn.
+    pooled = math.prod(results.sizes[str(name)] for name in results["true_tvec_m"].dims if
+                       name not in (*kept, DRAWS, "xyz"))
+    coming = table["draws"] / table["looked_for"] * rule.max_trials * pooled
+    few = (table["looked_for"] >= MIN_DRAWS) & (coming < MIN_DRAWS)
+    judged = table["decision"] != Decision.not_applicable
+    return ChoiceCells(table.assign(
+        hopeless=(table["decision"] == Decision.undecided) & few,
+        excess=excess_of(table).where(judged, -np.inf),
+        keeps=kept_by(table, required) | ~judged), rule, shares)
+
+
+def answers(cells: ChoiceCells) -> list[Answer]:
+    """Return the answer of each alternative, in the order of the table's dimensions."""
+    parts = zip(cells.decision, cells.keeps, cells.of("excess").max(axis=(2, 3)),
+                each_cell(cells.table, cells.rule.among), strict=True)
+    return [_answer(cells, *part) for part in parts]
+
+
+def _answer(
+    cells: ChoiceCells, decision: Decisions, keeps: Masks, excess: Floats,
+    part: tuple[dict[str, Any], xr.Dataset],
+) -> Answer:
+    """Return the answer of an alternative, a part of the table."""
+    (alternative, table), along = part, cells.rule.along
+    values: list[Any] = table[along].to_numpy().tolist() if along else [None]
+
+    def cause(at: int) -> Cause:
+        """Return the requirement and condition by which a value fails worst, or is nearest."""
+        cell = worst_cell(table.isel({along: at}) if along else table)
+        needed = math.nan
+        if cell["decision"] == Decision.undecided:
+            required = parse_requirements(str(cell["requirement"].item()))[0]
+            solved = float(cell["solved"]) / max(float(cell["looked_for"]), 1.0)
+            needed = float(draws_needed(required, cell, solved, cells.shares.met))
+        return Cause.at(cell, cells.rule.at_all, draws_needed=needed)
+
+    found, value = course(decision, keeps), combined_decision(decision, -1)
+    judged = value != Decision.not_applicable
+    met, after = found.met >= 0, found.unmet < len(values)
+    best = int(np.argmin(np.where(judged, excess, np.inf)))
+    return Answer(
+        alternative, met, values[found.met] if met else None, cause(found.met) if met else None,
+        values[found.unmet] if after else None, cause(found.unmet) if after else None,
+        tuple(value for k, value in enumerate(values)
+              if k > found.unmet and judged[k] and keeps[k].all()),
+        None if met else Nearest(values[best], float(excess[best]), cause(best)),
+        bool((value[: found.possible + 1] == Decision.undecided).any()),
+        None if found.possible < 0 else values[found.possible])
+
+
+# --------------------------------------------------------------------------------------------------
+# Half-widths of intervals, by which sampling stops, and whether they are as small as is wanted.
+#
+# Of rates they are as they are, of a bias relative to the root mean square error, of all else
+# relative to the value. The intervals are those that the analysis shows of a store whose sampling
+# was stopped (`sweep.analysis.estimator`).
+
+#: Draws below which no interval of a mean or a root mean square is narrow enough.
+#:
+#: Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.
+MIN_MEAN_DRAWS = 450
+
+#: Poses that count below which a rate is not worth waiting for.
+MIN_OF_RATE = 50
+
+#: Level of the interval that says that too few numbers will come.
+NEVER_LEVEL = 0.999
+
+
+class Reached(Flag):
+    """Whether a quantity is known as well as was wanted."""
+
+    not_run = flag(0, "Nothing was computed.", counted=False)
+    reached = flag(1, "The interval is as narrow as was wanted.", present=True)
+    not_reached = flag(2, "The interval is wider than was wanted.", present=True)
+    too_rare = flag(
+        3, "Poses that have such a number are too rare for an interval as narrow as was wanted.")
+    not_applicable = flag(4, "No pose was looked for.", counted=False)
+
+
+@dataclass(frozen=True)
+class WantedPrecision:
+    """The half-width that is wanted of the interval of a quantity.
+
+    Attributes
+    ----------
+    requirable
+        The quantity.
+    half_width
+        As the comment above says; above 0, below 1.
+    """
+
+    requirable: Requirable
+    half_width: float
+
+    @property
+    def name(self) -> str:
+        """Name of the quantity."""
+        return self.requirable.name
+
+    @property
+    def spread(self) -> Requirable | None:
+        """Of a bias the standard deviation; else None."""
+        return requirables().get(self.name.replace("_bias_", "_sd_")) \
+            if "_bias_" in self.name else None
+
+    def statistics(self, prefix: str) -> list[Statistic[Poses]]:
+        """Return the statistics that must be computed, their variables' names with a prefix."""
+        parts = self.requirable.computed(prefix, LEVEL)
+        return parts + self.spread.computed(f"{prefix}of ", LEVEL)[:1] if self.spread else parts
+
+    @property
+    def least_draws(self) -> int:
+        """Draws with a number below which it is useless to go on.
+
+        It does not depend on the half-width, so that a smaller one never needs fewer trials.
+        """
+        if self.requirable.is_rate:
+            return MIN_OF_RATE
+        if (percent := self.requirable.percent) is None:
+            return MIN_MEAN_DRAWS
+        return draws_to_see(1.0 - percent / 100.0, stopped_level(LEVEL))
+
+    @property
+    def fewest_draws(self) -> int:
+        """Draws below which no interval is narrow enough, whatever the results are."""
+        if not self.requirable.is_rate:
+            return self.least_draws
+        # An interval of half of all shares, or more, has a single draw.
+        return draws_to_see(min(2.0 * self.half_width, 0.999), stopped_level(LEVEL))
+
+    def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
+        """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.
+
+        Parameters
+        ----------
+        table
+            The variables of `statistics`; ``looked_for`` and ``run``: poses that were.
+        prefix
+            As there.
+        total
+            Poses that all trials would be.
+        """
+        what, run = self.requirable, table["run"]
+        # Of a bias with its sign.
+        value, low, high = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL] \
+            if what.signed else what.interval(table, prefix)
+        used, draws = table[f"{prefix}used"], table[f"{prefix}draws"]
+        with np.errstate(all="ignore"):
+            half = (high - low) / 2.0
+            if not what.is_rate:
+                scale = abs(value) if self.spread is None else xr.apply_ufunc(
+                    np.hypot, value, table[f"{prefix}of {self.spread.name}"])
+                half = (half / scale).where(half != 0.0, 0.0)
+        # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
+        half = half.where(low != np.inf, 0.0)
+        # Even the upper end of the share of poses with a number gives too few draws of all trials.
+        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
+        worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
+        too_rare = (share * total * worth < self.least_draws) & (total >= self.least_draws)
+        reached = np.select(
+            [run == 0, table["looked_for"] == 0,
+             (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS)),
+             too_rare],
+            [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
+            Reached.not_reached)
+        return xr.Dataset({
+            "value": value, "half_width": half, "used": used, "draws": draws,
+            "reached": used.copy(data=reached.astype(np.uint8))})
+
+
+def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
+    """Return the precisions that names and half-widths ask for.
+
+    Names are as in requirements (`sweep.analysis.requirements.parse_requirements`).
+
+    Raises
+    ------
+    ValueError
+        One line for each name that does not exist, each half-width that cannot be, and each
+        quantity that is named twice.
+
+    Examples
+    --------
+    >>> [(each.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
+    [('detection_rate', 0.02)]
+    """
+    precisions: dict[str, WantedPrecision] = {}
+    faults = []
+    for name, half_width in wanted.items():
+        try:
+            what = named(name)
+            if not 0.0 < half_width < 1.0:
+                raise ValueError("expected the half-width of an interval, above 0 and below 1")
+            if what.name in precisions:
+                raise ValueError(f"{what.name} has another half-width; delete one")
+            precisions[what.name] = WantedPrecision(what, float(half_width))
+        except ValueError as error:
+            faults.append(f"{name}: {error}")
+    if faults:
+        raise ValueError("\n".join(faults))
+    return tuple(precisions.values())
+
+
+@describes
+def precision_reached(
+    results: xr.Dataset, wanted: Mapping[str, float] | None = None,
+    per: Sequence[str] | None = None, max_trials: int | None = None,
+) -> xr.Dataset:
+    """Return how well each condition is known, against the precision that was wanted.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run.
+    wanted
+        Half-widths of intervals by the name of the quantity, such as ``{"detection_rate": 0.02}``:
+        of rates as they are, of a bias relative to the root mean square error, of all else
+        relative to the value. By default as in the pipeline's [search].
+    per
+        Dimensions whose values are conditions; by default as in the pipeline's [search].
+        Detector and estimator are always kept.
+    max_trials
+        The most trials that there may be; by default as many as there are.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*configuration, *per, quantity), computed.
+
+        - ``value`` and ``half_width`` of its interval, in the terms of ``wanted``.
+        - ``reached``: whether it is as narrow as was wanted (`Reached`).
+        - ``used``: poses that the value is of; ``draws``: the random draws that these are worth.
+        - ``run`` (*configuration, *per): poses that were run, of ``poses`` that all trials are.
+        - ``settled`` (*per): whether no configuration and quantity of the condition needs more.
+        - ``wanted`` (quantity).
+
+    Raises
+    ------
+    ArgumentError
+        For names and half-widths that cannot be, and a dimension that does not exist.
+    DatasetError
+        If the dataset lacks a variable, or has no poses.
+
+    Notes
+    -----
+    The intervals are those by which sampling stops: at 97 % for 95 %, and 98 % for root mean
+    squares and standard deviations (`sweep.analysis.estimator`), also of a store whose
+    sampling was not stopped.
+
+    Examples
+    --------
+    >>> table = precision_reached(results, {"detection_rate": 0.3}, per=["side_px"])
+    >>> [Reached(flag).name for flag in table["reached"].isel(solver=0, quantity=0).values]
+    ['reached', 'not_reached', 'reached']
+    """
+    rule = stopping_rule(results)
+    if wanted is None:
+        if rule is None or not rule.precision:
+            raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
+                                'give half-widths, such as {"detection_rate": 0.02}')
+        wanted = dict(rule.precision)
+    if per is None:
+        per = rule.per if rule is not None and rule.precision else ()
+    try:
+        precisions = wanted_precisions(wanted)
+    except ValueError as error:
+        raise ArgumentError("wanted", wanted, str(error)) from None
+    configuration = configuration_axes(results)
+    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *as_names(per)))))
+    table = aggregate(
+        results, requirable_arrays(results, [each.requirable for each in precisions]), kept, [
+            Count(*LOOKED_FOR, lambda poses: poses.looked_for),
+            Count("run", "poses that were run", lambda poses: poses.run),
+            Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
+            *(each for number, precision in enumerate(precisions)
+              for each in precision.statistics(f"{number} ")),
+        ], Poses, stopped=True)
+    total = table["poses"]
+    if max_trials is not None:
+        total = total // results.sizes[DRAWS] * max_trials
+    out = stacked([each.judged(table, f"{number} ", total)
+                   for number, each in enumerate(precisions)], "quantity").reset_coords(drop=True)
+    needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
+    out = out.assign(
+        settled=~needs.any([*configuration, "quantity"]), run=table["run"], poses=table["poses"])
+    for name, *words in (
+        ("value", "value"), ("half_width", "half-width of the interval, as was wanted"),
+        ("used", "poses that the value is of", "1"),
+        ("draws", "random draws that these are worth", "1"),
+        ("reached", "whether the interval is as narrow as was wanted", "", Reached),
+        ("settled", "whether no configuration and quantity needs more trials", "1"),
+    ):
+        out[name].attrs = cf_attributes(*words)
+    return out.assign_coords(
+        {name: each for name, each in table.coords.items() if {*each.dims} <= {*kept}},
+    ).assign_coords({name: ("quantity", listed) for name, listed in (
+        ("quantity", [each.name for each in precisions]),
+        ("wanted", [each.half_width for each in precisions]),
+        # The quantity of which the half-width is a share; none of a rate.
+        ("relative_to", ["" if each.requirable.is_rate else "RMSE" if each.spread else "value"
+                         for each in precisions]))},
+    ).assign_attrs(configuration_dims=configuration)

@@ -424,7 +424,7 @@ def search_limits(
     PipelineError, StoreError, RunError, ArgumentError
         As `sweep.limit`.
     """
-    from sweep.analysis.decisions import requirement_limits  # noqa: PLC0415  (slow to import)
+    from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
     chosen = search_settings(require, along, per, at_all, max_trials)
     if not isinstance(source, Pipeline) and lifecycle.names_store(source):

@@ -12,8 +12,7 @@ import xarray as xr
 
 from sweep.analysis import requirements as judged
 from sweep.analysis.dataset import each_cell
-from sweep.analysis.decisions import requirement_limits
-from sweep.analysis.requirements import Decision, Verdict
+from sweep.analysis.requirements import Decision, Verdict, requirement_limits
 from sweep.errors import DatasetError, StoreError
 from sweep.report import decisions, figures
 from sweep.report.comparison import CARDS, comparison

@@ -15,8 +15,7 @@ import xarray as xr
 from sweep.analysis import requirements as judged
 from sweep.analysis.comparisons import regressions
 from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes, each_cell, is_replicated
-from sweep.analysis.decisions import CONFIDENCE, Reach
-from sweep.analysis.requirements import Cause, Decision, Verdict, described
+from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
 from sweep.errors import ArgumentError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
@@ -28,7 +27,7 @@ from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.typing import Masks
 
 if TYPE_CHECKING:
-    from sweep.analysis.decisions import Answer
+    from sweep.analysis.requirements import Answer
     from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 

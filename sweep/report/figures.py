@@ -12,9 +12,8 @@ import xarray as xr
 from sweep import analysis
 from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.dataset import of_photographs
-from sweep.analysis.decisions import Reached
 from sweep.analysis.estimator import Bins
-from sweep.analysis.requirements import BOARDS
+from sweep.analysis.requirements import BOARDS, Reached
 from sweep.analysis.summaries import ERROR_HEADINGS
 from sweep.experiment.experiment import used_settings
 from sweep.experiment.parameters import Stage

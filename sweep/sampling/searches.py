@@ -12,36 +12,32 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.dataset import sides_of
-from sweep.analysis.decisions import (
-    CONFIDENCE,
-    ChoiceCells,
-    choice_cells,
-    easier_first,
-    error_shares,
-    met_run,
-    precision_reached,
-    smaller_upwards,
-    wanted_precisions,
-)
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.intervals import looks_factor
 from sweep.analysis.poses import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.requirements import (
+    CONFIDENCE,
     ERROR_PROBABILITY,
     MIN_DRAWS,
+    ChoiceCells,
     Decision,
     ErrorShares,
     Requirable,
     Requirement,
     check_required,
+    choice_cells,
     combined_decision,
     decide,
+    error_shares,
+    is_harder_upwards,
     kept_by,
+    met_run,
     parse_requirements,
+    precision_reached,
     read_requirements,
+    wanted_precisions,
 )
-from sweep.errors import DatasetError, PipelineError
+from sweep.errors import PipelineError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL, Block
 from sweep.experiment.pipeline import Pipeline
@@ -152,7 +148,7 @@ def search_rule(pipeline: Pipeline, rule: StoppingRule) -> Stopping:
     scene = [axis.name for axis in pipeline.experiment.scene_axes]
     make = {"precision": _precision, "along": _limit}.get(rule.kind, _choice)
     quantities, open_cells = make(pipeline, rule)
-    variables = [name for each in quantities for name in each.variables]
+    variables = [name for each in quantities for name in each.statistic.inputs]
     free = rule.among if rule.kind in CHOICES else rule.per
 
     def needed(group: Block, values: Mapping[str, NDArray[Any]]) -> Masks:
@@ -193,7 +189,6 @@ def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
         looks_factor(len(rule.ends)),
         len(required) * product_of(pipeline, (rule.along, *rule.at_all)))
     most = rule.max_trials * pooled_cells(pipeline, rule)
-    upwards = size_shrinks_upwards(pipeline, rule.along)
 
     def open_cells(dataset: xr.Dataset) -> xr.DataArray:
         table = decide(dataset, required, searched, shares=shares)
@@ -202,7 +197,7 @@ def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
         arrays = [array.sortby(rule.along) for array in (
             table["decision"], keeps, may_be_decided(table, keeps, required, shares, most))]
         wanted: xr.DataArray = xr.apply_ufunc(
-            functools.partial(_of_row, upwards), *arrays,
+            functools.partial(_of_row, rule.along), *arrays,
             input_core_dims=[[rule.along, *inner]] * 3, output_core_dims=[[rule.along, *inner]],
             vectorize=True)
         return wanted
@@ -232,16 +227,12 @@ def may_be_decided(
 
 
 def _of_row(
-    upwards: bool | None, decision: NDArray[np.uint8], keeps: Masks, possible: Masks
+    along: str, decision: NDArray[np.uint8], keeps: Masks, possible: Masks
 ) -> Masks:
-    """Return which decisions (values, *at_all, requirement) of a condition need trials.
-
-    ``upwards`` says whether large values of the axis are the hard ones; None where the results say.
-    """
+    """Return which decisions (values, *at_all, requirement) along an axis need trials."""
     inner = tuple(range(1, decision.ndim))
     keep = keeps | (decision == Decision.not_applicable)
-    if upwards is None:
-        upwards = easier_first(keeps, np.arange(len(keeps)))
+    upwards = is_harder_upwards(along, keeps)
     step = slice(None, None, 1 if upwards else -1)
     of_values = combined_decision(decision, inner)[step]
     values = wanted_values(
@@ -252,33 +243,6 @@ def _of_row(
     values = values.reshape((-1, *(1,) * (decision.ndim - 1)))
     return np.asarray(
         (decision == Decision.undecided) & possible & values & (all_keep | ~keep))
-
-
-def size_shrinks_upwards(pipeline: Pipeline, along: str) -> bool | None:
-    """Return whether markers are smaller at large values of an axis; None if nothing says it.
-
-    Examples
-    --------
-    >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1}, "axes": {
-    ...     "hfov_deg": [50, 70], "size_m": [0.1, 0.2], "tilt_deg": [0, 45]}})
-    >>> [size_shrinks_upwards(pipeline, name) for name in ("hfov_deg", "size_m", "tilt_deg")]
-    [True, False, None]
-    """
-    def value(name: str) -> Any:
-        if (axis := pipeline.axis_of(name)) is not None:
-            return xr.DataArray(list(pipeline.values_of(name)), dims=axis.name)
-        fixed = pipeline.fixed.get(name, pipeline.parameters[name].default)
-        if fixed is not None and not isinstance(fixed, int | float):
-            raise DatasetError(name)  # is drawn
-        return fixed
-
-    def sides() -> xr.DataArray:
-        given = value("side_px") if pipeline.values_of("side_px") else None
-        return sides_of(value) if given is None else xr.DataArray(given)
-
-    axis = pipeline.axis(along)
-    values = np.asarray(axis.coordinates() if axis is not None else [0.0])
-    return smaller_upwards(sides, values, along)
 
 
 def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
@@ -329,7 +293,7 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> 
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
 # quantity of every configuration has an interval as narrow as is wanted, or cannot have one: no
 # pose was looked for, or so few have the number that all trials would not give enough
-# (`sweep.analysis.decisions.Reached`).
+# (`sweep.analysis.requirements.Reached`).
 
 def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the conditions at which an interval is wider than was wanted."""

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from sweep.analysis.dataset import DRAWS, computed_scenes
-from sweep.analysis.decisions import Answer, answers
-from sweep.analysis.requirements import Decision
+from sweep.analysis.requirements import Answer, Decision, answers
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
 from sweep.experiment.document import SEARCH

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.analysis.decisions import course, error_shares, needed
-from sweep.analysis.requirements import Decision, combined_decision
+from sweep.analysis.requirements import Decision, combined_decision, course, error_shares, needed
 from sweep.experiment.sampling import wave_ends
 
 ENDS = wave_ends(5000, 50)

@@ -7,7 +7,7 @@ import pytest
 
 from support.small_datasets import perfect, with_detected
 from sweep.analysis import detection_limit
-from sweep.analysis.decisions import Reach
+from sweep.analysis.requirements import Reach
 from sweep.errors import ArgumentError, DatasetError
 
 TEXT = """

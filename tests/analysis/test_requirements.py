@@ -5,12 +5,13 @@ import pytest
 from scipy import stats
 
 from support.small_datasets import perfect, with_detected
-from sweep.analysis.decisions import Reach, requirement_limits
 from sweep.analysis.requirements import (
     Decision,
+    Reach,
     check_requirements,
     combined,
     parse_requirements,
+    requirement_limits,
     verdicts,
 )
 from sweep.errors import ArgumentError

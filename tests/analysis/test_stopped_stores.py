@@ -15,7 +15,7 @@ from sweep.analysis import (
     marker_ranking,
     precision_reached,
 )
-from sweep.analysis.decisions import Reached
+from sweep.analysis.requirements import Reached
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 TRIALS = 200

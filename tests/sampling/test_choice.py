@@ -7,8 +7,7 @@ import pytest
 
 from support.searches import DOCUMENT, block_of, flags_of, needed_by
 from support.small_datasets import perfect
-from sweep.analysis.decisions import answers, choice_cells
-from sweep.analysis.requirements import Decision, ErrorShares
+from sweep.analysis.requirements import Decision, ErrorShares, answers, choice_cells
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus

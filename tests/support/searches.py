@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sweep.analysis.decisions import requirement_limits
+from sweep.analysis.requirements import requirement_limits
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped

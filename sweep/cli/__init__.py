@@ -14,9 +14,9 @@ from sweep.cli.command import (
     SESSION,
     accept_any_text,
     answer,
-    flushed,
     print_error,
     print_system_error,
+    printing,
 )
 from sweep.cli.parser import build_parser
 from sweep.errors import SweepError
@@ -38,14 +38,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = parser.parse_args(arguments)
         if options.command is None:
-            print(parser.format_help(), end="")
-            return flushed(0)
+            with printing():
+                print(parser.format_help(), end="")
+            return 0
         SESSION.flags, SESSION.form = options.flags, getattr(options, "printed", "text")
         check_installation()
         function = options.command.function
         found = function(**{name: getattr(options, name)
                             for name in inspect.signature(function).parameters})
-        return flushed(answer(found))
+        with printing():
+            return answer(found)
     except SweepError as error:
         return print_error(error)
     except KeyboardInterrupt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import errno
 import inspect
@@ -13,7 +14,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,20 +41,14 @@ if TYPE_CHECKING:
 #: Names that are listed behind commas; a flag that may be repeated. None if it is not given.
 Names = Sequence[str] | None
 
+#: Whole numbers that are listed behind commas.
+Numbers = Sequence[int]
+
 #: A part of numpydoc: names, in place of a type flags and what stands for the value, meaning.
 PARAMETER = re.compile(r"^(\w[\w, ]*?)(?: : (.*))?\n((?:    .*\n?|\n)+)", re.MULTILINE)
 
 #: A docstring's text in place of parameters that another command explains.
 ELSEWHERE = re.compile(r"As for `(\w+)`\.?")
-
-
-@dataclass(frozen=True, slots=True)
-class Described:
-    """A parameter in a docstring: flags, what stands for its value, and meaning."""
-
-    flags: tuple[str, ...]
-    metavar: str | None
-    meaning: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +60,8 @@ class Command:
     function
         Runs it; returns findings, which are printed, or an exit status. Parameters before ``*`` are
         positional arguments, those behind it flags.
+    group
+        The heading that it stands below in the help.
     guide
         Path of the page that explains it, from the top of the repository.
     examples
@@ -72,6 +69,7 @@ class Command:
     """
 
     function: Callable[..., Findings | int]
+    group: str
     guide: str
     examples: Mapping[str, str]
 
@@ -95,11 +93,11 @@ class Command:
         """Add the function's parameters to a parser."""
         said = described(self.function)
         for parameter in inspect.signature(self.function).parameters.values():
-            one = said[parameter.name]
-            names, options = argument(parameter, one.flags)
+            flags, metavar, meaning = said[parameter.name]
+            names, options = argument(parameter, flags)
             if "action" not in options or options["action"] in ("append", "extend"):
-                options["metavar"] = one.metavar
-            parser.add_argument(*names, help=one.meaning.replace("%", "%%"), **options)
+                options["metavar"] = metavar
+            parser.add_argument(*names, help=meaning.replace("%", "%%"), **options)
         if self.prints_findings:
             form = parser.add_mutually_exclusive_group()
             for name, meaning in (("json", "one JSON object"), ("markdown", "Markdown")):
@@ -117,30 +115,29 @@ DECLARED: dict[str, Command] = {}
 
 
 def command(
-    guide: str, examples: Mapping[str, str]
+    group: str, guide: str, examples: Mapping[str, str]
 ) -> Callable[[Callable[..., Findings | int]], Command]:
     """Return a decorator that makes a command of the function that runs it."""
     def declared(function: Callable[..., Findings | int]) -> Command:
-        DECLARED[function.__name__] = Command(function, guide, examples)
+        DECLARED[function.__name__] = Command(function, group, guide, examples)
         return DECLARED[function.__name__]
 
     return declared
 
 
-def described(function: Callable[..., Any]) -> dict[str, Described]:
-    """Return the parameters in a function's docstring, by name.
+def described(function: Callable[..., Any]) -> dict[str, tuple[list[str], str | None, str]]:
+    """Return name -> flags, what stands for the value, and meaning, from a function's docstring.
 
     Of parameters described as "As for `run`." it is what that command's docstring says.
     """
     text = (inspect.getdoc(function) or "").partition("\nParameters\n----------\n")[2]
-    found: dict[str, Described] = {}
+    found: dict[str, tuple[list[str], str | None, str]] = {}
     for names, spelled, meaning in PARAMETER.findall(text):
         words, parts = " ".join(meaning.split()), spelled.split()
         elsewhere = ELSEWHERE.fullmatch(words)
         other = described(DECLARED[elsewhere[1]].function) if elsewhere else {}
-        flags = tuple(part for part in parts if part.startswith("-"))
-        metavar = " ".join(part for part in parts if not part.startswith("-"))
-        one = Described(flags, metavar or None, words.removesuffix("."))
+        flags = [part for part in parts if part.startswith("-")]
+        one = flags, " ".join(parts[len(flags):]) or None, words.removesuffix(".")
         found |= {name: other.get(name, one) for name in names.split(", ")}
     return found
 
@@ -154,10 +151,16 @@ def names_of(text: str) -> list[str]:
     return [name for part in text.split(",") if (name := part.strip())]
 
 
+def whole_numbers(text: str) -> list[int]:
+    """Return the numbers that a flag such as ``--views`` lists."""
+    return [int(part) for part in text.split(",")]
+
+
 #: Annotation -> what argparse makes of a flag; others are text.
 KINDS: dict[str, dict[str, Any]] = {
     "int": {"type": int}, "float": {"type": float}, "bool": {"action": "store_true"},
     "Sequence[str]": {"action": "append"}, "Names": {"action": "extend", "type": names_of},
+    "Numbers": {"type": whole_numbers},
 }
 
 
@@ -247,11 +250,6 @@ def read_pipeline(
     try:
         pipeline = library.lifecycle.read_pipeline(source, settings)
     except PipelineError as error:
-        if precision and any(line.endswith(library.sampling.NO_TRIALS) for line in error.faults):
-            raise ArgumentError(
-                "max_trials", "",
-                f"expected {library.sampling.NO_TRIALS}, such as 2400; beside --precision",
-            ) from None
         if texts := library.lifecycle.texts_required(source, settings):
             library.requirements.check_required(texts, plain(source), error)
         raise
@@ -343,29 +341,18 @@ def accept_any_text() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def flushed(status: int) -> int:
-    """Return a status once everything printed is written; OSError if it cannot be."""
-    if sys.stdout is not None:
-        sys.stdout.flush()
-    return status
-
-
-def is_refused_output() -> bool:
-    """Return whether standard output cannot be written; what it holds back is dropped then.
-
-    It is tried with an empty line, in case nothing is held back.
-    """
-    if sys.stdout is None:
-        return False
+@contextlib.contextmanager
+def printing() -> Iterator[None]:
+    """Write everything that the body prints; OSError that says so if it cannot be."""
     try:
-        print(flush=True)
-    except OSError:
-        # Python would try again when it ends, and say so.
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
-        os.close(nothing)
-        return True
-    return False
+        yield
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            # Python would try again when it ends, and say so.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OSError(error.errno, error.strerror, "standard output cannot be written") from None
 
 
 def quiet_matplotlib() -> None:
@@ -439,9 +426,6 @@ ADVICE = {
 }
 
 
-#: Errors with which writing may end.
-OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-
 #: Python's message in a RuntimeError where the system allows no more threads.
 NO_THREAD = "can't start new thread"
 
@@ -490,10 +474,7 @@ def print_system_error(error: OSError | MemoryError | RuntimeError | ValueError)
     if isinstance(error, MemoryError):
         line, number = "out of memory", errno.ENOMEM
     elif isinstance(error, OSError):
-        if error.filename is None and error.errno in OUTPUT_ERRORS and is_refused_output():
-            cause = "standard output cannot be written"
-        else:
-            cause = str(error.filename or "the system refused a request")
+        cause = str(error.filename or "the system refused a request")
         line, number = f"{cause}: {error.strerror or error}", error.errno or 0
     elif str(error) == NO_THREAD:
         line, number = f"the system refused a request: {error}", errno.EAGAIN

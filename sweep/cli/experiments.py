@@ -31,8 +31,6 @@ from sweep.messages import byte_count, duration, plain, quoted
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection
     from sweep.execution.forecast import Forecast
-    from sweep.execution.progress import Progress
-    from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
     from sweep.experiment.sampling import StoppingRule
     from sweep.integrity.verification import Reproduction
@@ -42,7 +40,7 @@ if TYPE_CHECKING:
 # ``sweep run``.
 
 
-@command("sweep/execution/README.md", {
+@command("experiments", "sweep/execution/README.md", {
     "sweep run --example smoke": "writes runs/smoke.zarr, from a pipeline of the package",
     "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr":
         "runs the same experiment at other tilts"})
@@ -93,17 +91,16 @@ def run(
     with Child(BLOCK_TASK) as child, library.progress.progress_display() as display:
         read = read_pipeline(source, settings, precision, max_trials)
         announce_compilation(read)
-        SESSION.stopped = "stopped before anything was computed" if overwrite else CONTINUES
-
-        def report(progress: Progress) -> None:
-            if overwrite:  # there is a new store
-                SESSION.stopped = CONTINUES.replace("command", "command without --overwrite")
-            display(progress)
-
+        SESSION.stopped = f"{CONTINUES}, without --overwrite" if overwrite else CONTINUES
         summary = library.runner.execute(
             read, store_of(source, store), workers=workers, scheduler=scheduler, reuse=reuse,
             overwrite=overwrite, retry_failed=retry_failed, yes=yes, time_limit_s=time_limit_s,
-            progress=report, child=child)
+            progress=display, child=child)
+    poses = f"{summary.poses:,} poses"
+    if summary.needed is not None:
+        settled = (summary.conditions or 0) - (summary.unsettled or 0)
+        poses = (f"{settled:,} of {summary.conditions:,} conditions settled with "
+                 f"{summary.needed:,} poses ({summary.poses:,} with all trials)")
     rate = summary.computed_scenes / max(summary.seconds, 1e-3)
     speed = f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else ""
     notes = [f"camera: {read.facts.camera_line}"]
@@ -123,18 +120,7 @@ def run(
                          "has the new ones")
         then = quoted("sweep", "require", summary.store, *words)
     return summarised(
-        summary, f"{_poses(summary)}, {summary.detected_line}{speed}", notes, then)
-
-
-def _poses(summary: Summary) -> str:
-    """Return how many poses there are; of a run in waves, how many it needed."""
-    if summary.needed is None:
-        return f"{summary.poses:,} poses"
-    settled = (summary.conditions or 0) - (summary.unsettled or 0)
-    return (
-        f"{settled:,} of {summary.conditions:,} conditions settled with {summary.needed:,} poses "
-        f"({summary.poses:,} with all trials)"
-    )
+        summary, f"{poses}, {summary.detected_line}{speed}", notes, then)
 
 
 def _conditions(pipeline: Pipeline) -> list[str]:
@@ -146,7 +132,7 @@ def _conditions(pipeline: Pipeline) -> list[str]:
 # ``sweep plan``.
 
 
-@command("pipelines/README.md", {
+@command("experiments", "pipelines/README.md", {
     "sweep plan pipelines/smoke.toml": "shows the grid, memory and time",
     "sweep plan pipelines/smoke.toml --set trial=1000 --workers 16 --json":
         "shows the same of a larger run, as JSON"})
@@ -252,7 +238,7 @@ def _set(settings: Sequence[str]) -> list[str]:
 # ``sweep show`` and ``sweep repro``: one cell.
 
 
-@command("pipelines/README.md", {
+@command("experiments", "pipelines/README.md", {
     "sweep show pipelines/smoke.toml --at distance_m=0.3,tilt_deg=45":
         "draws this pose into scene.png",
     "sweep show pipelines/faults.toml --full --plain -o frame.png":
@@ -289,7 +275,7 @@ def show(
         0, quoted("sweep", "plan", pipeline, *_set(settings)))
 
 
-@command("sweep/integrity/README.md", {
+@command("experiments", "sweep/integrity/README.md", {
     "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45 -o cell.png":
         "prints both values of each variable, and draws the image into cell.png",
     "sweep repro runs/faults.zarr --time-limit 10":
@@ -318,36 +304,37 @@ def repro(
     chosen = list(at) or [""]
     if output is None and (plain or full):
         raise ArgumentError("output", "is missing", "--plain and --full are for the file of -o")
+    if output is not None and len(chosen) > 1:
+        raise ArgumentError("output", output, "expected one --at beside it")
     if output is not None:
-        if len(chosen) > 1:
-            raise ArgumentError("output", output, "expected one --at beside it")
         check_png(output)
     library.verification.check_selection(store, chosen)
-    lines: list[Any] = []
-    cells = []
-    for each in chosen:
-        again = library.verification.reproduce(
-            store, each, whole_frame=full, time_limit_s=time_limit_s)
-        cells.append(again)
-        lines += [""] if lines else []
-        lines += _cell_lines(again)
-        if output is not None and again.image is not None:
-            _write_image(output, again.image, None if plain else again.inspection,
-                         again.pipeline, again.cell_pipeline)
-        if output is not None:
-            lines.append("no image: rendering failed" if again.image is None
-                         else f"{output}: image of the cell")
-        lines.append(_verdict(again))
-    status = int(any(each.difference for each in cells))
+    cells = [
+        library.verification.reproduce(store, each, whole_frame=full, time_limit_s=time_limit_s)
+        for each in chosen]
+    lines = [line for again in cells for line in ("", *_cell_lines(again))][1:]
+    last, status = cells[-1], int(any(each.difference for each in cells))
+    if output is not None and last.image is None:
+        lines.append("no image: rendering failed")
+    elif output is not None:
+        _write_image(output, last.image, None if plain else last.inspection, last.pipeline,
+                     last.cell_pipeline)
+        lines.append(f"{output}: image of the cell")
+    url = quoted(store)
+    then = f"sweep verify {url}", "checks the rest of the store"
+    if status:
+        then = f"sweep verify {url} --repair", "recomputes the blocks that differ"
+    elif output is None and last.inspection is not None:
+        where = f" --at {quoted(last.at)}" if last.at else ""
+        then = f"sweep repro {url}{where} -o scene.png", "draws the cell"
     shown = ("at", "stored", "recomputed", "difference", "exact", "seconds", "failures", "changes")
     return findings(
         lines, {"store": store, "cells": [
-            {name: getattr(each, name) for name in shown} for each in cells]},
-        status, *_after_repro(store, again, status, drawn=output is not None))
+            {name: getattr(each, name) for name in shown} for each in cells]}, status, *then)
 
 
 def _cell_lines(again: Reproduction) -> Iterator[Any]:
-    """Yield the recomputed values, as lines and a table."""
+    """Yield the recomputed values, as lines and a table, and whether they are the stored ones."""
     yield f"--at {again.at}"
     for line in again.changes:
         yield f"changed since the store was created: {line}"
@@ -363,6 +350,16 @@ def _cell_lines(again: Reproduction) -> Iterator[Any]:
         kind = "the process died" if failure.crashed else "an exception was raised"
         yield f"{failure.stage}: {kind}:"
         yield from (plain(line, 1000) for line in failure.text.strip().splitlines())
+    if again.unneeded:
+        yield "the store does not hold this cell: the run settled its condition with fewer trials"
+    elif again.stored is None:
+        yield "the store does not hold this cell yet"
+    elif again.difference:
+        yield f"differs from the store: {again.difference}"
+    else:
+        how = "bit for bit" if again.exact else (
+            "within the tolerances for another processor or version")
+        yield f"agrees with the store {how}"
 
 
 def _write_image(
@@ -377,37 +374,11 @@ def _write_image(
         Path(output), cv2.imencode(".png", image)[1].tobytes())
 
 
-def _verdict(again: Reproduction) -> str:
-    """Return whether the values are the stored ones."""
-    if again.unneeded:
-        return "the store does not hold this cell: the run settled its condition with fewer trials"
-    if again.stored is None:
-        return "the store does not hold this cell yet"
-    if again.difference:
-        return f"differs from the store: {again.difference}"
-    how = "bit for bit" if again.exact else (
-        "within the tolerances for another processor or version")
-    return f"agrees with the store {how}"
-
-
-def _after_repro(
-    url: str, again: Reproduction, status: int, *, drawn: bool
-) -> tuple[str, str]:
-    """Return the command to go on with, and its meaning."""
-    store = quoted(url)
-    if status:
-        return f"sweep verify {store} --repair", "recomputes the blocks that differ"
-    if not drawn and again.inspection is not None:
-        at = f" --at {quoted(again.at)}" if again.at else ""
-        return f"sweep repro {store}{at} -o scene.png", "draws the cell"
-    return f"sweep verify {store}", "checks the rest of the store"
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep status`` and ``sweep verify``: a store.
 
 
-@command("sweep/execution/README.md", {
+@command("experiments", "sweep/execution/README.md", {
     "sweep status runs/smoke.zarr": "shows the progress, also of a run in progress",
     "sweep status runs/smoke.zarr --json": "prints the same as JSON"})
 def status(store: str) -> Findings:
@@ -446,7 +417,7 @@ def status(store: str) -> Findings:
     return findings([*lines, *state.warnings], state, 0, then)
 
 
-@command("sweep/integrity/README.md", {
+@command("experiments", "sweep/integrity/README.md", {
     "sweep verify runs/smoke.zarr": "checks every file, and recomputes 20 scenes",
     "sweep verify runs/smoke.zarr --repair --sample 100":
         "repairs what is damaged, and recomputes 100 scenes"})

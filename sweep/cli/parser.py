@@ -7,20 +7,8 @@ import itertools
 import re
 from typing import Literal, NoReturn
 
-from sweep.cli.answers import (
-    calibration,
-    compare,
-    error_model,
-    limit,
-    reference,
-    report,
-    require,
-    size,
-    tradeoff,
-)
-from sweep.cli.command import Command, command, flushed
-from sweep.cli.experiments import plan, repro, run, show, status, verify
-from sweep.cli.programs import diagnose, export, fit, photos, plugins, score
+from sweep.cli import answers, experiments  # noqa: F401  (they declare the commands)
+from sweep.cli.command import DECLARED, Command, command, printing
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
@@ -30,7 +18,7 @@ FILES = ("OBSERVATIONS", "PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "F
          "FILE", "FIGURE", "PNG")
 
 
-@command("pipelines/README.md", {
+@command("help", "pipelines/README.md", {
     "sweep completion bash": "prints it for bash: source <(sweep completion bash)",
     "sweep completion fish": "prints it for fish: sweep completion fish | source"})
 def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
@@ -54,16 +42,9 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
     return 0
 
 
-#: Every command, by group, in the order in which the help lists them.
-GROUPS = {
-    "experiments": (run, plan, show, status, verify, repro),
-    "answers": (report, require, size, limit, tradeoff, diagnose, error_model, calibration),
-    "your camera": (photos, fit, compare),
-    "other programs": (export, score, plugins),
-    "help": (reference, completion),
-}
-
-COMMANDS = tuple(itertools.chain.from_iterable(GROUPS.values()))
+#: Every command, in the order in which the help lists them, by group.
+COMMANDS = sorted(DECLARED.values(), key=lambda each: (
+    "experiments", "answers", "your camera", "other programs", "help").index(each.group))
 
 #: Title of the list that argparse makes of the commands.
 UNGROUPED = "all commands"
@@ -89,7 +70,8 @@ class Parser(argparse.ArgumentParser):
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Exit once everything printed is written; OSError if it cannot be."""
-        flushed(0)
+        with printing():  # what argparse printed
+            pass
         super().exit(status, message)
 
 
@@ -122,8 +104,8 @@ def build_parser() -> tuple[Parser, list[argparse.ArgumentParser]]:
     Parsed, ``command`` is the chosen :class:`Command`, or None.
     """
     groups = "".join(
-        f"{group}:\n" + "".join(f"    {each.name:12} {each.summary}\n" for each in commands)
-        for group, commands in GROUPS.items())
+        f"{group}:\n" + "".join(f"    {each.name:12} {each.summary}\n" for each in group_commands)
+        for group, group_commands in itertools.groupby(COMMANDS, lambda each: each.group))
     parser = Parser(
         prog="sweep",
         description="How well will I know the pose? Experiments with fiducial markers.",

@@ -68,7 +68,7 @@ def folder(stores, monkeypatch):
         ("tradeoff runs/small.zarr --seconds nan",
          "--seconds nan: expected a finite number above 0"),
         ("run few.toml --precision 'detection_rate = 0.1'",
-         "--max-trials: expected max_trials, too: the most trials of a condition, such as 2400"),
+         "expected max_trials, too: the most trials of a condition"),
     ],
 )
 def test_a_mistake_is_refused_with_what_to_change(line, hint):

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
-    from sweep.fitting.folders import FittedScene
+    from sweep.fitting.folders import fit
     from sweep.report.cost_tables import measure_tradeoff
     from sweep.report.decisions import require
     from sweep.report.reference import reference
@@ -85,8 +85,9 @@ class RunOptions(LocalOptions, total=False):
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "measure_tradeoff": "cost_tables",
-    "reference": "reference", "require": "decisions", "write_report": "write_report",
+    "diagnose": "diagnosis", "error_model": "detection", "fit": "folders",
+    "measure_tradeoff": "cost_tables", "reference": "reference", "require": "decisions",
+    "write_report": "write_report",
 }
 
 
@@ -268,12 +269,11 @@ def _pipeline(
     given: library.pipeline.Pipeline | Mapping[str, Any] | str | os.PathLike[str],
 ) -> library.pipeline.Pipeline:
 
-    pipeline = given
     if isinstance(given, Mapping):
         pipeline = library.pipeline.Pipeline.from_dict(given)
-    elif isinstance(given, (str, os.PathLike)):
+    elif isinstance(given, (library.pipeline.Pipeline, str, os.PathLike)):
         pipeline = library.lifecycle.read_pipeline(given)
-    if not isinstance(pipeline, library.pipeline.Pipeline):
+    else:
         raise ArgumentError(
             "pipeline", given,
             "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
@@ -424,59 +424,6 @@ def twins(
     return run(
         library.twins.twin_pipeline(measured, parameters, repeats),
         store=store or library.twins.twin_store(photographs, named), progress=progress, **options)
-
-
-def fit(
-    *folders: str | os.PathLike[str],
-    camera: str | os.PathLike[str] | None = None,
-    board: str | os.PathLike[str] | None = None,
-    poses: str | os.PathLike[str] | None = None,
-    stereo: str | os.PathLike[str] | None = None,
-    settings: Sequence[str] = (),
-    markers: int = 12,
-    check: bool = True,
-) -> FittedScene:
-    """Estimate a camera's scene: blur, sharpening, tone, noise, geometry, and the print's size.
-
-    Parameters
-    ----------
-    folders, camera, board, poses, stereo
-        As for :func:`photos`; of a stereo camera the left one's scene is fitted.
-    settings
-        "key=value" for the dictionary and size_m of single markers, and for the detectors and
-        estimators whose errors are compared.
-    markers
-        The most markers of a photograph that are fitted, well spread over the frame.
-    check
-        Whether half of the photographs are held out: effects without which simulated errors come
-        clearly nearer to theirs are left out, and the gap that is left is in ``gap``.
-
-    Returns
-    -------
-    FittedScene
-        The terms with their intervals (``found.terms``), what the section [scene] has
-        (``found.scene``), a pipeline of this camera (``pipeline``) and its file (``text``).
-
-    Raises
-    ------
-    ArgumentError, PipelineError, StoreError
-        As for :func:`photos`; photographs to which nothing can be fitted are told in a line.
-
-    Examples
-    --------
-    >>> found = sweep.fit(
-    ...     folder / "shots", camera=folder / "camera.json", board=folder / "board.toml",
-    ...     markers=2, check=False)
-    >>> round(found.found.scene["blur_px"], 1)
-    0.6
-    """
-    fitted = library.folders.fit_folder(
-        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
-        markers=markers, check=check,
-    )
-    for line in fitted.lines:
-        notice(line)
-    return fitted
 
 
 def size(

@@ -208,44 +208,32 @@ def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
     >>> to_json({"errors": [1.0, -math.inf]}, None)
     '{"errors": [1.0, null], "errors_flag": [null, "-infinite"]}'
     """
-    return json.dumps(_json_value(content), indent=indent, allow_nan=False)
+    return json.dumps(_json_value(content)[0], indent=indent, allow_nan=False)
 
 
-def _json_value(value: Any) -> Any:
-    value = _unwrapped(value)
-    if isinstance(value, Mapping):
-        found: dict[str, Any] = {}
-        for name, item in value.items():
-            key = str(_unwrapped(name))
-            found[key] = _json_value(item)
-            if (flag := _infinite(item)) is not None:
-                found[f"{key}_flag"] = flag
-        return found
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_json_value(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, (str, bool, int)) else str(value)
-
-
-def _infinite(value: Any) -> Any:
-    """Return the flag of a number, or of nested lists of numbers; None if none is infinite."""
-    value = _unwrapped(value)
-    if isinstance(value, float) and math.isinf(value):
-        return "infinite" if value > 0 else "-infinite"
-    if isinstance(value, (list, tuple)):
-        flags = [_infinite(item) for item in value]
-        return flags if any(flag is not None for flag in flags) else None
-    return None
-
-
-def _unwrapped(value: Any) -> Any:
-    """Return a dataclass as its fields, an enumeration's member as its name, an array as lists."""
+def _json_value(value: Any) -> tuple[Any, Any]:
+    """Return a value as JSON has it, and its flag: None if no number in it is infinite."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        found = {}
+        for name, item in value.items():
+            key = name.name if isinstance(name, enum.Enum) else str(name)
+            found[key], flag = _json_value(item)
+            if flag is not None:
+                found[f"{key}_flag"] = flag
+        return found, None
+    if isinstance(value, (list, tuple, set, frozenset)):
+        pairs = [_json_value(item) for item in value]
+        flags = [flag for _, flag in pairs]
+        return [item for item, _ in pairs], None if set(map(str, flags)) <= {"None"} else flags
+    if isinstance(value, float) and not math.isfinite(value):
+        return None, None if math.isnan(value) else "infinite" if value > 0 else "-infinite"
     if isinstance(value, enum.Enum):
-        return value.name
-    return value.tolist() if hasattr(value, "tolist") else value
+        return value.name, None
+    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value), None
 
 
 BYTE_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB")

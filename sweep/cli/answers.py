@@ -393,11 +393,9 @@ def fit(
     """
     path = Path(output)
     library.output_file.check_output_file(path)
-    fitted = library.folders.fit_folder(
-        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
+    fitted = sweep.fit(
+        *folders, camera=camera, board=board, poses=poses, stereo=stereo, settings=settings,
         markers=markers, check=check)
-    for line in fitted.lines:
-        notice(line)
     library.output_file.write_output_file(path, fitted.text.encode())
     found, gap = fitted.found, fitted.gap
     rows = [

@@ -309,31 +309,44 @@ class FittedScene:
     gap: xr.Dataset | None
 
 
-def fit_folder(
-    folders: Sequence[PathName], camera: PathName | None = None, *,
-    board: PathName | None = None, poses: PathName | None = None,
-    stereo: PathName | None = None, settings: Sequence[str] = (), markers: int = MARKERS,
-    check: bool = True, say: Say = notice,
+def fit(
+    *folders: PathName, camera: PathName | None = None, board: PathName | None = None,
+    poses: PathName | None = None, stereo: PathName | None = None, settings: Sequence[str] = (),
+    markers: int = MARKERS, check: bool = True,
 ) -> FittedScene:
-    """Return the scene of the camera that took the photographs of a folder.
+    """Estimate a camera's scene: blur, sharpening, tone, noise, geometry, and the print's size.
 
     Parameters
     ----------
-    folders, camera, board, poses, stereo, settings
-        As for :func:`sweep.photographs.prepare.prepare`; detectors and estimators are those whose
-        errors are compared.
+    folders, camera, board, poses, stereo
+        As for `sweep.photos`; of a stereo camera the left one's scene is fitted.
+    settings
+        "key=value" for the dictionary and size_m of single markers, and for the detectors and
+        estimators whose errors are compared.
     markers
-        The most markers of a photograph that are fitted.
+        The most markers of a photograph that are fitted, well spread over the frame.
     check
-        Whether half of the photographs are held out, to see which effects bring errors nearer to
-        theirs, and what gap is left.
-    say
-        Gets lines of progress.
+        Whether half of the photographs are held out: effects without which simulated errors come
+        clearly nearer to theirs are left out, and the gap that is left is in ``gap``.
+
+    Returns
+    -------
+    FittedScene
+        The terms with their intervals (``found.terms``), what the section [scene] has
+        (``found.scene``), a pipeline of this camera (``pipeline``) and its file (``text``).
 
     Raises
     ------
-    ArgumentError, PipelineError, StoreError, RunError
-        Says in lines what to change.
+    ArgumentError, PipelineError, StoreError
+        As for `sweep.photos`; photographs to which nothing can be fitted are told in a line.
+
+    Examples
+    --------
+    >>> found = sweep.fit(
+    ...     folder / "shots", camera=folder / "camera.json", board=folder / "board.toml",
+    ...     markers=2, check=False)
+    >>> round(found.found.scene["blur_px"], 1)
+    0.6
     """
     if not 1 <= markers <= 1000:
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
@@ -347,9 +360,9 @@ def fit_folder(
         )
         pipeline, name = prepared.pipeline, name_of(Path(folders[0]))
         views, lines = scene_views(pipeline, markers)
-        found, gap = fit_scene(views, say=say), None
+        found, gap = fit_scene(views, say=notice), None
         if check and len(views) >= 2 * MIN_HELD_OUT:
-            found, gap = checked(found, views, pipeline, home, say)
+            found, gap = checked(found, views, pipeline, home, notice)
         elif check:
             lines.append(
                 f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to see "
@@ -357,6 +370,8 @@ def fit_folder(
             )
         document = scene_document(pipeline, views, found)
         text = scene_text(document, found, record_of(pipeline), name, lines)
+    for line in (*prepared.lines, *lines):
+        notice(line)
     return FittedScene(
         found, Pipeline.from_dict(document, name=name, source="scene"), text,
         (*prepared.lines, *lines), gap,

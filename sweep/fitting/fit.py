@@ -5,15 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
+from scipy.linalg import block_diag
 
+from sweep.analysis.intervals import TAIL
 from sweep.errors import ArgumentError
 from sweep.experiment.pipeline import Pipeline
 from sweep.fitting.photograph_fit import (
     AMOUNT,
     BLOOM,
+    CORNERS,
+    OWN,
     START,
     VARIANCE,
     MarkerState,
@@ -22,18 +27,386 @@ from sweep.fitting.photograph_fit import (
     fit_photograph,
     is_saturated,
     photograph_views,
-)
-from sweep.fitting.shifts import (
-    MIN_PHOTOGRAPHS,
-    UNKNOWN,
-    Estimate,
-    Field,
-    edge_field,
-    estimate,
-    geometry_field,
+    products,
 )
 from sweep.measure.flags import TruthSource
-from sweep.typing import Floats, Masks
+from sweep.measure.likelihood import QUANTISATION_VARIANCE
+from sweep.measure.solver import marker_frame, of_board
+from sweep.photographs.cameras import fit_pose
+from sweep.typing import Floats, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# Means over photographs, each of which is one draw, and their intervals.
+
+#: Photographs from which intervals are given: with three, Student's are 2.5 standard deviations of
+#: a photograph wide on each side, and their spread is known to a factor of 6.
+MIN_PHOTOGRAPHS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A parameter of the camera.
+
+    Attributes
+    ----------
+    value, low, high
+        The mean over the photographs, and the ends of its 95 % interval; NaN with too few.
+    """
+
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+    def excludes(self, absent: float) -> bool:
+        """Return whether the interval excludes a value."""
+        return self.high < absent or self.low > absent
+
+    def mapped(self, function: Callable[[float], float]) -> Estimate:
+        """Return the estimate of an increasing function of the parameter."""
+        return Estimate(function(self.value), function(self.low), function(self.high))
+
+
+#: What nothing is known of.
+UNKNOWN = Estimate()
+
+
+def estimate(values: Floats) -> Estimate:
+    """Return the mean of a parameter's values (n,) in n photographs; the interval is Student's."""
+    known = values[np.isfinite(values)]
+    count = len(known)
+    if not count:
+        return UNKNOWN
+    mean = float(known.mean())
+    if count < MIN_PHOTOGRAPHS:
+        return Estimate(mean)
+    half = float(special.stdtrit(count - 1, 1 - TAIL) * known.std(ddof=1) / math.sqrt(count))
+    return Estimate(mean, mean - half, mean + half)
+
+
+def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estimate]:
+    """Return estimates of a function (k,) of photographs, by leaving each of them out.
+
+    ``function`` takes the numbers of the photographs that count. Pseudo-values give the interval
+    (Efron and Stein, "The jackknife estimate of variance", Annals of Statistics 9, 1981).
+    """
+    every = np.arange(count)
+    whole = function(every)
+    if count < MIN_PHOTOGRAPHS:
+        return [Estimate(value) for value in whole.tolist()]
+    without = np.array([function(np.delete(every, k)) for k in range(count)])
+    spread = [estimate(each) for each in (count * whole - (count - 1) * without).T]
+    return [
+        Estimate(value, value + each.low - each.value, value + each.high - each.value)
+        for value, each in zip(whole.tolist(), spread, strict=True)
+    ]
+
+
+# --------------------------------------------------------------------------------------------------
+# A Gaussian field of shifts, of covariance s² exp(-d² / (2 l²)), as ``edge_px`` and ``geometry_px``
+# in scenes.
+#
+# Two sums of a photograph's squares or products of shifts say s and l (the method of moments). The
+# farther the field reaches, the smaller is the first one beside the second. The logarithms of s and
+# l have the jackknife's intervals.
+
+class Field(NamedTuple):
+    """A field of shifts: standard deviation, correlation length, and whether there is one.
+
+    ``variance_px`` (px²) is the mean of unbiased estimates by each photograph: it may be below 0.
+    """
+
+    size_px: Estimate = UNKNOWN
+    length_px: Estimate = UNKNOWN
+    variance_px: Estimate = UNKNOWN
+
+    def covariance(self, distances: Floats, cell_px: float) -> Floats:
+        """Return the covariance in px² of means over cells at squared distances (px²).
+
+        Means over two squares are, nearly, the field smoothed by a Gaussian of their variance.
+        """
+        if not self.variance_px.value > 0:
+            return np.zeros_like(distances)
+        square = self.length_px.value**2
+        wide = square + cell_px**2 / 6
+        return np.asarray(
+            self.size_px.value**2 * square / wide * np.exp(-0.5 * distances / wide)
+        )
+
+
+def field_of(sums: Floats, shares: Floats, lengths_px: Floats) -> Field:
+    """Return the field that has n photographs' two sums (n, 2) of squares, px².
+
+    ``shares`` (n, 2, L) are the sums expected of fields of standard deviation 1 px, and of L
+    correlation lengths; the first over the second one falls with the length.
+    """
+    at = np.log(lengths_px)
+
+    def matched(rows: Integers) -> Floats:
+        """Return the logarithms of standard deviation and length, (2,)."""
+        found, expected = sums[rows].sum(axis=0), shares[rows].sum(axis=0)
+        first, second = np.maximum(found, 1e-12)
+        rising = -np.log(expected[0] / expected[1])
+        length = float(np.interp(-np.log(first / second), rising, at))
+        total = np.interp(length, at, expected.sum(axis=0))
+        return np.array([0.5 * math.log(max(float(found.sum()), 1e-12) / total), length])
+
+    size, length = jackknife(matched, len(sums))
+    expected = [np.interp(length.value, at, each.sum(axis=0)) for each in shares]
+    return Field(
+        size.mapped(math.exp), length.mapped(math.exp), estimate(sums.sum(axis=1) / expected)
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Shifts of single edges beside the marker's corners, from the residuals of pixels near edges.
+#
+# A module's edge that is shifted by d along the unit vector n leaves the residuals d (n · slope).
+# Edges of both polarities that are shifted alike are a field of shifts; edges that all move
+# towards white are the marker's own bloom, which is taken off. An edge's shift is the field's mean
+# along a module. Its variance, and the covariance with the next edge on the same line, say how far
+# the field reaches: about a module.
+
+#: Half widths across and along the edge of the pixels that say where a module's edge is.
+REACH_MODULES, ALONG_MODULES = 0.5, 0.4
+
+#: Share of the whole step from black to white from which pixels count as an edge.
+STEP_SHARE = 0.6
+
+#: Correlation lengths that are compared, in modules.
+EDGE_LENGTHS = np.geomspace(0.1, 3.0, 60)
+
+#: Least correlation length of a field of edges' shifts.
+MIN_LENGTH_PX = 1.0
+
+
+def edge_field(fits: Sequence[PhotographFit]) -> Field:
+    """Return the field of shifts of edges in photographs."""
+    t = ALONG_MODULES * ((np.arange(16) + 0.5) / 8 - 1)
+    apart = np.array([0.0, 1.0])[:, None, None, None]
+    # Squares of means along a module, and their products with those along the next one.
+    means = np.exp(
+        -0.5 * ((t[:, None] - t - apart) / EDGE_LENGTHS[:, None, None]) ** 2
+    ).mean(axis=(2, 3))
+    found = [edge_sums(each) for each in fits]
+    known = [each for each in found if (each[1] > 0).all()]
+    if not known:
+        return Field()
+    module_px = np.mean([state.marker.module_px for fit in fits for state in fit.states])
+    field = field_of(
+        np.array([sums for sums, _ in known]),
+        np.array([counts[:, None] * means for _, counts in known]), EDGE_LENGTHS * module_px,
+    )
+    return field._replace(length_px=field.length_px.mapped(lambda px: max(px, MIN_LENGTH_PX)))
+
+
+def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
+    """Return sums (2,) of products of shifts of a photograph's edges in px², and their counts (2,).
+
+    First of squares, less the share of the pixels' noise; their count is the degrees of freedom.
+    Then of two edges on one line of modules that follow on each other.
+    """
+    variance = float(np.nanmean(fit.noise)) + QUANTISATION_VARIANCE
+    sums, counts = np.zeros(2), np.zeros(2)
+    for state in fit.states:
+        shifts = [_edges_along(state, axis) for axis in range(2)]
+        bright = np.concatenate([each[0].ravel() for each in shifts])
+        information = np.concatenate([each[2].ravel() for each in shifts])
+        count = int(np.isfinite(bright).sum())
+        if count <= OWN:
+            continue
+        own = float(np.nanmean(bright))
+        # Corners and bloom took up as much of the squares as of independent shifts' ones, and,
+        # being smooth, about as much of the products of neighbours.
+        taken = (CORNERS + 1) / count
+        squares = float(np.nansum((bright - own) ** 2 - variance / information))
+        sums[0] += squares
+        counts[0] += count * (1 - taken)
+        for towards_white, direction, _ in shifts:
+            shifted = (towards_white - own) * direction
+            following = shifted[:, :-1] * shifted[:, 1:]
+            pairs = np.isfinite(following).sum()
+            sums[1] += np.nansum(following) + pairs * taken * squares / (count * (1 - taken))
+            counts[1] += pairs
+    return sums, counts
+
+
+def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]:
+    """Return the edges on lines of constant column (``axis`` 0) or row of a marker.
+
+    (lines, modules) each, NaN where there is no edge: shifts towards white in px, the sign of that
+    direction along the axis, and the information of the shifts.
+    """
+    marker = state.marker
+    across, along = marker.modules * state.at[axis], marker.modules * state.at[1 - axis]
+    line, module = np.rint(across), np.floor(along)
+    near = (
+        (np.abs(across - line) < REACH_MODULES) & (np.abs(along - module - 0.5) < ALONG_MODULES)
+        & (line >= 0) & (line <= marker.modules) & (module >= 0) & (module < marker.modules)
+    )
+    shape = marker.modules + 1, marker.modules
+    number = (line * marker.modules + module)[near].astype(np.int64)
+    slope, residuals = state.slope[:, near], state.residuals[near]
+
+    def total(values: Floats) -> Floats:
+        return np.asarray(np.bincount(number, values, shape[0] * shape[1]), dtype=np.float64)
+
+    steps = np.stack([total(each) for each in slope])
+    length = np.hypot(*steps)
+    normal = steps / np.maximum(length, 1e-12)
+    by_shift = (normal[:, number] * slope).sum(axis=0)
+    information = total(by_shift**2)
+    whole = abs(state.levels[1]) * 2 * ALONG_MODULES * marker.module_px
+    edge = length > STEP_SHARE * whole
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shifts = np.where(edge, total(by_shift * residuals) / information, np.nan)
+    corners = marker.corners_px
+    positive = corners[1] - corners[0] if axis == 0 else corners[3] - corners[0]
+    return tuple(  # type: ignore[return-value]
+        np.where(edge, each, np.nan).reshape(shape)
+        for each in (shifts, np.sign(positive @ normal), information)
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Shifts of markers beside the camera's model: how large they are, and how far they reach.
+#
+# The fitted corners of a photograph's markers minus the corners of the board's pose, which is
+# fitted to them, are (1 - P) (shifts + noise), P being the projection on the changes by a pose. The
+# two sums of squares are those of their corners beside the centres, which turn a pose, and of the
+# markers' centres.
+
+#: Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
+#: longer ones: their size cannot be said.
+LENGTHS = np.geomspace(0.01, 0.4, 24)
+
+#: Cells along each side of a marker in which the field is taken as constant.
+CELLS = 6
+
+#: Markers of a photograph from which their shifts are seen beside the pose's.
+MIN_SHIFTED_MARKERS = 3
+
+
+def geometry_field(
+    fits: Sequence[PhotographFit], edges: Field, scale: float
+) -> Field | None:
+    """Return the field of shifts of markers; None with too few photographs that say it.
+
+    Parameters
+    ----------
+    fits
+        Of the photographs.
+    edges
+        Shifts of single edges, which move corners as noise does.
+    scale
+        Size of the markers over the board's.
+    """
+    lengths = LENGTHS * fits[0].states[0].marker.shown.width_px
+    known = [
+        _geometry_sums(fit, edges, *beside, lengths) for fit in fits
+        if len(fit.states) >= MIN_SHIFTED_MARKERS and np.isfinite(fit.noise).any()
+        and (beside := _beside_truth(fit.states, scale)) is not None
+    ]
+    if len(known) < MIN_PHOTOGRAPHS:
+        return None
+    return field_of(
+        np.array([sums for sums, _ in known]), np.array([shares for _, shares in known]), lengths
+    )
+
+
+def _beside_truth(
+    states: Sequence[MarkerState], scale: float
+) -> tuple[Floats, Floats] | None:
+    """Return the shifts (8 n,) of corners beside the truth, and how they change with it (8 n, k).
+
+    Poses of a file are exact: k = 0. Otherwise it is one pose of the board, fitted to all corners,
+    whose markers are ``scale`` times as large as its file says; None without such a pose.
+    """
+    places = [state.marker.shown for state in states]
+    if places[0].source == TruthSource.poses_file:
+        shifts = np.concatenate([state.shifts.ravel() for state in states])
+        return shifts, np.empty((len(shifts), 0))
+    corners = np.array([
+        each.on_board.board.corners_m[each.on_board.number] for each in places if each.on_board
+    ])
+    centres = corners.mean(axis=1, keepdims=True)
+    points = (centres + scale * (corners - centres)).reshape(-1, 3)
+    pixels = np.concatenate([
+        state.marker.corners_px + state.shifts + state.marker.frame_px for state in states
+    ])
+    first, used = places[0], np.ones(len(points), dtype=bool)
+    start = of_board(first.rotation, first.translation, marker_frame(corners[0])[1])
+    pose = fit_pose(first.lens, points, pixels, *start, used)
+    if pose is None:
+        return None
+    _, explained, _ = first.lens.derivatives(points, pose.rotation, pose.translation)
+    return -pose.residuals.ravel(), explained
+
+
+def _geometry_sums(
+    fit: PhotographFit, edges: Field, shifts: Floats, explained: Floats, lengths_px: Floats
+) -> tuple[Floats, Floats]:
+    """Return a photograph's sums (2,) of squares, and the shares (2, L) of fields in them.
+
+    The expected shares of the pixels' noise and of single edges are taken off. ``shifts`` (8 n,)
+    and ``explained`` (8 n, k) are the corners' (:func:`_beside_truth`).
+    """
+    count, size = len(fit.states), CORNERS * len(fit.states)
+    q, _ = np.linalg.qr(explained)
+    residual = np.eye(size) - q @ q.T
+    centres = np.kron(np.eye(count), np.tile(np.eye(2), 4) / 2)
+    parts = (residual - centres.T @ centres @ residual, centres @ residual)
+    forms = [part.T @ part for part in parts]
+    noises, points, *weights = zip(*(_corners(each, fit.noise) for each in fit.states), strict=True)
+    moved = [block_diag(*each) for each in weights]
+    every = np.concatenate(points)
+    distances = ((every[:, None] - every[None]) ** 2).sum(axis=2)
+
+    def sums(covariance: Floats) -> Floats:
+        """Return the expected share of a field of shifts in both sums of squares."""
+        shifted = sum(each @ covariance @ each.T for each in moved)
+        return np.array([float((form * shifted).sum()) for form in forms])
+
+    cell_px = float(np.mean([
+        state.marker.modules * state.marker.module_px for state in fit.states
+    ])) / CELLS
+    of_noise = np.array([float((form * block_diag(*noises)).sum()) for form in forms])
+    added = sums(edges.covariance(distances, cell_px)) + of_noise
+    return np.array([shifts @ form @ shifts for form in forms]) - added, np.stack([
+        sums(np.exp(-0.5 * distances / length**2)) for length in lengths_px
+    ], axis=1)
+
+
+def _corners(state: MarkerState, noise: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return how a marker's fitted corners follow from its pixels.
+
+    Their covariance (8, 8), x and y in turn, by the pixels' ``noise`` (2,), the variances on black
+    and white, px². Points (n, 2) in px of the frame, and weights (8, n) for right and for down:
+    what shifts there add to the corners.
+    """
+    marker = state.marker
+    own = state.jacobian[:, :OWN]
+    influence = own @ np.linalg.pinv(products(own), hermitian=True)[:, :CORNERS]
+    black, white = np.where(np.isfinite(noise), noise, noise[::-1])
+    share = np.clip(state.share, 0.0, 1.0)
+    variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
+    cells = np.clip(state.at * CELLS, 0, CELLS - 1).astype(np.int64)
+    number = cells[1] * CELLS + cells[0]
+
+    def in_cells(values: Floats) -> Floats:
+        return np.asarray(np.bincount(number, values, minlength=CELLS**2), dtype=np.float64)
+
+    # A cell's point is where its edges are, most of them at a side of the marker.
+    edge = (state.slope**2).sum(axis=0) + 1e-12
+    rows, columns = np.nonzero(marker.used)
+    points = np.array([in_cells(edge * each) for each in (columns, rows)])
+    right, down = (
+        np.array([in_cells(one * slope) for one in influence.T]) for slope in state.slope
+    )
+    return (
+        influence.T @ (influence * variance[:, None]),
+        (points / np.maximum(in_cells(edge), 1e-12)).T + marker.frame_px, right, down,
+    )
+
 
 # --------------------------------------------------------------------------------------------------
 # The terms of a scene: the estimate of each, and whether it is kept.

@@ -23,13 +23,20 @@ from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
-from sweep.fitting.fit import MARKERS, Say, SceneFit, fit_scene, scene_views, shortened
-from sweep.fitting.photograph_fit import Views, record_of
-from sweep.fitting.shifts import Estimate
+from sweep.fitting.fit import (
+    MARKERS,
+    Estimate,
+    Say,
+    SceneFit,
+    fit_scene,
+    scene_views,
+    shortened,
+)
+from sweep.fitting.photograph_fit import Views
 from sweep.measure.surroundings import clear_modules
 from sweep.messages import notice, plain
 from sweep.photographs.prepare import name_of, prepare, setting_name
-from sweep.photographs.twins import twin_pipeline
+from sweep.photographs.twins import record_of, twin_pipeline
 from sweep.store.files import write_whole
 from sweep.store.lifecycle import open_dataset
 from sweep.typing import Floats, Integers
@@ -65,51 +72,6 @@ SWITCHES = ("sharpening", "bloom", "geometry_px", "edge_px", "marker_scale")
 NOT_NEEDED = "errors are clearly nearer to those of photographs that were not fitted without it"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
-    """Photographs that are held out, measured.
-
-    Attributes
-    ----------
-    pipeline
-        Theirs, in ``folder``.
-    results
-        Of the photographs.
-    folder
-        Where the stores of simulations go.
-    say
-        Gets a line before each simulation.
-    """
-
-    pipeline: Pipeline
-    results: xr.Dataset
-    folder: Path
-    say: Say
-
-    def gap(self, scene: Mapping[str, Any], name: str) -> xr.Dataset:
-        """Return the photographs beside simulations with a scene."""
-        self.say(f"simulating them with {name}")
-        store = str(self.folder / f"{name.replace(' ', '-')}.zarr")
-        execute(twin_pipeline(self.pipeline, scene, REPEATS), store, overwrite=True)
-        return simulation_gap(self.results, open_dataset(store)).load()
-
-    def worth(self, full: xr.Dataset, rest: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:
-        """Return which effects do not clearly widen the gap.
-
-        Parameters
-        ----------
-        full
-            The gap with the whole scene.
-        rest
-            Switch of an effect -> the scene without it.
-        """
-        size = gap_size(full, full)
-        return {
-            switch: gap_size(self.gap(scene, f"all but {switch}"), full) > size - CLEARLY
-            for switch, scene in rest.items()
-        }
-
-
 def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
     """Return the mean size of all statistics' gaps, in half-widths of the intervals of ``widths``.
 
@@ -130,20 +92,17 @@ def gap_size(gap: xr.Dataset, widths: xr.Dataset) -> float:
     return float(known.mean()) if len(known) else math.nan
 
 
-def held_out(pipeline: Pipeline, numbers: Integers, folder: Path, say: Say) -> HeldOut:
-    """Measure photographs that are held out.
+def needed(whole: xr.Dataset, without: Mapping[str, xr.Dataset]) -> dict[str, bool]:
+    """Return which effects the gap is not clearly narrower without.
 
-    Parameters
-    ----------
-    pipeline
-        Of all photographs.
-    numbers
-        Of the photographs that are held out.
-    folder
-        Where their record and the stores go.
-    say
-        Gets a line before each simulation.
+    ``whole`` is the gap with the whole scene, ``without`` that without each effect.
     """
+    least = gap_size(whole, whole) - CLEARLY
+    return {switch: gap_size(gap, whole) > least for switch, gap in without.items()}
+
+
+def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
+    """Return the pipeline of some of the photographs, by number; their record goes to a folder."""
     record, name = record_of(pipeline), "held-out"
     chosen = dataclasses.replace(
         record, **{
@@ -162,10 +121,7 @@ def held_out(pipeline: Pipeline, numbers: Integers, folder: Path, say: Say) -> H
         every = record.marker_id
         spread = np.unique(np.linspace(0, len(every) - 1, MAX_MARKERS).astype(np.int64))
         axes["marker_id"] = every[spread].tolist()
-    smaller = Pipeline.from_dict(document, name=name, source="held out", folder=folder)
-    store = str(folder / f"{name}.zarr")
-    execute(smaller, store, overwrite=True)
-    return HeldOut(smaller, open_dataset(store), folder, say)
+    return Pipeline.from_dict(document, name=name, source="held out", folder=folder)
 
 
 def checked(
@@ -173,22 +129,35 @@ def checked(
 ) -> tuple[SceneFit, xr.Dataset]:
     """Return the scene with what moves errors of held-out photographs, and the gap that is left.
 
-    Every other photograph is held out, and the scene of the others simulated. The record, in
-    ``home``, and its simulations are of the photographs of ``views``.
+    Every other photograph is held out, and the scene of the others simulated; stores go to
+    ``home``.
     """
     numbers, known = list(views), found.tested_fits
     others, held = {number: views[number] for number in numbers[::2]}, np.array(numbers[1::2])
     say(f"measuring {len(held)} photographs that the scene of the others is compared with")
-    photographs = held_out(pipeline, held, home, say)
+    photographs = held_out(pipeline, held, home)
+
+    def measured(experiment: Pipeline, name: str) -> xr.Dataset:
+        store = str(home / f"{name.replace(' ', '-')}.zarr")
+        execute(experiment, store, overwrite=True)
+        return open_dataset(store)
+
+    def gap_with(scene: Mapping[str, Any], name: str) -> xr.Dataset:
+        say(f"simulating them with {name}")
+        twins = twin_pipeline(photographs, scene, REPEATS)
+        return simulation_gap(results, measured(twins, name)).load()
+
+    results = measured(photographs, photographs.name)
     half = fit_scene(others, known=known).scene
-    gap = photographs.gap(half, "the whole scene")
-    worth = photographs.worth(gap, {
-        switch: fit_scene(others, {switch: NOT_NEEDED}, known).scene
-        for switch in SWITCHES if switch in half
+    gap = gap_with(half, "the whole scene")
+    kept = needed(gap, {
+        switch: gap_with(
+            fit_scene(others, {switch: NOT_NEEDED}, known).scene, f"all but {switch}"
+        ) for switch in SWITCHES if switch in half
     })
-    refused = {switch: NOT_NEEDED for switch, needed in worth.items() if not needed}
+    refused = {switch: NOT_NEEDED for switch, keep in kept.items() if not keep}
     if refused:
-        rest = photographs.gap(fit_scene(others, refused, known).scene, "what is kept")
+        rest = gap_with(fit_scene(others, refused, known).scene, "what is kept")
         if gap_size(rest, gap) <= gap_size(gap, gap):
             return fit_scene(views, refused, known), rest
     return found, gap

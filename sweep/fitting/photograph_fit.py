@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
@@ -25,6 +23,7 @@ from sweep.model.image_file import photograph_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.photographs.cameras import Lens, cameras_of
+from sweep.photographs.twins import record_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -113,12 +112,6 @@ class FittedMarker:
 
 #: Number of a photograph -> the markers in it that are fitted.
 Views = dict[int, list[FittedMarker]]
-
-
-def record_of(pipeline: Pipeline) -> PhotographRecord:
-    """Return the record of a pipeline's photographs; of two cameras the left one's."""
-    path = Path(pipeline.folder) / str(pipeline.values_of(PHOTOGRAPHS)[0])
-    return PHOTOGRAPH_RECORDS.read(path)[0]
 
 
 def photograph_views(pipeline: Pipeline, most: int) -> Views:

@@ -138,22 +138,18 @@ def prepare(
     records = [
         _without_truth(folder, part, sizes, described, Path(home))
         for folder, part in zip(found, parts, strict=True)
-    ]
-    lens, said = lens_of(cameras[0]), []
+    ][: 1 if one_camera else None]
+    lens = lens_of(cameras[0])
     if poses is not None:
-        truth, said = poses_of_file(records[0], Path(poses), lens, sizes_m, seen[0])
-        records = [truth]
+        lines += poses_of_file(records[0], Path(poses), lens, sizes_m, seen[0])
     elif target is not None and (rig is None or one_camera):
-        truth, said = _poses_of_board(records[0], cameras[0], camera, target, corners)
-        records = [truth]
+        lines += _poses_of_board(records[0], cameras[0], camera, target, corners)
     elif rig is None:
-        records = [own_poses(records[0], lens, sizes_m, seen[0])]
+        own_poses(records[0], lens, sizes_m, seen[0])
     else:
-        records = [
+        for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=False)):
             partner_poses(record, one, sizes_m, seen[k], seen[1 - k])
-            for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=True))
-        ][: 1 if one_camera else None]
-    lines += [*said, *_summary(records, first)]
+    lines += _summary(records, first)
     pipeline = _write_records(
         records, cameras, dictionary, sizes, settings, Path(home),
         name or name_of(Path(folders[0])), first, overwrite=overwrite,
@@ -191,20 +187,21 @@ def name_of(folder: Path) -> str:
 def _check_arguments(
     folders: Sequence[PathName], camera: PathName | None, poses: object, stereo: object
 ) -> None:
-    if stereo is not None and poses is not None:
-        raise ArgumentError("poses", poses, "expected one truth; delete poses or stereo")
-    if stereo is not None and camera is not None:
-        raise ArgumentError(
-            "camera", camera, "expected none beside stereo, whose file has both cameras"
-        )
-    if stereo is None and camera is None:
-        raise ArgumentError(
-            "camera", "none", f"expected the file of a calibration, or {CALIBRATE}"
-        )
     most = 1 if stereo is None else 2
-    if not 1 <= len(folders) <= most:
-        expected = "one folder" + (", or those of the left and the right camera" if stereo else "")
-        raise ArgumentError("folders", ", ".join(map(str, folders)), f"expected {expected}")
+    several = ", or those of the left and the right camera" if most == 2 else ""
+    faults = (
+        (stereo is not None and poses is not None, "poses", poses,
+         "expected one truth; delete poses or stereo"),
+        (stereo is not None and camera is not None, "camera", camera,
+         "expected none beside stereo, whose file has both cameras"),
+        (stereo is None and camera is None, "camera", "none",
+         f"expected the file of a calibration, or {CALIBRATE}"),
+        (not 1 <= len(folders) <= most, "folders", ", ".join(map(str, folders)),
+         f"expected one folder{several}"),
+    )
+    for holds, argument, value, reason in faults:
+        if holds:
+            raise ArgumentError(argument, value, reason)
 
 
 def _check_pairs(found: Sequence[Folder]) -> None:
@@ -278,16 +275,16 @@ def _camera(
 def _poses_of_board(
     record: PhotographRecord, camera: Calibration, written: PathName | None, board: Board,
     corners: Sequence[FoundCorners],
-) -> tuple[PhotographRecord, list[str]]:
-    """Return a record with the poses of a board's markers, and a line on them."""
-    truth, boards, halves = board_poses(record, board, camera, corners)
+) -> list[str]:
+    """Write the poses of a board's markers; return a line on them."""
+    boards, halves = board_poses(record, board, camera, corners)
     if not boards:
-        return truth, []
+        return []
     rms = float(np.median([each.rms_px for each in boards]))
     if written is not None and str(written) != CALIBRATE:
         check_resolution(str(written), lens_of(camera), record.size, corners, rms)
     line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
-    return truth, [line if np.isnan(halves) else (
+    return [line if np.isnan(halves) else (
         f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "
         "residuals predict"
     )]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,16 +34,7 @@ from sweep.photographs.folder import SeenMarkers
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
-# Poses of markers in photographs, as they are gathered in a record without any.
-
-def unknown_poses(record: PhotographRecord) -> PhotographRecord:
-    """Return a record of the same photographs and markers without poses."""
-    return dataclasses.replace(
-        record, source=np.zeros_like(record.source),
-        **{name: np.full_like(getattr(record, name), np.nan)
-           for name in ("rotation", "translation", "std")},
-    )
-
+# Poses of M markers in P photographs are written into their record, which has none before.
 
 def put(
     record: PhotographRecord, place: tuple[int, int], rotation: Floats, translation: Floats,
@@ -81,9 +71,8 @@ MAD_TO_STD = 1.4826
 
 def own_poses(
     record: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
-) -> PhotographRecord:
-    """Return a record with the poses of its M markers, of sides (M,), by their own corners."""
-    poses = unknown_poses(record)
+) -> None:
+    """Write the poses of markers, of sides (M,), by their own corners."""
     for photograph, one in enumerate(seen):
         marker, quads = one.among(record.marker_id)
         rotation, translation = both_planar_solutions(
@@ -91,16 +80,15 @@ def own_poses(
         )
         for k, number in enumerate(marker.tolist()):
             if np.isfinite(rotation[k, 0]).all() and translation[k, 0, 2] > 0:
-                put(poses, (photograph, number), rotation[k, 0], translation[k, 0],
+                put(record, (photograph, number), rotation[k, 0], translation[k, 0],
                     TruthSource.none)
-    return poses
 
 
 def partner_poses(
     record: PhotographRecord, stereo: StereoCamera, sizes_m: Floats, left: Sequence[SeenMarkers],
     right: Sequence[SeenMarkers],
-) -> PhotographRecord:
-    """Return a record with the poses in left photographs, from the right ones of the same moment.
+) -> None:
+    """Write the poses in left photographs, from the right ones of the same moment.
 
     Their standard deviations are computed from the differences between left and right poses, over
     √2: robust ones over all markers, since a single marker's are not known.
@@ -108,7 +96,7 @@ def partner_poses(
     Parameters
     ----------
     record
-        P left photographs of M markers.
+        Of the left photographs.
     stereo
         The cameras.
     sizes_m
@@ -116,7 +104,7 @@ def partner_poses(
     left, right
         P each.
     """
-    poses, differences, ids = unknown_poses(record), [], record.marker_id
+    differences, ids = [], record.marker_id
     for photograph, (own, partner) in enumerate(zip(left, right, strict=True)):
         (own_marker, own_quads), (marker, quads) = own.among(ids), partner.among(ids)
         sides, own_sides = sizes_m[marker], sizes_m[own_marker]
@@ -137,7 +125,7 @@ def partner_poses(
             corners = marker_corners(sides[k : k + 1])
             if not are_within(record, stereo.left, corners, turn, shift)[0]:
                 continue
-            put(poses, (photograph, int(marker[k])), turn, shift, TruthSource.stereo_partner)
+            put(record, (photograph, int(marker[k])), turn, shift, TruthSource.stereo_partner)
             for both in np.flatnonzero(at == k).tolist():
                 turns = rotation_difference(own_turns[both], np.repeat(turn[None], 2, axis=0))
                 angle = np.linalg.norm(turns, axis=1)
@@ -146,8 +134,7 @@ def partner_poses(
                     differences.append([*turns[j], *(own_places[both, j] - shift)])
     if len(differences) >= MIN_PAIRS:
         spread = MAD_TO_STD * np.median(np.abs(np.array(differences)), axis=0) / np.sqrt(2.0)
-        poses.std[poses.shown] = spread
-    return poses
+        record.std[record.shown] = spread
 
 
 def _errors(
@@ -173,8 +160,8 @@ OTHER_UNIT = 1.5
 
 def poses_of_file(
     record: PhotographRecord, path: Path, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
-) -> tuple[PhotographRecord, list[str]]:
-    """Return a record with a file's poses of markers wholly in their photographs, and lines.
+) -> list[str]:
+    """Write a file's poses of markers wholly in their photographs; return lines on them.
 
     Raises
     ------
@@ -196,47 +183,45 @@ def poses_of_file(
         faults.append(f"marker {unknown[0]}: expected one of the board or the photographs")
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
-    poses, cut = unknown_poses(record), 0
     if not faults:
         for photograph, marker_id, rotation, translation in zip(
             answers.image.tolist(), answers.marker_id.tolist(), answers.rotation,
             answers.translation, strict=True,
         ):
             place = photograph, number[marker_id]
-            put(poses, place, rotation, translation, TruthSource.poses_file)
-        faults += _faults(poses, lens, sizes_m, seen)
+            put(record, place, rotation, translation, TruthSource.poses_file)
+        faults += _faults(record, lens, sizes_m, seen)
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])
-    for photograph, k in np.argwhere(poses.shown).tolist():
-        pose = poses.rotation[photograph, k], poses.translation[photograph, k]
+    given = np.argwhere(record.shown).tolist()
+    for photograph, k in given:
+        pose = record.rotation[photograph, k], record.translation[photograph, k]
         if not are_within(record, lens, marker_corners(sizes_m[k : k + 1]), *pose)[0]:
-            poses.translation[photograph, k] = np.nan
-            cut += 1
-    lines = [f"{cut:,} poses of markers that are not wholly in the frame: not counted"]
-    return poses, lines if cut else []
+            record.translation[photograph, k] = np.nan
+    cut = len(given) - int(record.shown.sum())
+    line = f"{cut:,} poses of markers that are not wholly in the frame: not counted"
+    return [line] if cut else []
 
 
 def _faults(
-    poses: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+    record: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
 ) -> list[str]:
     """Return the fault of poses that are not where markers are detected, if there is one."""
-    own = own_poses(poses, lens, sizes_m, seen)
-    ranges = (np.linalg.norm(each.translation, axis=2) for each in (poses, own))
-    ratios, distances = np.divide(*ranges), []
+    ratios, distances = [], []
     for photograph, one in enumerate(seen):
-        marker, quads = one.among(poses.marker_id)
-        for k, quad, side in zip(
-            marker.tolist(), quads, side_lengths(quads).mean(axis=1).tolist(), strict=True
-        ):
-            if not np.isnan(ratios[photograph, k]):
-                points = marker_corners(sizes_m[k : k + 1])[0]
-                pose = poses.rotation[photograph, k], poses.translation[photograph, k]
-                away = np.linalg.norm(lens.project(points, *pose) - quad, axis=1).max()
-                behind = ((points @ pose[0].T + pose[1])[:, 2] <= 0).any()
-                distances.append(np.inf if behind else float(away) / side)
+        for k, quad in zip(*one.among(record.marker_id), strict=True):
+            if not record.shown[photograph, k]:
+                continue
+            points = marker_corners(sizes_m[k : k + 1])[0]
+            pose = record.rotation[photograph, k], record.translation[photograph, k]
+            pixels, side = lens.project(points, *pose), side_lengths(quad[None]).mean()
+            behind = ((points @ pose[0].T + pose[1])[:, 2] <= 0).any()
+            away = np.linalg.norm(pixels - quad, axis=1).max()
+            distances.append(np.inf if behind else float(away) / side)
+            ratios.append(side / side_lengths(pixels[None]).mean())
     if not distances or np.median(distances) < NEAR_SHARE:
         return []
-    ratio = float(np.nanmedian(ratios))
+    ratio = float(np.median(ratios))
     fault = (
         "most markers are not where its poses have them; expected rotation vectors and positions "
         "from the marker's frame (x right, y up) to the camera's (x right, y down, z forward)"
@@ -262,8 +247,8 @@ MIN_HALF = 5
 
 def board_poses(
     record: PhotographRecord, board: Board, camera: Calibration, found: Sequence[FoundCorners]
-) -> tuple[PhotographRecord, list[FittedPose], float]:
-    """Return the poses of a board's markers in photographs, of markers wholly in them.
+) -> tuple[list[FittedPose], float]:
+    """Write the poses of a board's markers in photographs, of markers wholly in them.
 
     Parameters
     ----------
@@ -277,7 +262,7 @@ def board_poses(
     Returns
     -------
     tuple
-        A record with the poses. The board's own ones in the photographs with corners enough.
+        The board's own poses in the photographs with corners enough.
         The root mean square of the differences between the poses of two halves of the corners,
         over the prediction from the residuals' variance; NaN if no photograph has corners enough.
     """
@@ -287,7 +272,7 @@ def board_poses(
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     frames = [marker_frame(each)[1] for each in board.corners_m]
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
-    own, poses = own_corners(board), unknown_poses(record)
+    own = own_corners(board)
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
         if pose is None:
             continue
@@ -307,9 +292,9 @@ def board_poses(
                     lens, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
                     (board.corners_m[k] - centre) @ axes,
                 )
-            put(poses, (photograph, column[k]), fitted.rotation, fitted.translation,
+            put(record, (photograph, column[k]), fitted.rotation, fitted.translation,
                 TruthSource.board_without_this_marker, np.sqrt(variance))
-    return poses, [each for each in boards if each is not None], ratio
+    return [each for each in boards if each is not None], ratio
 
 
 def unshared_variance(

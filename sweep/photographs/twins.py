@@ -56,7 +56,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         raise ArgumentError("repeats", repeats, "expected at least 1")
     axis = pipeline.axis(TRIAL)
     trials = 1 if axis is None else len(axis)
-    photographs = len(_record(pipeline).paths)
+    photographs = len(record_of(pipeline).paths)
     if repeats > 1 and trials != photographs:
         raise ArgumentError(
             "repeats", repeats, f"expected 1, for the {trials} first of {photographs} photographs"
@@ -83,7 +83,7 @@ def _ground(black: Any) -> dict[str, float]:
         return {}  # the pipeline's check names its fault
 
 
-def _record(pipeline: Pipeline) -> PhotographRecord:
+def record_of(pipeline: Pipeline) -> PhotographRecord:
     """Return the record of photographs of a pipeline; of two cameras the left one's.
 
     Raises

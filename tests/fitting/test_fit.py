@@ -10,7 +10,7 @@ import sweep
 from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
 from sweep.analysis.comparisons import GAP_STATISTICS
-from sweep.fitting.folders import REPEATS, HeldOut
+from sweep.fitting.folders import REPEATS, needed
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles
 from sweep.model.renderers import render_all
@@ -116,21 +116,11 @@ def gap(simulated, photographs=1.0):
     return xr.Dataset(variables)
 
 
-class Simulated(HeldOut):
-    """Held-out photographs whose simulations have known gaps: a scene's ``value``."""
-
-    def gap(self, scene, name):  # noqa: ARG002
-        return gap(scene["value"])
-
-
 def test_an_effect_is_left_out_where_errors_are_clearly_nearer_to_those_of_photographs_without():
-    photographs = Simulated(None, None, None, None)
-    full = gap(1.5)
     # Without an effect the gap of 1 half-width becomes 2, 1, 0.8, and, though the errors move by as
     # much as in the first case, 0.2 on the other side.
-    scenes = {"nearer": {"value": 2.0}, "idle": {"value": 1.5}, "open": {"value": 1.4},
-              "moved": {"value": 0.9}}
-    assert photographs.worth(full, scenes) == {
+    without = {"nearer": gap(2.0), "idle": gap(1.5), "open": gap(1.4), "moved": gap(0.9)}
+    assert needed(gap(1.5), without) == {
         "nearer": True, "idle": True, "open": True, "moved": False}
 
 

@@ -112,19 +112,19 @@ def jackknife(function: Callable[[Integers], Floats], count: int) -> list[Estima
 class Field(NamedTuple):
     """A field of shifts: standard deviation, correlation length, and whether there is one.
 
-    ``variance_px`` (px²) is the mean of unbiased estimates by each photograph: it may be below 0.
+    ``variance`` (px²) is the mean of unbiased estimates by each photograph: it may be below 0.
     """
 
     size_px: Estimate = UNKNOWN
     length_px: Estimate = UNKNOWN
-    variance_px: Estimate = UNKNOWN
+    variance: Estimate = UNKNOWN
 
     def covariance(self, distances: Floats, cell_px: float) -> Floats:
         """Return the covariance in px² of means over cells at squared distances (px²).
 
         Means over two squares are, nearly, the field smoothed by a Gaussian of their variance.
         """
-        if not self.variance_px.value > 0:
+        if not self.variance.value > 0:
             return np.zeros_like(distances)
         square = self.length_px.value**2
         wide = square + cell_px**2 / 6
@@ -692,8 +692,8 @@ def _noise(levels: tuple[float, float], noises: Floats) -> list[Term]:
 
 def _field_terms(name: str, parameter: str, field: Field) -> list[Term]:
     """Return the term of a field of shifts, and the term of its reach, which is kept with it."""
-    term = judged(name, parameter, field.size_px, field.variance_px)
-    if term.kept and not field.variance_px.value > 0:
+    term = judged(name, parameter, field.size_px, field.variance)
+    if term.kept and not field.variance.value > 0:
         term = term.left_out("smaller than the noise")
     return [term, Term(
         f"reach of {name}", parameter.replace("_px", "_length_px"), field.length_px, term.kept,

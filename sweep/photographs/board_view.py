@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import tomllib
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,7 +18,7 @@ from sweep.messages import plain, shown
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary_names
 from sweep.model.polygon import side_lengths
-from sweep.photographs.folder import Photograph, SeenMarkers, detect_markers, named
+from sweep.photographs.folder import Photograph, SeenMarkers, detect_markers, fault_of, named
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -162,10 +160,10 @@ MAX_TRIED = 3
 
 
 def check_board(
-    path: Path, board: Board, seen: Sequence[SeenMarkers], find: FindFunction,
-    photographs: Sequence[Photograph],
+    name: str, document: Mapping[str, Any], board: Board, seen: Sequence[SeenMarkers],
+    find: FindFunction, photographs: Sequence[Photograph],
 ) -> None:
-    """Refuse a board that the photographs do not show.
+    """Refuse a board, of a file of that name and content, that the photographs do not show.
 
     Raises
     ------
@@ -182,9 +180,9 @@ def check_board(
                  "first_id or ids")
     else:
         _check_each(board, seen, photographs)
-        fault = _other_size(board, seen) or _other_kind(path, board, seen)
+        fault = _other_size(board, seen) or _other_kind(document, board, seen)
     if fault:
-        raise ArgumentError("board", plain(path), fault)
+        raise ArgumentError("board", plain(name), fault)
 
 
 def _check_each(
@@ -196,8 +194,8 @@ def _check_each(
         if len(one.ids) >= MIN_JUDGED and fitting_share(board, [one]) < MIN_OWN
     ]
     if odd and len(odd) < len(photographs) / 2:
-        raise ArgumentError(
-            "folders", plain(photographs[0].path.parent, 300),
+        raise fault_of(
+            photographs[0].path.parent,
             f"{named(odd)}: less than {100 * MIN_OWN:.0f} % of the markers lie where the board "
             f"has them, unlike in {len(photographs) - len(odd)} other photographs; move those of "
             "another board elsewhere",
@@ -216,14 +214,16 @@ def _other_size(board: Board, seen: Sequence[SeenMarkers]) -> str:
             f"show about {side * ratio:.3g} m; correct marker_m, or the squares or gaps")
 
 
-def _other_kind(path: Path, board: Board, seen: Sequence[SeenMarkers]) -> str:
+def _other_kind(
+    document: Mapping[str, Any], board: Board, seen: Sequence[SeenMarkers]
+) -> str:
     """Return the fault of a board whose markers lie elsewhere, and which board fits better."""
     share = fitting_share(board, seen)
     if share > DOUBTFUL:
         return ""
     # Of those that fit as well, the first.
     found, better = max(
-        ((fitting_share(other, seen), words) for words, other in _others(path)),
+        ((fitting_share(other, seen), words) for words, other in _others(document)),
         key=lambda each: each[0], default=(0.0, ""),
     )
     if found < max(MIN_FITTING, share + CLEARLY):
@@ -281,9 +281,8 @@ COUNTS = {
 }
 
 
-def _others(path: Path) -> Iterator[tuple[str, Board]]:
+def _others(document: Mapping[str, Any]) -> Iterator[tuple[str, Board]]:
     """Yield boards that differ from a file's in an often mistaken key, each in words."""
-    document = tomllib.loads(path.read_text())
     kind = document.get("kind")
     if kind not in COUNTS:
         return
@@ -321,8 +320,8 @@ def _check_halves(seen: Sequence[SeenMarkers], photographs: Sequence[Photograph]
     twice = sum(one.repeated for one in seen)
     every = twice + sum(len(one.ids) for one in seen)
     if width >= 2 * height and every >= MIN_JUDGED and twice > every / 2:
-        raise ArgumentError(
-            "folders", plain(photographs[0].path.parent, 300),
+        raise fault_of(
+            photographs[0].path.parent,
             "most markers are in both halves of the images: of two cameras side by side give the "
             "calibration (--stereo FILE)",
         )

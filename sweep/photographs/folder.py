@@ -52,6 +52,11 @@ class Folder:
         return width, height
 
 
+def fault_of(folder: Path, reason: str) -> ArgumentError:
+    """Return the error that names a folder of photographs and what is wrong with it."""
+    return ArgumentError("folders", plain(folder, 300), reason)
+
+
 def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
     """Return the photographs of a folder, or the same half of each of its images.
 
@@ -64,8 +69,7 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
     try:
         files = sorted(path for path in home.iterdir() if not path.name.startswith("."))
     except OSError as error:
-        reason = f"{error.strerror or 'unreadable'}{nearest_file(home)}"
-        raise ArgumentError("folders", plain(home, 300), reason) from None
+        raise fault_of(home, f"{error.strerror or 'unreadable'}{nearest_file(home)}") from None
     photographs: list[Photograph] = []
     left_out: dict[str, list[str]] = {NO_IMAGES: [], UNREADABLE: [], AGAIN: []}
     names: dict[str, str] = {}
@@ -93,24 +97,18 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
     lines += [f"{name}: {count} of {len(photographs)} photographs {note}"
               for note, count in sorted(notes.items())]
     if not photographs:
-        raise ArgumentError(
-            "folders", plain(home, 300),
-            f"expected photographs ({', '.join(each[1:].upper() for each in IMAGE_SUFFIXES)})"
-            + (f"; {'; '.join(lines)}" if lines else ""),
-        )
+        kinds = ", ".join(each[1:].upper() for each in IMAGE_SUFFIXES)
+        raise fault_of(home, "; ".join([f"expected photographs ({kinds})", *lines]))
     ((height, width), _), *others = Counter(each.image.shape for each in photographs).most_common()
     if others:
         odd = [f"{plain(path.name)} ({image.shape[1]} x {image.shape[0]})"
                for path, _, image in photographs if image.shape != (height, width)]
-        raise ArgumentError(
-            "folders", plain(home, 300),
-            f"expected photographs of one size: most are {width} x {height}, not {named(odd)}; "
-            "move those of another camera or size elsewhere",
+        raise fault_of(
+            home, f"expected photographs of one size: most are {width} x {height}, not "
+            f"{named(odd)}; move those of another camera or size elsewhere",
         )
     if part is not Part.whole and width % 2:
-        raise ArgumentError(
-            "folders", plain(home, 300), f"expected images of two halves; they are {width} px wide"
-        )
+        raise fault_of(home, f"expected images of two halves; they are {width} px wide")
     return Folder(
         tuple(each._replace(image=part.of(each.image)) for each in photographs), tuple(lines)
     )

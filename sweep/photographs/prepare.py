@@ -38,6 +38,7 @@ from sweep.photographs.folder import (
     Folder,
     SeenMarkers,
     detect_markers,
+    fault_of,
     named,
     read_folder,
     reference_detector,
@@ -123,7 +124,7 @@ def prepare(
     lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
     if stereo is not None:
         _check_pairs(found)
-    dictionary, sizes, seen = _detected(target, board, settings, found)
+    dictionary, sizes, seen = _detected(target, document, str(board), settings, found)
     sizes_m, first = np.array(list(sizes.values())), found[0]
     corners = [] if target is None else [
         find_corners(each.image, target, one)
@@ -220,12 +221,13 @@ def _check_pairs(found: Sequence[Folder]) -> None:
 
 
 def _detected(
-    board: Board | None, path: PathName | None, settings: Sequence[str], found: Sequence[Folder]
+    board: Board | None, document: Mapping[str, Any], name: str, settings: Sequence[str],
+    found: Sequence[Folder],
 ) -> tuple[str, dict[int, float], list[list[SeenMarkers]]]:
     """Return dictionary and sides (m, by increasing ID) of the markers, and those that are seen.
 
     These are of each photograph of each camera. Settings that say what the board says are refused,
-    and a board that is not in the photographs.
+    and a board, of a file of a name and content, that is not in the photographs.
     """
     given = {setting_name(each) for each in settings}
     if board is not None and (twice := given & {"dictionary", "size_m", "marker_id"}):
@@ -245,7 +247,7 @@ def _detected(
     ]
     every = [each for side in seen for each in side]
     if board is not None:
-        check_board(Path(str(path)), board, every, find, found[0].photographs)
+        check_board(name, document, board, every, find, found[0].photographs)
         sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
         sizes = dict(sorted(zip(board.marker_ids, np.round(sides, 12).tolist(), strict=True)))
         return dictionary, sizes, seen
@@ -294,8 +296,8 @@ def _summary(records: Sequence[PhotographRecord], folder: Folder) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
     shown = np.array([each.shown for each in records])
     if not shown.any():
-        raise ArgumentError(
-            "folders", plain(folder.photographs[0].path.parent, 300),
+        raise fault_of(
+            folder.photographs[0].path.parent,
             "no photograph shows a whole marker whose pose is known",
         )
     with_pose = shown.any(axis=2)

@@ -25,7 +25,7 @@ from sweep.messages import nearest, plain, refusal
 from sweep.model.calibration import MAX_BYTES, Calibration
 from sweep.model.image_file import decode_grey, read_regular
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
-from sweep.photographs.cameras import camera_of_file, cameras_of, lens_of
+from sweep.photographs.cameras import camera_of_file, cameras_of
 from sweep.photographs.folder import detect_markers
 from sweep.typing import Floats, Integers
 
@@ -351,7 +351,7 @@ def _solved(corners: Floats, camera: Calibration, size_m: float) -> tuple[Floats
     if all(frame) and (quads > np.array(frame, dtype=np.float64)).any():
         raise _fault("corners lie beyond the camera file's image of "
                      f"{frame[0]} x {frame[1]} px: expected the calibration of their images")
-    cameras = cameras_of(lens_of(camera), len(quads))
+    cameras = cameras_of(camera, len(quads))
     rotation, position = both_planar_solutions(quads, cameras, np.full(len(quads), size_m))
     _each_row(np.isfinite(position[:, 0]).all(axis=-1), "the corners have no pose; expected top "
               "left, top right, bottom right, bottom left")

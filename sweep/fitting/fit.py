@@ -32,7 +32,7 @@ from sweep.fitting.photograph_fit import (
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.solver import marker_frame, of_board
-from sweep.photographs.cameras import fit_pose
+from sweep.photographs.cameras import derivatives, fit_pose
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -335,10 +335,10 @@ def _beside_truth(
     ])
     first, used = places[0], np.ones(len(points), dtype=bool)
     start = of_board(first.rotation, first.translation, marker_frame(corners[0])[1])
-    pose = fit_pose(first.lens, points, pixels, *start, used)
+    pose = fit_pose(first.camera, points, pixels, *start, used)
     if pose is None:
         return None
-    _, explained, _ = first.lens.derivatives(points, pose.rotation, pose.translation)
+    _, explained, _ = derivatives(first.camera, points, pose.rotation, pose.translation)
     return -pose.residuals.ravel(), explained
 
 

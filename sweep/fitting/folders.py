@@ -180,7 +180,8 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
     record, fixed = record_of(pipeline), pipeline.fixed
     first = next(iter(views.values()))[0].shown
     marker = {
-        "dictionary": first.dictionary, "marker_id": first.marker_id, "size_m": first.size_m,
+        "dictionary": first.marker.dictionary, "marker_id": first.marker.marker_ids[0],
+        "size_m": first.size_m,
     }
     on_board = [each for each in record.on_board(record.marker_id) if each is not None]
     if on_board:

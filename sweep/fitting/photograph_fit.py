@@ -14,15 +14,14 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.photograph import PANEL_PX, add_plane, photograph_view, system
-from sweep.measure.solver import marker_frame
 from sweep.measure.surroundings import BoardMarker, clear_modules, ring_modules
-from sweep.model.board import single_marker
-from sweep.model.calibration import VIEW
+from sweep.model.board import Board, single_marker
+from sweep.model.calibration import VIEW, Calibration
 from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
-from sweep.photographs.cameras import Lens, cameras_of
+from sweep.photographs.cameras import cameras_of, project
 from sweep.photographs.twins import record_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
@@ -45,17 +44,16 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 class Shown(NamedTuple):
     """A marker in a photograph: its true pose (3, 3), (3,) m, and where that comes from.
 
-    ``on_board`` is its place on a board, None of a single one; ``size_m`` its side. ``width_px`` is
-    the photograph's.
+    ``marker`` is the marker alone, ``size_m`` its side, ``on_board`` its place on a board, None of
+    a single one; ``width_px`` is the photograph's.
     """
 
     rotation: Floats
     translation: Floats
     source: TruthSource
-    lens: Lens
+    camera: Calibration
     width_px: int
-    dictionary: str
-    marker_id: int
+    marker: Board
     size_m: float
     on_board: BoardMarker | None
 
@@ -63,7 +61,7 @@ class Shown(NamedTuple):
         """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side."""
         flat = (points - 0.5) * self.size_m * [1.0, -1.0]
         in_plane = np.column_stack([flat, np.zeros(len(flat))])
-        return self.lens.project(in_plane, self.rotation, self.translation)
+        return project(self.camera, in_plane, self.rotation, self.translation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,27 +118,24 @@ def photograph_views(pipeline: Pipeline, most: int) -> Views:
     They are those farthest from one another, beginning with the one nearest the frame's centre.
     """
     record, fixed = record_of(pipeline), pipeline.fixed
-    *view, distortion = (pipeline.values_of(name)[0] for name in (*VIEW, "distortion"))
-    fx, fy, cx, cy = view
-    lens, views = Lens.of(fx, fy, cx, cy, tuple(distortion)), Views()
+    fx, fy, cx, cy, distortion = (
+        pipeline.values_of(name)[0] for name in (*VIEW, "distortion")
+    )
+    camera, views = Calibration(None, None, fx, fy, cx, cy, tuple(distortion), (), ()), Views()
     on_board = record.on_board(record.marker_id)
-    sizes = [
-        float(fixed["size_m"]) if each is None
-        else round(marker_frame(each.board.corners_m[each.number])[0], 12) for each in on_board
-    ]
+    sizes = np.broadcast_to(pipeline.values_of("size_m"), len(on_board)).tolist()
     for number, (path, digest) in enumerate(zip(record.paths, record.digests, strict=True)):
         image = photograph_image(reference(Path(pipeline.folder) / path, digest, record.part))
         every = [
             Shown(
                 record.rotation[number, k], record.translation[number, k],
-                TruthSource(int(record.source[number, k])), lens, record.width_px,
-                fixed["dictionary"], int(record.marker_id[k]), sizes[k], on_board[k],
+                TruthSource(int(record.source[number, k])), camera, record.width_px,
+                single_marker(
+                    fixed["dictionary"], int(record.marker_id[k]), fixed["quiet_zone_modules"]
+                ), sizes[k], on_board[k],
             ) for k in np.flatnonzero(record.shown[number]).tolist()
         ]
-        markers = [
-            marker_view(shown, image, fixed["quiet_zone_modules"])
-            for shown in _spread(every, image.shape, most)
-        ]
+        markers = [marker_view(shown, image) for shown in _spread(every, image.shape, most)]
         views[number] = [each for each in markers if each is not None]
     return {number: each for number, each in views.items() if each}
 
@@ -159,14 +154,11 @@ def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[S
     return [every[large[k]] for k in sorted(chosen)]
 
 
-def marker_view(shown: Shown, image: Grey, margin: float) -> FittedMarker | None:
-    """Return the pixels of a marker in a photograph (height, width); None if they are few.
-
-    ``margin`` is the quiet zone of single markers in modules.
-    """
-    marker = single_marker(shown.dictionary, shown.marker_id, margin)
-    corners, modules = shown.pixels(SQUARE), module_count(shown.dictionary)
-    optics = cameras_of(shown.lens, 1).optics(0)
+def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
+    """Return the pixels of a marker in a photograph (height, width); None if they are few."""
+    marker, corners = shown.marker, shown.pixels(SQUARE)
+    modules = module_count(marker.dictionary)
+    optics = cameras_of(shown.camera, 1).optics(0)
     box = photograph_view(
         marker, shown.on_board, shown.size_m, corners, optics, image, np.zeros(2, dtype=np.int64),
         toned=False,
@@ -183,12 +175,12 @@ def marker_view(shown: Shown, image: Grey, margin: float) -> FittedMarker | None
         used &= drawn(ends, sides, used.shape, OUTSIDE_BLUR_PX)[4] < OUTSIDE_SHARE
     if used.sum() < MIN_SIDE_PX**2:
         return None
-    clear = margin if shown.on_board is None else clear_modules(shown.on_board)
+    clear = marker.margin or 0.0 if shown.on_board is None else clear_modules(shown.on_board)
     beyond = SQUARE + (clear + 1.0) / modules * (2.0 * SQUARE - 1.0)
     return FittedMarker(
         shown, box.levels, used, ends, sides, ends_at, 0.5 + (0.5 + ring / modules) * box.at,
         corners - frame_px, modules, float(side_lengths(corners[None]).mean()) / modules,
-        (overhang(shown.dictionary) + 0.5) / modules, frame_px, _along(image, shown.pixels(beyond)),
+        (overhang(marker.dictionary) + 0.5) / modules, frame_px, _along(image, shown.pixels(beyond)),
     )
 
 

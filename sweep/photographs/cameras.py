@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from sweep.measure import intrinsics
 from sweep.measure.flags import CalibrationStatus
 from sweep.measure.solver import GuardedPoints
 from sweep.messages import plain
-from sweep.model.calibration import MAX_BYTES, Calibration, calibration_of, read_tree
+from sweep.model.calibration import MAX_BYTES, VIEW, Calibration, calibration_of, read_tree
 from sweep.model.camera import Cameras
 from sweep.model.image_file import read_regular
 from sweep.model.lens import pack
@@ -26,59 +27,41 @@ from sweep.model.pose import rotation_of_vector
 from sweep.photographs.board_view import FoundCorners
 from sweep.typing import Floats, Integers, Masks
 
+# --------------------------------------------------------------------------------------------------
+# A camera, which is a calibration, as OpenCV and as solvers take it.
 
-class Lens(NamedTuple):
-    """A camera as OpenCV takes it: matrix (3, 3) and coefficients (0, 4, 5, 8, 12 or 14)."""
-
-    matrix: Floats
-    distortion: Floats
-
-    @staticmethod
-    def of(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]) -> Lens:
-        """Return a camera from its numbers."""
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return Lens(matrix, np.array(distortion, dtype=np.float64))
-
-    def project(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
-        """Return the images (n, 2) of points (n, 3) of a target."""
-        return self.derivatives(points, rotation, translation)[0]
-
-    def derivatives(
-        self, points: Floats, rotation: Floats, translation: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """Return images (n, 2) with derivatives by the pose (2 n, 6) and by the camera (2 n, c).
-
-        The pose changes by a rotation vector in the camera's frame, about the target's origin,
-        and by a translation. The derivative by a point in the camera's frame is OpenCV's by the
-        translation. The camera's numbers are fx, fy, cx, cy and the coefficients.
-        """
-        turned = points @ rotation.T
-        image, jacobian = cv2.projectPoints(
-            np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
-            self.distortion if len(self.distortion) else None,
-        )
-        slopes = np.asarray(jacobian, dtype=np.float64)
-        by_point = slopes[:, 3:6].reshape(-1, 2, 3)
-        by_turn = np.cross(turned[:, None, :], by_point)
-        return (
-            np.asarray(image, dtype=np.float64).reshape(-1, 2),
-            np.concatenate([by_turn, by_point], axis=2).reshape(-1, 6),
-            slopes[:, 6 : 10 + len(self.distortion)],
-        )
+def project(camera: Calibration, points: Floats, rotation: Floats, translation: Floats) -> Floats:
+    """Return the images (n, 2) of points (n, 3) of a target."""
+    return derivatives(camera, points, rotation, translation)[0]
 
 
-def lens_of(calibration: Calibration) -> Lens:
-    """Return the camera of a calibration."""
-    return Lens.of(
-        calibration.fx_px, calibration.fy_px, calibration.cx_px, calibration.cy_px,
-        calibration.distortion,
+def derivatives(
+    camera: Calibration, points: Floats, rotation: Floats, translation: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return images (n, 2) with derivatives by the pose (2 n, 6) and by the camera (2 n, c).
+
+    The pose changes by a rotation vector in the camera's frame, about the target's origin, and by
+    a translation. The derivative by a point in the camera's frame is OpenCV's by the translation.
+    The camera's numbers are fx, fy, cx, cy and the coefficients.
+    """
+    turned, none = points @ rotation.T, np.zeros(3)
+    image, jacobian = cv2.projectPoints(
+        np.ascontiguousarray(turned + translation), none, none, cameras_of(camera, 1).matrix(0),
+        np.array(camera.distortion) if camera.distortion else None,
+    )
+    slopes = np.asarray(jacobian, dtype=np.float64)
+    by_point = slopes[:, 3:6].reshape(-1, 2, 3)
+    by_turn = np.cross(turned[:, None, :], by_point)
+    return (
+        np.asarray(image, dtype=np.float64).reshape(-1, 2),
+        np.concatenate([by_turn, by_point], axis=2).reshape(-1, 6),
+        slopes[:, 6 : 10 + len(camera.distortion)],
     )
 
 
-def cameras_of(lens: Lens, count: int) -> Cameras:
+def cameras_of(camera: Calibration, count: int) -> Cameras:
     """Return ``count`` equal cameras as solvers take them."""
-    matrix, packed = lens.matrix, pack(tuple(lens.distortion.tolist()))
-    view = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    view, packed = np.array([getattr(camera, name) for name in VIEW]), pack(camera.distortion)
     return Cameras(
         np.repeat(view[None], count, axis=0), np.repeat(packed[None], count, axis=0),
         np.full(count, bool(packed[:14].any())),
@@ -131,7 +114,7 @@ class FittedPose(NamedTuple):
 
 
 def fit_pose(
-    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats,
+    camera: Calibration, points: Floats, pixels: Floats, rotation: Floats, translation: Floats,
     used: Masks | None = None,
 ) -> FittedPose | None:
     """Return the pose of least squares from a start; None without 4 points, or if it diverges.
@@ -142,7 +125,7 @@ def fit_pose(
 
     Parameters
     ----------
-    lens
+    camera
         The camera.
     points, pixels
         (n, 3) m and (n, 2) px.
@@ -155,11 +138,11 @@ def fit_pose(
     for last in ((False, False, True) if used is None else (True,)):
         if chosen.sum() < 4:
             return None
-        solved = _gauss_newton(lens, points[chosen], pixels[chosen], rotation, translation)
+        solved = _gauss_newton(camera, points[chosen], pixels[chosen], rotation, translation)
         if solved is None:
             return None
         rotation, translation, covariance = solved
-        residuals = lens.project(points, rotation, translation) - pixels
+        residuals = project(camera, points, rotation, translation) - pixels
         if not last:
             length = np.linalg.norm(residuals, axis=1)
             # The median length of a two-dimensional normal residual is 1.177 standard deviations.
@@ -169,11 +152,11 @@ def fit_pose(
 
 
 def _gauss_newton(
-    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
+    camera: Calibration, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
     """Return rotation, translation and covariance; None if the steps diverge."""
     for _ in range(MAX_STEPS):
-        image, design, _ = lens.derivatives(points, rotation, translation)
+        image, design, _ = derivatives(camera, points, rotation, translation)
         residual = (pixels - image).ravel()
         if not (np.isfinite(design).all() and np.isfinite(residual).all()):
             return None
@@ -192,13 +175,13 @@ def _gauss_newton(
     return None
 
 
-def fitted_board(lens: Lens, found: FoundCorners) -> FittedPose | None:
+def fitted_board(camera: Calibration, found: FoundCorners) -> FittedPose | None:
     """Return a board's pose; None with too few corners."""
     if len(found.points) < MIN_CORNERS:
         return None
-    guard = GuardedPoints.of(found.points, found.pixels, cameras_of(lens, 1))
+    guard = GuardedPoints.of(found.points, found.pixels, cameras_of(camera, 1))
     fits = [
-        fit_pose(lens, found.points, found.pixels, *start)
+        fit_pose(camera, found.points, found.pixels, *start)
         for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE) for start in guard.poses(method)
     ]
     good = [fit for fit in fits if fit is not None and fit.used.sum() >= MIN_CORNERS]
@@ -217,8 +200,8 @@ ORTHOGONAL = 1e-3
 class StereoCamera(NamedTuple):
     """Two cameras: a point X in the left one's frame is ``rotation @ X + translation`` (m)."""
 
-    left: Lens
-    right: Lens
+    left: Calibration
+    right: Calibration
     rotation: Floats
     translation: Floats
 
@@ -244,7 +227,7 @@ def camera_of_file(written: str, size: tuple[int, int] | None = None) -> Calibra
     return calibration
 
 
-def stereo_of_file(written: str, size: tuple[int, int]) -> tuple[StereoCamera, list[Calibration]]:
+def stereo_of_file(written: str, size: tuple[int, int]) -> StereoCamera:
     """Return the two cameras of a file with K1, D1, K2, D2, R and T, as OpenCV names them.
 
     Raises
@@ -254,16 +237,16 @@ def stereo_of_file(written: str, size: tuple[int, int]) -> tuple[StereoCamera, l
     """
     with _reading("stereo", written, "a file with K1, D1, K2, D2, R and T of two cameras"):
         tree = read_tree(read_regular(written, MAX_BYTES))
-        cameras = [calibration_of(tree, name) for name in ("1", "2")]
+        left, right = (calibration_of(tree, name) for name in ("1", "2"))
         rotation = _numbers(tree, "R", 9, "the rotation").reshape(3, 3)
         translation = _numbers(tree, "T", 3, "the translation, in metres,")
         error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
         if not error < ORTHOGONAL or np.linalg.det(rotation) < 0:
             raise ValueError("R: expected a rotation matrix")
-    for each in cameras:
+    for each in (left, right):
         _check_size("stereo", written, each, size)
     u, _, vt = np.linalg.svd(rotation)
-    return StereoCamera(lens_of(cameras[0]), lens_of(cameras[1]), u @ vt, translation), cameras
+    return StereoCamera(left, right, u @ vt, translation)
 
 
 def covariance_of(calibration: Calibration) -> Floats | None:
@@ -336,7 +319,7 @@ SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "
 
 
 def check_resolution(
-    written: str, lens: Lens, size: Integers, found: Sequence[FoundCorners], rms_px: float
+    written: str, camera: Calibration, size: Integers, found: Sequence[FoundCorners], rms_px: float
 ) -> None:
     """Refuse a camera of a file that fits the board far better in another resolution.
 
@@ -344,7 +327,7 @@ def check_resolution(
     ----------
     written
         The file.
-    lens, size
+    camera, size
         The camera, and the photographs' width and height in px.
     found
         The board's corners in each photograph.
@@ -359,8 +342,8 @@ def check_resolution(
     if rms_px < DOUBTFUL_PX:
         return
     best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
-    own = _median_rms(lens, best)
-    fitting = {scale: _median_rms(scaled(lens, float(scale)), best) for scale in SCALES}
+    own = _median_rms(camera, best)
+    fitting = {scale: _median_rms(scaled(camera, float(scale)), best) for scale in SCALES}
     scale = min(fitting, key=lambda each: fitting[each])
     if fitting[scale] < CLEARLY_BETTER * own:
         raise ArgumentError(
@@ -371,20 +354,21 @@ def check_resolution(
         )
 
 
-def scaled(lens: Lens, scale: float) -> Lens:
+def scaled(camera: Calibration, scale: float) -> Calibration:
     """Return the camera of images that are ``scale`` times as large; pixels' edges lie at halves.
 
-    >>> scaled(Lens.of(100.0, 100.0, 9.5, 7.5, ()), 2.0).matrix[0].tolist()
-    [200.0, 0.0, 19.5]
+    >>> scaled(Calibration(20, 16, 100.0, 100.0, 9.5, 7.5, (), (), ()), 2.0).cx_px
+    19.5
     """
-    matrix = lens.matrix.copy()
-    matrix[:2] *= scale
-    matrix[:2, 2] += (scale - 1.0) / 2.0
-    return Lens(matrix, lens.distortion)
+    shift = (scale - 1.0) / 2.0
+    return replace(
+        camera, fx_px=scale * camera.fx_px, fy_px=scale * camera.fy_px,
+        cx_px=scale * camera.cx_px + shift, cy_px=scale * camera.cy_px + shift,
+    )
 
 
-def _median_rms(lens: Lens, found: Sequence[FoundCorners]) -> float:
-    fits = [fitted_board(lens, each) for each in found]
+def _median_rms(camera: Calibration, found: Sequence[FoundCorners]) -> float:
+    fits = [fitted_board(camera, each) for each in found]
     return float(np.median([np.inf if fit is None else fit.rms_px for fit in fits]))
 
 
@@ -444,7 +428,9 @@ def calibrate(
     if fault:
         raise ArgumentError("camera", "calibrate", fault)
     fx, fy, cx, cy, *distortion = made.values.tolist()
-    lens = Lens.of(fx, fy, cx, cy, tuple(distortion))
+    camera = Calibration(
+        *size, fx, fy, cx, cy, tuple(distortion), tuple(made.std.tolist()), ()
+    )
     numbers = ", ".join(
         f"{name} {value:.1f} ± {sd:.1f}"
         for name, value, sd in zip(("fx", "fy", "cx", "cy"), made.values, made.std, strict=False)
@@ -453,14 +439,13 @@ def calibrate(
         f"camera: calibrated from {made.views} photographs, {made.rms_px:.2f} px RMS: {numbers} px "
         "(standard deviations; truth_std has of them what truth and estimates do not share)"
     )
-    covariance = _covariance(lens, [used[i] for i in made.used], made)
-    return Calibration(
-        *size, fx, fy, cx, cy, tuple(distortion), tuple(made.std.tolist()),
-        tuple(covariance.ravel().tolist()),
-    ), line
+    covariance = _covariance(camera, [used[i] for i in made.used], made)
+    return replace(camera, covariance=tuple(covariance.ravel().tolist())), line
 
 
-def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:
+def _covariance(
+    camera: Calibration, used: Sequence[FoundCorners], made: intrinsics.Intrinsics
+) -> Floats:
     """Return the covariance (9, 9) of the camera's numbers beside the photographs' poses.
 
     By least squares with the residuals' variance: the inverse of the Schur complement of the
@@ -471,9 +456,12 @@ def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intri
     squares, count = 0.0, 0
     rotations = rotation_of_vector(made.turns)
     for found, rotation, shift in zip(used, rotations, made.shifts, strict=True):
-        image, pose, camera = lens.derivatives(found.points * [1.0, -1.0, -1.0], rotation, shift)
-        cross = pose.T @ camera
-        information += camera.T @ camera - cross.T @ np.linalg.solve(pose.T @ pose, cross)
+        image, by_pose, by_camera = derivatives(
+            camera, found.points * [1.0, -1.0, -1.0], rotation, shift
+        )
+        cross = by_pose.T @ by_camera
+        pose = np.linalg.solve(by_pose.T @ by_pose, cross)
+        information += by_camera.T @ by_camera - cross.T @ pose
         squares += float(((image - found.pixels) ** 2).sum())
         count += 2 * len(found.points) - 6
     scale = np.sqrt(np.diag(information))  # the numbers' units differ by many powers of ten

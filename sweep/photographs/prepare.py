@@ -31,7 +31,6 @@ from sweep.photographs.cameras import (
     calibrate,
     camera_of_file,
     check_resolution,
-    lens_of,
     stereo_of_file,
 )
 from sweep.photographs.folder import (
@@ -131,7 +130,8 @@ def prepare(
         for each, one in zip(first.photographs, seen[0], strict=True)
     ]
     if stereo is not None:
-        rig, cameras = stereo_of_file(str(stereo), first.size)
+        rig = stereo_of_file(str(stereo), first.size)
+        cameras = [rig.left, rig.right]
     else:
         calibration, said = _camera(first, camera, corners)
         rig, cameras, lines = None, [calibration], lines + said
@@ -140,13 +140,12 @@ def prepare(
         _without_truth(folder, part, sizes, described, Path(home))
         for folder, part in zip(found, parts, strict=True)
     ][: 1 if one_camera else None]
-    lens = lens_of(cameras[0])
     if poses is not None:
-        lines += poses_of_file(records[0], Path(poses), lens, sizes_m, seen[0])
+        lines += poses_of_file(records[0], Path(poses), cameras[0], sizes_m, seen[0])
     elif target is not None and (rig is None or one_camera):
         lines += _poses_of_board(records[0], cameras[0], camera, target, corners)
     elif rig is None:
-        own_poses(records[0], lens, sizes_m, seen[0])
+        own_poses(records[0], cameras[0], sizes_m, seen[0])
     else:
         for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=False)):
             partner_poses(record, one, sizes_m, seen[k], seen[1 - k])
@@ -284,7 +283,7 @@ def _poses_of_board(
         return []
     rms = float(np.median([each.rms_px for each in boards]))
     if written is not None and str(written) != CALIBRATE:
-        check_resolution(str(written), lens_of(camera), record.size, corners, rms)
+        check_resolution(str(written), camera, record.size, corners, rms)
     line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
     return [line if np.isnan(halves) else (
         f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "

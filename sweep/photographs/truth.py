@@ -22,13 +22,13 @@ from sweep.photographs.board_view import FoundCorners, own_corners
 from sweep.photographs.cameras import (
     MIN_CORNERS,
     FittedPose,
-    Lens,
     StereoCamera,
     cameras_of,
     covariance_of,
+    derivatives,
     fit_pose,
     fitted_board,
-    lens_of,
+    project,
 )
 from sweep.photographs.folder import SeenMarkers
 from sweep.typing import Floats, Masks
@@ -46,11 +46,12 @@ def put(
 
 
 def are_within(
-    record: PhotographRecord, lens: Lens, corners: Floats, rotation: Floats, translation: Floats
+    record: PhotographRecord, camera: Calibration, corners: Floats, rotation: Floats,
+    translation: Floats,
 ) -> Masks:
     """Return which markers (M,), of corners (M, 4, 3), are wholly in the frame at a pose."""
     points = corners.reshape(-1, 3)
-    pixels = lens.project(points, rotation, translation)
+    pixels = project(camera, points, rotation, translation)
     inside = ((pixels >= -0.5) & (pixels <= record.size - 0.5)).all(axis=1)
     before = (points @ rotation.T + translation)[:, 2] > 0
     return np.asarray((inside & before).reshape(-1, 4).all(axis=1))
@@ -70,13 +71,13 @@ MAD_TO_STD = 1.4826
 
 
 def own_poses(
-    record: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+    record: PhotographRecord, camera: Calibration, sizes_m: Floats, seen: Sequence[SeenMarkers]
 ) -> None:
     """Write the poses of markers, of sides (M,), by their own corners."""
     for photograph, one in enumerate(seen):
         marker, quads = one.among(record.marker_id)
         rotation, translation = both_planar_solutions(
-            quads, cameras_of(lens, len(quads)), sizes_m[marker]
+            quads, cameras_of(camera, len(quads)), sizes_m[marker]
         )
         for k, number in enumerate(marker.tolist()):
             if np.isfinite(rotation[k, 0]).all() and translation[k, 0, 2] > 0:
@@ -138,10 +139,10 @@ def partner_poses(
 
 
 def _errors(
-    lens: Lens, quads: Floats, sides: Floats, rotation: Floats, translation: Floats
+    camera: Calibration, quads: Floats, sides: Floats, rotation: Floats, translation: Floats
 ) -> Floats:
     """Return the RMS reprojection errors (k, 2) of two poses each, px; NaN for none."""
-    cameras = cameras_of(lens, len(quads))
+    cameras = cameras_of(camera, len(quads))
     return np.stack([
         reprojection_errors_px(rotation[:, j], translation[:, j], sides, quads, cameras)
         for j in range(2)
@@ -159,7 +160,8 @@ OTHER_UNIT = 1.5
 
 
 def poses_of_file(
-    record: PhotographRecord, path: Path, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+    record: PhotographRecord, path: Path, camera: Calibration, sizes_m: Floats,
+    seen: Sequence[SeenMarkers],
 ) -> list[str]:
     """Write a file's poses of markers wholly in their photographs; return lines on them.
 
@@ -190,13 +192,13 @@ def poses_of_file(
         ):
             place = photograph, number[marker_id]
             put(record, place, rotation, translation, TruthSource.poses_file)
-        faults += _faults(record, lens, sizes_m, seen)
+        faults += _faults(record, camera, sizes_m, seen)
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])
     given = np.argwhere(record.shown).tolist()
     for photograph, k in given:
         pose = record.rotation[photograph, k], record.translation[photograph, k]
-        if not are_within(record, lens, marker_corners(sizes_m[k : k + 1]), *pose)[0]:
+        if not are_within(record, camera, marker_corners(sizes_m[k : k + 1]), *pose)[0]:
             record.translation[photograph, k] = np.nan
     cut = len(given) - int(record.shown.sum())
     line = f"{cut:,} poses of markers that are not wholly in the frame: not counted"
@@ -204,7 +206,7 @@ def poses_of_file(
 
 
 def _faults(
-    record: PhotographRecord, lens: Lens, sizes_m: Floats, seen: Sequence[SeenMarkers]
+    record: PhotographRecord, camera: Calibration, sizes_m: Floats, seen: Sequence[SeenMarkers]
 ) -> list[str]:
     """Return the fault of poses that are not where markers are detected, if there is one."""
     ratios, distances = [], []
@@ -214,7 +216,7 @@ def _faults(
                 continue
             points = marker_corners(sizes_m[k : k + 1])[0]
             pose = record.rotation[photograph, k], record.translation[photograph, k]
-            pixels, side = lens.project(points, *pose), side_lengths(quad[None]).mean()
+            pixels, side = project(camera, points, *pose), side_lengths(quad[None]).mean()
             behind = ((points @ pose[0].T + pose[1])[:, 2] <= 0).any()
             away = np.linalg.norm(pixels - quad, axis=1).max()
             distances.append(np.inf if behind else float(away) / side)
@@ -266,9 +268,9 @@ def board_poses(
         The root mean square of the differences between the poses of two halves of the corners,
         over the prediction from the residuals' variance; NaN if no photograph has corners enough.
     """
-    lens, camera_covariance = lens_of(camera), covariance_of(camera)
-    boards = [fitted_board(lens, each) for each in found]
-    ratio = _halves_ratio(lens, boards, found, 1 if len(board.chessboard_m) else 4)
+    camera_covariance = covariance_of(camera)
+    boards = [fitted_board(camera, each) for each in found]
+    ratio = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     frames = [marker_frame(each)[1] for each in board.corners_m]
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
@@ -276,12 +278,12 @@ def board_poses(
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
         if pose is None:
             continue
-        shown = are_within(record, lens, board.corners_m, pose.rotation, pose.translation)
+        shown = are_within(record, camera, board.corners_m, pose.rotation, pose.translation)
         for k in np.flatnonzero(shown).tolist():
             without = pose.used & ~np.isin(corners.number, own[k])
             axes, centre = frames[k]
             fitted = fit_pose(
-                lens, (corners.points - centre) @ axes, corners.pixels, pose.rotation @ axes,
+                camera, (corners.points - centre) @ axes, corners.pixels, pose.rotation @ axes,
                 pose.rotation @ centre + pose.translation, without,
             ) if without.sum() >= MIN_CORNERS else None
             if fitted is None:
@@ -289,7 +291,7 @@ def board_poses(
             variance = raised**2 * np.diag(fitted.covariance)
             if camera_covariance is not None:
                 variance = variance + unshared_variance(
-                    lens, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
+                    camera, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
                     (board.corners_m[k] - centre) @ axes,
                 )
             put(record, (photograph, column[k]), fitted.rotation, fitted.translation,
@@ -298,7 +300,7 @@ def board_poses(
 
 
 def unshared_variance(
-    lens: Lens, camera_covariance: Floats, pose: FittedPose, points: Floats, own: Floats
+    camera: Calibration, camera_covariance: Floats, pose: FittedPose, points: Floats, own: Floats
 ) -> Floats:
     """Return the variances (6,) of a pose by errors of the camera that the estimates do not share.
 
@@ -307,7 +309,7 @@ def unshared_variance(
     """
     by_points, by_own = (
         np.linalg.lstsq(by_pose, by_camera, rcond=None)[0] for _, by_pose, by_camera in (
-            lens.derivatives(each, pose.rotation, pose.translation) for each in (points, own)
+            derivatives(camera, each, pose.rotation, pose.translation) for each in (points, own)
         )
     )
     change = np.asarray(by_points - by_own, dtype=np.float64)
@@ -315,7 +317,8 @@ def unshared_variance(
 
 
 def _halves_ratio(
-    lens: Lens, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners], together: int
+    camera: Calibration, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners],
+    together: int,
 ) -> float:
     """Return how far the poses of two halves differ, in predicted standard deviations.
 
@@ -328,7 +331,7 @@ def _halves_ratio(
             continue
         first, centre = (corners.number // together) % 2 == 0, corners.points.mean(axis=0)
         one, other = (
-            fit_pose(lens, corners.points - centre, corners.pixels, pose.rotation,
+            fit_pose(camera, corners.points - centre, corners.pixels, pose.rotation,
                      pose.rotation @ centre + pose.translation, half & pose.used)
             if (half & pose.used).sum() >= MIN_HALF else None for half in (first, ~first)
         )

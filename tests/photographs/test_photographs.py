@@ -24,8 +24,15 @@ from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
+from sweep.model.calibration import Calibration
 from sweep.photographs.board_view import FoundCorners
-from sweep.photographs.cameras import Lens, calibrate, camera_of_file, covariance_of, fit_pose
+from sweep.photographs.cameras import (
+    calibrate,
+    camera_of_file,
+    covariance_of,
+    fit_pose,
+    project,
+)
 from sweep.photographs.prepare import prepare
 from sweep.photographs.truth import unshared_variance
 from sweep.photographs.twins import twin_pipeline
@@ -238,14 +245,14 @@ def test_only_photographs_have_twins(prepared):
             twins.to_toml() + "\n[pose]\ndistance_m = 1\n", folder=prepared.folder)
 
 
-LENS = Lens.of(*VIEW, (0.1, -0.2, 0.001, -0.001, 0.05))
+CAMERA = Calibration(*SIZE, *VIEW, (0.1, -0.2, 0.001, -0.001, 0.05), (), ())
 
 
 def seen(number, rng, sd_px):
     """Return the chessboard's corners in a photograph, with an error."""
     turn, shift = POSES[number]
     points = board().chessboard_m
-    pixels = LENS.project(points, turn, np.array(shift)) + rng.normal(0, sd_px, (len(points), 2))
+    pixels = project(CAMERA, points, turn, np.array(shift)) + rng.normal(0, sd_px, (len(points), 2))
     return FoundCorners(points, pixels, np.arange(len(points)))
 
 
@@ -279,13 +286,13 @@ def test_what_truth_and_estimates_do_not_share_is_that_of_fitted_poses(number):
     centre = own.mean(axis=0)
     own, others = own - centre, board().chessboard_m - centre
     position = turn @ centre + shift
-    pixels = [LENS.project(points, turn, position) for points in (own, others)]
-    pose = fit_pose(LENS, others, pixels[1], turn, position)
-    predicted = np.sqrt(unshared_variance(LENS, covariance, pose, others, own))
+    pixels = [project(CAMERA, points, turn, position) for points in (own, others)]
+    pose = fit_pose(CAMERA, others, pixels[1], turn, position)
+    predicted = np.sqrt(unshared_variance(CAMERA, covariance, pose, others, own))
     errors = []
     for _ in range(200):
-        numbers = np.array([*VIEW, *LENS.distortion]) + factor @ rng.normal(size=9)
-        wrong = Lens.of(*numbers[:4], tuple(numbers[4:]))
+        numbers = np.array([*VIEW, *CAMERA.distortion]) + factor @ rng.normal(size=9)
+        wrong = Calibration(*SIZE, *numbers[:4], tuple(numbers[4:]), (), ())
         alone, truth = (
             fit_pose(wrong, points, image, turn, position, np.ones(len(points), dtype=bool))
             for points, image in zip((own, others), pixels, strict=True)

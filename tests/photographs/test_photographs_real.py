@@ -71,7 +71,7 @@ def test_poses_from_pixels_agree_between_both_cameras(tmp_path):
     results = sweep.photos(
         file.parent, stereo=file, board=board, store=tmp_path / "grid.zarr", settings=PIXELS,
     ).load()
-    stereo, _ = stereo_of_file(str(file), (1280, 720))
+    stereo = stereo_of_file(str(file), (1280, 720))
     detected = (results.detection == DetectionStatus.detected).values
     flags = results.estimate.sel(solver="photometric_real")
     solved = (flags == EstimateStatus.solved).values

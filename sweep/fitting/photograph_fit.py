@@ -180,7 +180,8 @@ def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
     return FittedMarker(
         shown, box.levels, used, ends, sides, ends_at, 0.5 + (0.5 + ring / modules) * box.at,
         corners - frame_px, modules, float(side_lengths(corners[None]).mean()) / modules,
-        (overhang(marker.dictionary) + 0.5) / modules, frame_px, _along(image, shown.pixels(beyond)),
+        (overhang(marker.dictionary) + 0.5) / modules, frame_px,
+        _along(image, shown.pixels(beyond)),
     )
 
 

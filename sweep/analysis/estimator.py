@@ -1224,7 +1224,12 @@ def _column(
     """
     # Of dimensions that make an axis together an array has all, or is repeated along all.
     own = {axis: part for axis, part in axes.items() if set(part) & set(array.dims)}
-    variable: Any = xr.Variable(array.dims, array.to_numpy())
+    try:
+        read = array.to_numpy()
+    except (RuntimeError, ValueError) as error:  # Zarr's, of a chunk that is damaged
+        raise DatasetError(
+            f"a store cannot be read: {error}; `sweep verify` names what is damaged") from None
+    variable: Any = xr.Variable(array.dims, read)
     variable = variable.set_dims(
         dict(variable.sizes) | {name: sizes[name] for part in own.values() for name in part})
     variable = variable.stack(own)

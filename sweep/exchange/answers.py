@@ -127,8 +127,8 @@ def _text(path: Path, source: str) -> str:
     """Return a file's text in any encoding that a byte order mark names, else UTF-8."""
     try:
         content = path.read_bytes()
-        utf_16 = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-        return content.decode("utf-16" if utf_16 else "utf-8-sig")
+        return content.decode(
+            "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise refusal([f"{source}: not text ({error.reason}); expected CSV"]) from None
     except OSError as error:

@@ -191,7 +191,6 @@ def truth_of(images: Images) -> Truth:
     }
     view = scenes.cameras.view
     of_image = pd.DataFrame({
-        "image": arrays["image"],
         **_columns(POSE, np.hstack([arrays["true_rvec"], scenes.translation])),
         "size_m": scenes.size_m,
         **_columns(("width_px", "height_px"), images.windows[:, 2:] - first),
@@ -208,34 +207,29 @@ def truth_of(images: Images) -> Truth:
     } | drawn
     of_image = of_image.assign(**{
         name: varying[name] for name in varying
-        if name not in (*of_image, "marker_id", "dictionary")})
-
-    def repeated(rows: Integers, own: dict[str, Any], what: slice) -> pd.DataFrame:
-        """Return images with columns of their own behind the first, the image's name."""
-        chosen = of_image.iloc[rows, what].reset_index(drop=True)
-        return pd.concat([chosen[["image"]], pd.DataFrame(own), chosen.iloc[:, 1:]], axis=1)
-
+        if name not in (*of_image, "image", "marker_id", "dictionary")})
     row, square = np.nonzero(batch.visible[:, None] & (targets.marker_id >= 0))
     places = [
         targets.targets[i].corners_m[k]
         * (scenes.size_m[i] if targets.targets[i].is_marker else 1.0)
         for i, k in zip(row.tolist(), square.tolist(), strict=True)
     ]
-    squares = repeated(row, {
-        "id": targets.marker_id[row, square],
+    squares = pd.DataFrame({
+        "image": arrays["image"][row], "id": targets.marker_id[row, square],
         "dictionary": [targets.targets[i].dictionary for i in row.tolist()],
         **_columns(CORNERS, targets.corners_px[row, square] - first[row, None]),
         "visible": (targets.flags[row, square] == DetectionStatus.not_run).astype(np.int64),
         **_columns(PLACES, np.array(places)),
-    }, slice(None))
+    }).join(of_image.iloc[row].reset_index(drop=True))
     pixels = targets.chessboard_px - first[:, None]
     row, corner = np.nonzero(batch.visible[:, None] & np.isfinite(pixels[..., 0]))
     places = [targets.targets[i].chessboard_m[k]
               for i, k in zip(row.tolist(), corner.tolist(), strict=True)]
-    chessboards = repeated(row, {
-        "corner": corner, **_columns(("x", "y"), pixels[row, corner]),
+    chessboards = pd.DataFrame({
+        "image": arrays["image"][row], "corner": corner,
+        **_columns(("x", "y"), pixels[row, corner]),
         **_columns(("X_m", "Y_m", "Z_m"), np.array(places)),
-    }, slice(1))
+    })
     return Truth(arrays, squares, chessboards)
 
 

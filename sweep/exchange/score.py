@@ -203,14 +203,12 @@ def prepare(
     labels = _labels(files, names)
     images = _Images.of(Path(folder))
     answers = [read_answers(Path(path), images.index, conventions, doubled) for path in files]
-    lines = []
-    for label, each in zip(labels, answers, strict=True):
-        lines += [f"{label}: {line}" for line in (
-            _summary(each, len(images.index)),
-            *hints(each.corners, images.truth(each), conventions))]
-    home = Path(folder) / export.EXPERIMENT
+    home, lines = Path(folder) / export.EXPERIMENT, []
     with translate_errors(plain(home, 300), "written"):
         for label, each in zip(labels, answers, strict=True):
+            lines += [f"{label}: {line}" for line in (
+                _summary(each, len(images.index)),
+                *hints(each.corners, images.truth(each), conventions))]
             path, content = home / f"{label}{SUFFIX}", RECORDINGS.content(images.recording(each))
             if path.exists() and path.read_bytes() != content:
                 raise StoreError(
@@ -256,20 +254,18 @@ def _pipeline(
 ) -> Pipeline:
     """Return the export's pipeline with recorded detections in the place of its detector."""
     detectors = [f"{label}{SUFFIX}" for label in labels]
-    document = tomlkit.parse(exported.text)
-    replaced = [exported.axis_of("detector")]
     if beside:
         detectors = [*map(str, exported.values_of("detector")), *detectors]
-    else:
+    ours = {"detector": detectors if len(detectors) > 1 else detectors[0]} | (
+        {"solver": "recorded"} if posed and not beside else {})
+    document = tomlkit.parse(exported.text)
+    if not beside:
         document.pop("detector", None)
-        replaced += exported.axes_of(Stage.detection)
-    ours = [f"detector={json.dumps(detectors if len(detectors) > 1 else detectors[0])}"]
-    if posed and not beside:
-        replaced.append(exported.axis_of("solver"))
-        ours.append('solver="recorded"')
     axes: Any = document.get("axes", {})
-    for name in {axis.name for axis in replaced if axis is not None} & axes.keys():
-        del axes[name]
+    for axis in exported.axes:
+        if ours.keys() & axis.columns.keys() or (axis.stage is Stage.detection and not beside):
+            axes.pop(axis.name, None)
+    chosen = [f"{name}={json.dumps(value)}" for name, value in ours.items()]
     return Pipeline.from_text(
-        tomlkit.dumps(document), [*ours, *settings], name=labels[0],
+        tomlkit.dumps(document), [*chosen, *settings], name=labels[0],
         source=str(home / "pipeline.toml"), folder=home)

@@ -104,8 +104,10 @@ def _local_cluster(workers: int) -> LocalCluster:
     ever.
     """
     environment = dask.config.get("distributed.nanny.pre-spawn-environ") | SINGLE_THREADED
+    routes = [*dask.config.get("distributed.scheduler.http.routes")]  # without Bokeh, Dask adds one
     try:
-        with dask.config.set({"distributed.nanny.pre-spawn-environ": environment}):
+        with dask.config.set({"distributed.nanny.pre-spawn-environ": environment,
+                              "distributed.scheduler.http.routes": routes}):
             return LocalCluster(
                 n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
                 dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)

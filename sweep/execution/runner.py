@@ -209,6 +209,9 @@ def _check_arguments(
         raise ArgumentError("workers", workers, "expected at least 1")
     if scheduler is not None and client is not None:
         raise ArgumentError("scheduler", scheduler, "expected no client beside it")
+    if scheduler is not None and ":" not in scheduler and scheduler != "local":
+        raise ArgumentError(
+            "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
     for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
         if seconds is not None and not 0 < seconds < math.inf:
             raise ArgumentError(name, seconds, "expected seconds above 0")

@@ -162,24 +162,21 @@ def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:
     DatasetError
         If the dataset lacks variables, or has no poses.
     """
-    names = as_names(per)
+    names = tuple(dict.fromkeys(as_names(per)))
     require_poses(results)
     axes = axes_of(results)
-    missing = [name for name in dict.fromkeys(names) if name not in axes]
-    drawn = [name for name in missing
-             if name in results.coords and DRAWS in results[name].dims and name != DRAWS]
-    if drawn:
-        raise ArgumentError(
-            "per", ", ".join(drawn), "is drawn in this store, which has no axis of it: run it with "
-            f'{drawn[0]} = [...] under [axes], or, in Python, give bins={{"{drawn[0]}": [...]}}')
-    for name in missing:
+    for name in names:
+        if name in axes:
+            continue
         along = results[name].dims if name in results.coords else ()
-        if len(along) == 1 and along[0] in axes:
-            raise ArgumentError("per", name, f"goes with the axis {along[0]}: name that")
-    if missing:
-        raise ArgumentError("per", ", ".join(missing),
-                            f"no such dimension; there are {', '.join(axes) or 'none'}")
-    return tuple(dict.fromkeys(names))
+        problem = f"no such dimension; there are {', '.join(axes) or 'none'}"
+        if DRAWS in along:
+            problem = ("is drawn in this store, which has no axis of it: run it with "
+                       f'{name} = [...] under [axes], or, in Python, give bins={{"{name}": [...]}}')
+        elif len(along) == 1:
+            problem = f"goes with the axis {along[0]}: name that"
+        raise ArgumentError("per", name, problem)
+    return names
 
 
 def require_poses(results: xr.Dataset) -> None:
@@ -278,7 +275,7 @@ def replicate_order(results: xr.Dataset, draws: Sequence[str]) -> NDArray[np.int
     trials = results[DRAWS].to_numpy().astype(np.int64)
     replicate = trials % REPLICATES
     counts = np.bincount(replicate, minlength=REPLICATES)
-    if len(set(counts.tolist())) > 1:
+    if np.ptp(counts):
         raise DatasetError(
             f"{DRAWS}: not equally many of each of the {REPLICATES} replicates of Sobol' points "
             f"(sampling = sobol); keep a multiple of {REPLICATES} in a row, from a multiple of "

@@ -75,9 +75,6 @@ MAX_THREADS = 4
 #: Settings up to which they are summed one by one, for NumPy's loop along a short axis is slow.
 MAX_SLICES = 8
 
-#: Axes of cells, draws and settings.
-OVER_ALL = (1, 2, 3)
-
 
 class Columns(Generic[ViewT]):
     """The poses of some groups, read in blocks along groups, cells and draws.

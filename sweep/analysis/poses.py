@@ -555,9 +555,8 @@ def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
     if names is None:
         return list(QUANTITIES)
     known = {name: (each,) for name, each in ALL_QUANTITIES.items()} | SIGNED
-    if isinstance(names, str):
-        names = (names,)
-    if not isinstance(names, Iterable) or not (wanted := list(names)):
+    wanted = [names] if isinstance(names, str) else [*names] if isinstance(names, Iterable) else []
+    if not wanted:
         raise ArgumentError("quantities", names, f"expected some of {', '.join(known)}")
     for name in wanted:
         if name not in known:

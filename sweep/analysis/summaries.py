@@ -362,8 +362,8 @@ def hypergeometric_moments(
         mean = n * all_hits / total
         variance = mean * (total - all_hits) * (total - n) / (total * (total - 1.0))
         third = variance * (total - 2 * all_hits) * (total - 2 * n) / (total * (total - 2.0))
-    return (np.where(total > 0, mean, 0.0), np.where(total > 1, variance, 0.0),
-            np.where(total > 2, third, 0.0))
+    # Of too few draws they are 0 over 0.
+    return np.nan_to_num(mean), np.nan_to_num(variance), np.nan_to_num(third)
 
 
 def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:

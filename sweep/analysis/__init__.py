@@ -10,8 +10,8 @@ from __future__ import annotations
 from sweep.analysis.ambiguities import ambiguity
 from sweep.analysis.camera_calibration import calibration_summary, camera_calibrations
 from sweep.analysis.comparisons import compare, renderer_bias, simulation_gap, store_differences
+from sweep.analysis.dataset import per_marker
 from sweep.analysis.error_models import error_models, model_covariance, model_errors
-from sweep.analysis.poses import per_marker
 from sweep.analysis.requirements import (
     check_requirements,
     detection_limit,

@@ -15,11 +15,14 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from sweep.analysis.dataset import (
+    ESTIMATE_INPUTS,
+    Poses,
     as_names,
     configuration_axes,
     describes,
     is_sampling_stopped,
     kept_dimensions,
+    pose_arrays,
     stacked,
 )
 from sweep.analysis.estimator import (
@@ -32,7 +35,6 @@ from sweep.analysis.estimator import (
     scaled_to_draws,
 )
 from sweep.analysis.intervals import TAIL, clopper_pearson
-from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.summaries import FLIPPED, SOLVED
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import cf_attributes

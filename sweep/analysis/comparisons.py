@@ -14,8 +14,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.dataset import (
+    ALL_QUANTITIES,
+    DETECTION_INPUTS,
     DRAWS,
+    ERROR_INPUTS,
+    INSIDE,
+    OF_MARKERS,
+    QUANTITIES,
     Labelled,
+    Poses,
+    Quantity,
     as_names,
     axes_of,
     configuration_axes,
@@ -28,8 +36,10 @@ from sweep.analysis.dataset import (
     is_sampling_stopped,
     kept_dimensions,
     largest_cell,
+    norm_squared,
     of_photographs,
     parameter_value,
+    pose_arrays,
     require_dimension,
     require_poses,
     stored_pipeline,
@@ -61,18 +71,6 @@ from sweep.analysis.intervals import (
     percentile_interval,
     resampled_quantiles,
     unit_counts,
-)
-from sweep.analysis.poses import (
-    ALL_QUANTITIES,
-    DETECTION_INPUTS,
-    ERROR_INPUTS,
-    INSIDE,
-    OF_MARKERS,
-    QUANTITIES,
-    Poses,
-    Quantity,
-    norm_squared,
-    pose_arrays,
 )
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import ArgumentError, DatasetError, SweepError

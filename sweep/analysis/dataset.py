@@ -1,4 +1,4 @@
-"""The parts of a dataset that analyses read: axes, draws, stored parameters, labels of flags."""
+"""What analyses read of a dataset: axes, draws, parameters, poses and their errors, flags."""
 
 from __future__ import annotations
 
@@ -6,29 +6,28 @@ import contextlib
 import functools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.poses import (
-    AXIS,
-    DETECTION_INPUTS,
-    ERROR_INPUTS,
-    NOT_AVAILABLE,
-    NOT_LOOKED_FOR,
-)
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.document import SEARCH, read_document
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
-from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
-from sweep.messages import shown
+from sweep.experiment.schema import FIXED, LABELS, SCHEMA, VARIABLES, XYZ, with_descriptions
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
+from sweep.messages import nearest, shown
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.model.pose import angle_between, rotation_of_vector
 from sweep.plugins.declared import recorded_plugins
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # The kinds of a dataset's dimensions, and which of them the caller keeps.
@@ -399,6 +398,552 @@ def _checked(sides: xr.DataArray) -> xr.DataArray:
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
                            "the distance and the camera")
     return without_fixed(sides)
+
+
+# --------------------------------------------------------------------------------------------------
+# The markers of boards as poses of their own: for rates and corners of each marker.
+
+#: The dimension of a board's markers where they are an axis.
+AXIS = "board_marker"
+
+#: Variable of boards -> its name where the markers are an axis.
+OF_MARKERS = {"marker_detection": "detection", "marker_corner_error_px": "corner_error_px"}
+
+#: Variables of the whole board that hold for each of its markers, too.
+OF_TARGETS = ("true_rvec", "true_tvec_m")
+
+
+def per_marker(results: xr.Dataset) -> xr.Dataset:
+    """Return the detections of a board's markers, each marker on its own.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run whose scenes show boards.
+
+    Returns
+    -------
+    xr.Dataset
+        The markers are the axis ``board_marker``, a marker's number on its board from 0 on: in
+        reading order, of an aprilgrid from the bottom left upwards, of ``[[board.markers]]`` as
+        listed. It is no ID: that is ``board_marker_id``. Lazy if ``results`` is.
+
+        - ``detection``: the flags of each marker, ``not_on_board`` (which no rate counts) where a
+          scene's board has fewer markers than another's.
+        - ``corner_error_px``: found corner minus true corner of the detected ones.
+        - ``board_marker_id``, and ``true_rvec`` and ``true_tvec_m`` of the board.
+
+        Estimates are the board's and are left out, as are bounds and the area.
+
+    Raises
+    ------
+    DatasetError
+        If the scenes show no boards.
+
+    Notes
+    -----
+    Markers of one image see the same draws. Where they are pooled they count as one draw, as
+    settings do (`sweep.analysis.estimator`), so that intervals of rates over all markers are right
+    however much neighbours fail together.
+
+    Examples
+    --------
+    >>> twice = xr.concat([results["detection"]] * 2, dim="marker").transpose(..., "marker")
+    >>> markers = per_marker(results.assign(marker_detection=twice))
+    >>> markers["detection"].dims[-1], markers["detection"].sizes["board_marker"]
+    ('board_marker', 2)
+    """
+    if "marker_detection" not in results:
+        raise DatasetError("no variable marker_detection: the scenes show no boards")
+    kept = [name for name in (*OF_TARGETS, "board_marker_id", *OF_MARKERS) if name in results]
+    markers = results[kept].rename({
+        "marker": AXIS, **{name: new for name, new in OF_MARKERS.items() if name in kept}
+    })
+    return markers.transpose(..., *(
+        dim for dim in ("corner", "xy", "xyz") if dim in markers.dims))
+
+
+# --------------------------------------------------------------------------------------------------
+# Errors of a pose along axes and about angles, signed: estimated minus true.
+#
+# R and t are the true rotation and position of the marker in the camera's frame, E the rotation
+# of the error and d the error of position as stored: the estimated pose is E · R, t + d.
+
+@dataclass(frozen=True)
+class SignedErrors:
+    """Errors of poses, each component an array (...).
+
+    Nothing cancels for small errors but the last digit of the true angle, and angles near 180
+    degrees are as exact as others (atan2). NaN if any input is.
+
+    Attributes
+    ----------
+    rvec, position_m
+        Rotation vectors (..., xyz) and positions of the truth, camera frame.
+    rotation_error_rad, position_error_m
+        Errors (..., xyz), camera frame: the rotation vector of E, and d.
+
+    Examples
+    --------
+    >>> frontal, quarter = np.array([np.pi, 0.0, 0.0]), np.array([0.0, 0.0, np.pi / 2])
+    >>> away = np.array([0.0, 0.0, 2.0])
+    >>> error = SignedErrors(frontal, away, quarter, np.array([0.0, 0.0, 0.5]))
+    >>> error.yaw_pitch_roll_deg.round(9) + 0.0, error.in_plane_deg.round(9)
+    (array([ 0.,  0., 90.]), np.float64(-90.0))
+    >>> error.of_camera_m.round(9) + 0.0
+    array([0. , 0. , 0.5])
+    """
+
+    rvec: Floats
+    position_m: Floats
+    rotation_error_rad: Floats
+    position_error_m: Floats
+
+    @cached_property
+    def in_camera_m(self) -> Floats:
+        """d, (..., xyz): the position's error along the axes of the camera."""
+        return np.asarray(self.position_error_m, dtype=np.float64)
+
+    @cached_property
+    def along_marker_m(self) -> Floats:
+        """Rᵀ d, (..., xyz): the position's error along the axes of the true marker."""
+        return self._in_marker_frame(self.in_camera_m)
+
+    @cached_property
+    def of_camera_m(self) -> Floats:
+        """Error (..., xyz) of the camera's position in the marker's frame.
+
+        The camera is at -Rᵀ t, a robot that knows the marker's place believes to be at
+        -(E R)ᵀ (t + d): the error is -Rᵀ (Eᵀ (t + d) - t).
+        """
+        moved = self.in_camera_m + self._turned(self.position_m + self.in_camera_m, -1.0)
+        return -self._in_marker_frame(moved)
+
+    @cached_property
+    def yaw_pitch_roll_deg(self) -> Floats:
+        """Differences (..., 3) of the angles of R = Ry(yaw) · Rx(pitch) · Rz(roll) · Rx(180°).
+
+        In [-180, 180]; yaw and roll are not defined at a pitch of 90 degrees.
+        """
+        return wrapped_deg(_angles(self._estimated) - _angles(self._rotation))
+
+    @cached_property
+    def tilt_deg(self) -> Floats:
+        """Difference (...) of the angles between the marker's plane and the image plane."""
+        optical_axis = np.array([0.0, 0.0, 1.0])
+        return self._difference(optical_axis, optical_axis)
+
+    @cached_property
+    def viewing_angle_deg(self) -> Floats:
+        """Difference (...) of the angles between the normal and the line of sight to the centre."""
+        return self._difference(self.position_m + self.in_camera_m, self.position_m)
+
+    @cached_property
+    def in_plane_deg(self) -> Floats:
+        """The part of E (...) about the true normal, in [-180, 180]: its twist.
+
+        With the quaternion (w, v) of E and the normal n it is 2 atan2(v · n, w), which is what is
+        left of E if the shortest rotation that moves the normal as E does comes after it:
+        Dobrowolski, "Swing-twist decomposition in Clifford algebra", arXiv:1506.05481, 2015.
+        """
+        error = np.asarray(self.rotation_error_rad, dtype=np.float64)
+        half = np.linalg.norm(error, axis=-1) / 2.0
+        along = (error * self._rotation[..., 2]).sum(axis=-1)
+        sine = along * np.sinc(half / np.pi) / 2.0  # sin(half) / angle is sinc / 2
+        return np.asarray(np.degrees(2.0 * np.arctan2(sine, np.cos(half))))
+
+    @cached_property
+    def _rotation(self) -> Floats:
+        """R, (..., 3, 3)."""
+        return rotation_of_vector(np.asarray(self.rvec, dtype=np.float64))
+
+    @cached_property
+    def _estimated(self) -> Floats:
+        """E · R, (..., 3, 3)."""
+        columns = np.swapaxes(self._rotation, -1, -2)
+        return np.swapaxes(columns + self._turned(columns, 1.0, inner=1), -1, -2)
+
+    def _in_marker_frame(self, vectors: Floats) -> Floats:
+        return np.asarray(np.einsum("...ij,...i->...j", self._rotation, vectors))
+
+    def _turned(self, vectors: Floats, sign: float, inner: int = 0) -> Floats:
+        """Return (E - 1) v, or (Eᵀ - 1) v for a sign of -1: Rodrigues' formula.
+
+        ``inner`` axes stand before the last of ``vectors``.
+        """
+        error = sign * np.asarray(self.rotation_error_rad, dtype=np.float64)
+        error = error.reshape(*error.shape[:-1], *[1] * inner, 3)
+        angle = np.linalg.norm(error, axis=-1, keepdims=True)
+        across = np.cross(error, vectors)
+        # sin(a) / a, and (1 - cos(a)) / a² without a difference
+        return np.asarray(np.sinc(angle / np.pi) * across
+                          + 0.5 * np.sinc(angle / (2.0 * np.pi))**2 * np.cross(error, across))
+
+    def _difference(self, estimated: Floats, true: Floats) -> Floats:
+        """Return the angle of the estimated normal to a direction minus the true normal's."""
+        return np.asarray(np.degrees(angle_between(self._estimated[..., 2], -estimated)
+                                     - angle_between(self._rotation[..., 2], -true)))
+
+
+def _angles(rotation: Floats) -> Floats:
+    """Return yaw, pitch and roll (..., 3) in radians, of R = Ry · Rx · Rz · Rx(180°)."""
+    across, down, along = rotation[..., 0, 2], rotation[..., 1, 2], rotation[..., 2, 2]
+    return np.stack([
+        np.arctan2(-across, -along), np.arctan2(down, np.hypot(across, along)),
+        np.arctan2(rotation[..., 1, 0], -rotation[..., 1, 1])], axis=-1)
+
+
+def wrapped_deg(angle: Floats) -> Floats:
+    """Return angles in radians as degrees in [-180, 180].
+
+    Examples
+    --------
+    >>> wrapped_deg(np.radians([-350.0, 180.0, 179.0])).round(9).tolist()
+    [10.0, 180.0, 179.0]
+    """
+    return np.degrees(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
+
+
+# --------------------------------------------------------------------------------------------------
+# The sight frame: the camera's frame, turned by the shortest way so that z is the line of sight.
+#
+# On the optical axis it is the camera's frame. Elsewhere the error along the line of sight, which
+# is by far the largest, would be in x and y of the camera in proportion to the bearing.
+
+def sight_rotation(position_m: Floats) -> Floats:
+    """Return the rotations Q (..., 3, 3) whose columns are the sight frame's axes in the camera's.
+
+    With the direction w = (a, b, c) to the marker and k = 1 / (1 + c) they are (1 - k a², -k a b,
+    -a), (-k a b, 1 - k b², -b) and w: the rotation of z to w about their cross product (Rodrigues).
+
+    Examples
+    --------
+    >>> sight_rotation(np.array([0.0, 3.0, 4.0])).round(3).tolist()
+    [[1.0, -0.0, 0.0], [-0.0, 0.8, 0.6], [-0.0, -0.6, 0.8]]
+    """
+    position_m = np.asarray(position_m, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        w = position_m / np.linalg.norm(position_m, axis=-1, keepdims=True)
+        a, b, c = w[..., 0], w[..., 1], w[..., 2]
+        k = 1.0 / (1.0 + c)
+        rows = [[1.0 - k * a * a, -k * a * b, a], [-k * a * b, 1.0 - k * b * b, b], [-a, -b, c]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def in_sight_frame(vectors: Floats, position_m: Floats) -> Floats:
+    """Return vectors (..., 3) of the camera's frame as Qᵀ v in the sight frame of positions."""
+    return np.asarray(
+        np.einsum("...ij,...i->...j", sight_rotation(position_m), np.asarray(vectors, dtype=float)))
+
+
+def viewing_angle_of(rvec: Floats, position_m: Floats) -> Floats:
+    """Return the angles (...) in degrees between the marker's normal and the line of sight."""
+    normal = rotation_of_vector(np.asarray(rvec, dtype=np.float64))[..., 2]
+    return np.degrees(angle_between(normal, -np.asarray(position_m, dtype=np.float64)))
+
+
+def bearing_of(position_m: Floats) -> Floats:
+    """Return the angles (...) in degrees between the lines of sight and the optical axis."""
+    x, y, z = np.moveaxis(np.asarray(position_m, dtype=np.float64), -1, 0)
+    return np.asarray(np.degrees(np.arctan2(np.hypot(x, y), z)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Poses of a block as statistics read them: which are counted, and their errors.
+
+#: Flags of detection of the poses that are in no denominator.
+NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))
+
+#: Flags of detection of the poses that were not run.
+NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
+
+#: Name of the mask of the poses that count at all, if not all do.
+INSIDE = "inside"
+
+#: Name of the mask of the trials that all pooled cells have, where sampling was stopped.
+COMMON = "common"
+
+#: Names of the variables that a statistic of detections, of estimates, of errors reads, one of
+#: errors along axes and about angles, and one of errors and their bounds.
+DETECTION_INPUTS = ("detection",)
+ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
+ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", "true_tvec_m")
+SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec")
+BOUND_INPUTS = (*ERROR_INPUTS, "bound_std")
+
+
+def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
+    """Return a dataset's variables by name.
+
+    Raises
+    ------
+    DatasetError
+        If the dataset lacks one.
+    """
+    for name in names:
+        if name not in results:
+            if AXIS in results.dims:
+                raise DatasetError(
+                    f"no variable {name}: a board's markers have detections alone; estimates "
+                    "are the board's: give the dataset that per_marker was given")
+            raise DatasetError(f"no variable {name}; "
+                               f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
+    return {name: results[name] for name in names}
+
+
+class Poses:
+    """Poses of a block: arrays (groups, cells, draws, settings, ...), by name.
+
+    Those outside the mask `INSIDE` count as not run, those outside `COMMON` as not needed. The
+    masks and errors have the shape (groups, cells, draws, settings).
+
+    Parameters
+    ----------
+    arrays
+        The arrays, by the names of `pose_arrays` with ``prefix`` in front, `INSIDE` and `COMMON`.
+    prefix
+        What stands before the names of these poses' arrays in ``arrays``, if it has others too.
+    """
+
+    def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
+        self._arrays = arrays
+        self._prefix = prefix
+        #: Squared absolute errors (..., 1) by the name of their `Quantity`, once computed.
+        self.squares: dict[str, Floats] = {}
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return an array, of flags 0 (not run) for the poses that do not count."""
+        array = self._arrays[self._prefix + name]
+        if name in VARIABLES and VARIABLES[name].flags is not None:
+            if array.dtype.kind == "f":
+                # A dataset that was cut or joined has NaN where nothing was run.
+                array = np.nan_to_num(array, nan=0.0)
+            if INSIDE in self._arrays:
+                array = np.where(self.inside, array, 0)
+            if COMMON in self._arrays:
+                array = np.where(
+                    self._arrays[COMMON] | (array == 0), array, VARIABLES[name].not_needed)
+        return array
+
+    @property
+    def inside(self) -> Masks:
+        """Poses that count at all."""
+        return self._arrays.get(INSIDE, np.ones((), dtype=bool))
+
+    @cached_property
+    def detection(self) -> NDArray[np.uint8]:
+        """Flags of `DetectionStatus`."""
+        return self["detection"]
+
+    @cached_property
+    def estimate(self) -> NDArray[np.uint8]:
+        """Flags of `EstimateStatus`."""
+        return self["estimate"]
+
+    @cached_property
+    def draws(self) -> Masks:
+        """Which draws were run: (groups, cells, draws)."""
+        return np.asarray(self.run.any(axis=3))
+
+    @cached_property
+    def run(self) -> Masks:
+        """Poses that were run."""
+        return ~np.isin(self.detection, NOT_AVAILABLE)
+
+    @cached_property
+    def looked_for(self) -> Masks:
+        """Poses whose detection is counted: run, visible and modelled."""
+        return ~np.isin(self.detection, NOT_LOOKED_FOR)
+
+    @cached_property
+    def detected(self) -> Masks:
+        """Detected poses."""
+        return np.asarray(self.detection == DetectionStatus.detected)
+
+    @cached_property
+    def solved(self) -> Masks:
+        """Solved poses."""
+        return np.asarray(self.estimate == EstimateStatus.solved)
+
+    @cached_property
+    def flipped(self) -> Masks:
+        """Solved poses that are nearer to the mirror of the truth."""
+        return np.asarray(self.solved & (self["flipped"] == Flipped.flipped))
+
+    @cached_property
+    def unflipped(self) -> Masks:
+        """Solved poses that are not flipped."""
+        return self.solved & ~self.flipped
+
+    @cached_property
+    def rotation_deg(self) -> Floats:
+        """Rotation error vectors, (..., xyz), in degrees."""
+        return np.asarray(np.degrees(self["rotation_error_rad"], dtype=np.float64))
+
+    @cached_property
+    def range_percent(self) -> Floats:
+        """Depth error in percent of the true depth, (..., 1)."""
+        return self.percent_of_depth(self["translation_error_m"][..., 2])[..., None]
+
+    def percent_of_depth(self, length: NDArray[Any]) -> Floats:
+        """Return lengths (...) in percent of the true z."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100.0 * np.asarray(length / self["true_tvec_m"][..., 2], dtype=np.float64)
+
+    @cached_property
+    def signed(self) -> SignedErrors:
+        """Errors along axes and about angles."""
+        return SignedErrors(self["true_rvec"], self["true_tvec_m"], self["rotation_error_rad"],
+                            self["translation_error_m"])
+
+    @cached_property
+    def position_m(self) -> Floats:
+        """Position error vectors, (..., xyz), in metres."""
+        return np.asarray(self["translation_error_m"], dtype=np.float64)
+
+
+def norm_squared(vectors: NDArray[Any]) -> Floats:
+    """Return the squared norms of (..., components)."""
+    return component_sum(np.square(vectors, dtype=np.float64))
+
+
+def component_sum(vectors: Floats) -> Floats:
+    """Return the sums of the few components of (..., components), bit for bit as NumPy does.
+
+    NumPy's loop along a short last axis takes three times as long.
+    """
+    components = (vectors[..., k] for k in range(vectors.shape[-1]))
+    return np.asarray(functools.reduce(np.add, components, np.zeros(())))
+
+
+# --------------------------------------------------------------------------------------------------
+# Kinds of errors of poses: what statistics are computed of, by name.
+
+@dataclass(frozen=True)
+class Quantity:
+    """A kind of error of poses.
+
+    Attributes
+    ----------
+    name
+        In the names of variables.
+    unit
+        As in names, such as ``deg``.
+    units
+        As in attributes, such as ``degree``.
+    words
+        As in meanings.
+    vector
+        The error vectors (..., components) of poses.
+    bound
+        The largest absolute error that exists; None if there is none.
+    signed
+        Whether it has a sign, and one component.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.dataset.pose_arrays`.
+    """
+
+    name: str
+    unit: str
+    units: str
+    words: str
+    vector: Callable[[Poses], Floats]
+    bound: float | None = None
+    signed: bool = False
+    inputs: tuple[str, ...] = ERROR_INPUTS
+
+    def norm(self, poses: Poses) -> Floats:
+        """Return the absolute errors (...)."""
+        return np.sqrt(self.squares(poses)[..., 0])
+
+    def squares(self, poses: Poses) -> Floats:
+        """Return the squared absolute errors (..., 1)."""
+        if self.name not in poses.squares:
+            poses.squares[self.name] = norm_squared(self.vector(poses))[..., None]
+        return poses.squares[self.name]
+
+    def named(self, statistic: str) -> str:
+        """Return a variable's name, such as ``rotation_p95_deg``."""
+        return f"{self.name}_{statistic}_{self.unit}"
+
+
+#: Kinds of error in `sweep.analysis.error_statistics` unless others are asked for.
+QUANTITIES = (
+    Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg,
+             bound=180.0),
+    Quantity("range", "percent", "percent", "depth error of the true depth",
+             lambda poses: poses.range_percent, signed=True),
+    Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
+)
+
+
+def _signed(source: str, unit: str, units: str, **words: str) -> tuple[Quantity, ...]:
+    """Return the components of an array of `SignedErrors`, or the array itself, by their names."""
+    errors = attrgetter(f"signed.{source}")
+
+    def component(k: int, poses: Poses) -> Floats:
+        values = errors(poses)
+        return np.asarray(values[..., None] if len(words) == 1 else values[..., k : k + 1])
+
+    return tuple(
+        Quantity(name, unit, units, text, functools.partial(component, k), signed=True,
+                 inputs=SIGNED_INPUTS)
+        for k, (name, text) in enumerate(words.items()))
+
+
+_IN_METRES, _IN_DEGREES = ("m", "m"), ("deg", "degree")
+
+#: Errors with a sign, by groups: of these bias and standard deviation are computed.
+SIGNED: dict[str, tuple[Quantity, ...]] = {
+    "camera_frame": _signed("in_camera_m", *_IN_METRES, **{
+        axis: f"position error along {axis} of the camera" for axis in XYZ}),
+    "marker_frame": _signed("along_marker_m", *_IN_METRES, **{
+        f"marker_frame_{axis}": f"position error along {axis} of the true marker"
+        for axis in XYZ}),
+    "camera_in_marker": _signed("of_camera_m", *_IN_METRES, **{
+        f"camera_in_marker_{axis}": f"error of the camera's {axis} in the marker's frame"
+        for axis in XYZ}),
+    "yaw_pitch_roll": _signed("yaw_pitch_roll_deg", *_IN_DEGREES, **{
+        name: f"{name} error" for name in ("yaw", "pitch", "roll")}),
+    "angles": (
+        *_signed("tilt_deg", *_IN_DEGREES, tilt="error of the angle to the image plane"),
+        *_signed("viewing_angle_deg", *_IN_DEGREES,
+                 viewing_angle="error of the angle between normal and line of sight"),
+        *_signed("in_plane_deg", *_IN_DEGREES,
+                 in_plane="rotation error about the true normal"),
+    ),
+}
+
+
+#: Kinds of error by name.
+ALL_QUANTITIES = {each.name: each for group in (QUANTITIES, *SIGNED.values()) for each in group}
+
+
+def chosen_quantities(names: Iterable[str] | None) -> list[Quantity]:
+    """Return the quantities of some names of quantities or groups, each once; default `QUANTITIES`.
+
+    Raises
+    ------
+    ArgumentError
+        For a name that is neither, or none at all.
+
+    Examples
+    --------
+    >>> [quantity.name for quantity in chosen_quantities(["range", "yaw_pitch_roll", "yaw"])]
+    ['range', 'yaw', 'pitch', 'roll']
+    """
+    if names is None:
+        return list(QUANTITIES)
+    known = {name: (each,) for name, each in ALL_QUANTITIES.items()} | SIGNED
+    wanted = [names] if isinstance(names, str) else [*names] if isinstance(names, Iterable) else []
+    if not wanted:
+        raise ArgumentError("quantities", names, f"expected some of {', '.join(known)}")
+    for name in wanted:
+        if name not in known:
+            raise ArgumentError(
+                "quantities", name,
+                f"no such error{nearest(str(name), [*known])}; there are {', '.join(known)}")
+    return list({each.name: each for name in wanted for each in known[name]}.values())
 
 
 # --------------------------------------------------------------------------------------------------

@@ -16,23 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from sweep.analysis.dataset import (
     DRAWS,
+    SIGNED_INPUTS,
+    Poses,
     axes_of,
+    bearing_of,
+    in_sight_frame,
     is_grid_axis,
     kept_dimensions,
     parameter_value,
+    pose_arrays,
+    sight_rotation,
+    viewing_angle_of,
     with_sampling,
 )
 from sweep.analysis.estimator import INTERVAL, Columns, arranged
 from sweep.analysis.intervals import DEVIATIONS
-from sweep.analysis.poses import (
-    SIGNED_INPUTS,
-    Poses,
-    bearing_of,
-    in_sight_frame,
-    pose_arrays,
-    sight_rotation,
-    viewing_angle_of,
-)
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
@@ -817,7 +815,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         Dimensions: the axes that are kept apart; ``quantity``: ``x``, ``y``, ``z`` (m), and the
         rotation vector ``rotation_x``, ``rotation_y``, ``rotation_z`` (rad), estimated minus true,
         in the sight frame, which is the camera's frame turned so that z is the line of sight
-        (`sweep.analysis.poses`; z is the error of the range); knots ``distance_m`` (along
+        (`sweep.analysis.dataset`; z is the error of the range); knots ``distance_m`` (along
         the optical axis), ``side_px`` and ``viewing_angle_deg``; and cells of these three.
 
         - ``sigma``, ``bias`` at the knots, with ``_low`` and ``_high``. Between knots ln(sigma) and

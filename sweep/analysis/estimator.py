@@ -25,8 +25,12 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from sweep.analysis.dataset import (
+    COMMON,
     DRAWS,
+    INSIDE,
+    Poses,
     common_trials,
+    component_sum,
     is_fixed,
     is_grid_axis,
     is_sampling_stopped,
@@ -34,7 +38,6 @@ from sweep.analysis.dataset import (
     replicate_order,
 )
 from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
-from sweep.analysis.poses import COMMON, INSIDE, Poses, component_sum
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.schema import LABELS, cf_attributes
@@ -499,7 +502,7 @@ class Statistic(ABC, Generic[ViewT]):
     unseen_factor
         Of upper ends of mean squares, as in `with_unseen_tail`.
     inputs
-        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
+        Names of the arrays that it reads, as in `sweep.analysis.dataset.pose_arrays`.
     """
 
     name: str

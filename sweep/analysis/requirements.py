@@ -21,7 +21,11 @@ from scipy import special
 
 from sweep.analysis.dataset import (
     DRAWS,
+    ESTIMATE_INPUTS,
+    QUANTITIES,
+    SIGNED,
     SIZE_AXES,
+    Poses,
     as_names,
     axes_of,
     computed_scenes,
@@ -33,6 +37,7 @@ from sweep.analysis.dataset import (
     kept_dimensions,
     largest_cell,
     parameter_value,
+    pose_arrays,
     require_poses,
     stacked,
     stopping_rule,
@@ -53,13 +58,6 @@ from sweep.analysis.estimator import (
     stopped_level,
 )
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
-from sweep.analysis.poses import (
-    ESTIMATE_INPUTS,
-    QUANTITIES,
-    SIGNED,
-    Poses,
-    pose_arrays,
-)
 from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError, PipelineError
 from sweep.experiment.parameters import Stage

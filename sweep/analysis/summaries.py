@@ -12,15 +12,25 @@ import xarray as xr
 from scipy import special, stats
 
 from sweep.analysis.dataset import (
+    BOUND_INPUTS,
+    COMMON,
+    DETECTION_INPUTS,
     DRAWS,
+    ESTIMATE_INPUTS,
+    QUANTITIES,
+    Poses,
+    Quantity,
     as_names,
     axes_of,
+    chosen_quantities,
     common_trials,
     describes,
     is_grid_axis,
     is_replicated,
     is_sampling_stopped,
     kept_dimensions,
+    norm_squared,
+    pose_arrays,
     require_dimension,
     stacked,
 )
@@ -44,18 +54,6 @@ from sweep.analysis.estimator import (
     guarded,
 )
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.poses import (
-    BOUND_INPUTS,
-    COMMON,
-    DETECTION_INPUTS,
-    ESTIMATE_INPUTS,
-    QUANTITIES,
-    Poses,
-    Quantity,
-    chosen_quantities,
-    norm_squared,
-    pose_arrays,
-)
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes

@@ -13,8 +13,8 @@ import xarray as xr
 
 from sweep.analysis import compare
 from sweep.analysis.comparisons import paired_table
+from sweep.analysis.dataset import QUANTITIES
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.poses import QUANTITIES
 from sweep.report.report_data import CONFIGURATION, Configurations, ReportData, configurations
 from sweep.report.table import Column, Table, Value, number
 from sweep.tradeoff.pareto import WRONG, conditions_of

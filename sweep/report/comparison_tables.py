@@ -19,9 +19,8 @@ from sweep.analysis.comparisons import (
     matched_sides,
     store_differences,
 )
-from sweep.analysis.dataset import each_cell
+from sweep.analysis.dataset import QUANTITIES, each_cell
 from sweep.analysis.estimator import Bins
-from sweep.analysis.poses import QUANTITIES
 from sweep.errors import ArgumentError
 from sweep.messages import quoted
 from sweep.report.decisions import selected_store

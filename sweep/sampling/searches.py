@@ -12,9 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
+from sweep.analysis.dataset import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.intervals import looks_factor
-from sweep.analysis.poses import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.requirements import (
     CONFIDENCE,
     ERROR_PROBABILITY,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from support.small_datasets import ALL, mixed, perfect
 from sweep.analysis import error_statistics
-from sweep.analysis.poses import SIGNED, SignedErrors
+from sweep.analysis.dataset import SIGNED, SignedErrors
 from sweep.errors import ArgumentError
 from sweep.measure.flags import EstimateStatus, Flipped
 

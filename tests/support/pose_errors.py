@@ -7,7 +7,7 @@ import numpy as np
 import tomlkit
 
 from support.small_datasets import perfect
-from sweep.analysis.poses import viewing_angle_of
+from sweep.analysis.dataset import viewing_angle_of
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
 
 FX, SIZE_M = 900.0, 0.165

@@ -21,24 +21,6 @@ from sweep.report.table import Column, Table, interval_text, number
 
 
 @dataclass(frozen=True, slots=True)
-class Tile:
-    """One number, with its name above and a detail below it.
-
-    Attributes
-    ----------
-    heading, value, detail
-        Text.
-    numbers
-        The value, the ends of its interval, its unit: for JSON.
-    """
-
-    heading: str
-    value: str
-    detail: str = ""
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class Answer:
     """The answer that a reader wants first.
 
@@ -51,7 +33,8 @@ class Answer:
     of
         The configuration that is named, of the tiles; empty if there is only one.
     tiles
-        Its numbers over the whole grid.
+        Its numbers over the whole grid, as cards and as JSON have them: ``name``, ``text`` and
+        ``detail``, ``value`` with ``low``, ``high`` and ``unit``, and what a share is of.
     tables
         By configuration, shown at once.
     details
@@ -63,7 +46,7 @@ class Answer:
     headline: str
     paragraph: str
     of: str
-    tiles: Sequence[Tile]
+    tiles: Sequence[Mapping[str, Any]]
     tables: Sequence[Table]
     details: Sequence[Table]
     numbers: Mapping[str, Any] = field(default_factory=dict)
@@ -72,11 +55,7 @@ class Answer:
         """Return it as JSON values: numbers, and tables of text as a page shows them."""
         return {
             "answer": self.headline, "text": self.paragraph, "configuration": self.of or None,
-            "numbers": [
-                {"name": tile.heading, "text": tile.value, "detail": tile.detail, **tile.numbers}
-                for tile in self.tiles
-            ],
-            **self.numbers,
+            "numbers": self.tiles, **self.numbers,
             "tables": [table.as_json() for table in (*self.tables, *self.details)],
         }
 
@@ -229,29 +208,29 @@ def _reached(limits: Sequence[xr.Dataset], others: Sequence[str]) -> str:
 # The numbers in the cards, and the line that they make where there is nothing to compare.
 
 #: Share -> the number of poses that it is of.
-COUNTED = {"detection_rate": "looked_for", "solved_rate": "looked_for", "flip_rate": "solved"}
+COUNTED = {"detection_rate": ["looked_for"], "solved_rate": ["looked_for"], "flip_rate": ["solved"]}
 
 
-def _in_numbers(tiles: Sequence[Tile]) -> str:
+def _in_numbers(tiles: Sequence[Mapping[str, Any]]) -> str:
     """Return the answer of a single configuration in one line."""
     detected, _, median, _, rmse, *_ = tiles
     errors = "".join(
-        f"; {tile.heading} {tile.value}{f' ({tile.detail})' if tile.detail else ''}"
-        for tile in (median, rmse) if not math.isnan(tile.numbers["value"]))
-    return f"Detected in {detected.value} ({detected.detail}){errors}."
+        f"; {tile['name']} {tile['text']}{f' ({detail})' if (detail := tile['detail']) else ''}"
+        for tile in (median, rmse) if not math.isnan(tile["value"]))
+    return f"Detected in {detected['text']} ({detected['detail']}){errors}."
 
 
-def _tile(one: xr.Dataset, column: Column) -> Tile:
-    heading, _, unit = column.heading.rpartition(", ")
+def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
+    """Return a number of one configuration, with its name and a detail."""
+    name, _, unit = column.heading.rpartition(", ")
     unit = {"deg": "\u00b0"}.get(unit, f" {unit}")
     (found,) = column.cells(one)
-    numbers: dict[str, Any] = {**found._asdict(), "unit": unit.strip()}
-    if math.isinf(found.value):
-        return Tile(heading, "\u221e", "more than half not solved", numbers)
     known = math.isfinite(found.low) and not math.isnan(found.high)
     details = [interval_text(found.low, found.high, unit)] if known else []
-    if counted := COUNTED.get(column.variable):
-        numbers[counted] = int(one[counted])
-        details.append(f"of {int(one[counted]):,} {counted.replace('_', ' ')}")
-    text = number(found.value) if math.isnan(found.value) else f"{number(found.value)}{unit}"
-    return Tile(heading, text, ", ".join(details), numbers)
+    counted = {name: int(one[name]) for name in COUNTED.get(column.variable, ())}
+    details += [f"of {count:,} {of.replace('_', ' ')}" for of, count in counted.items()]
+    text = number(found.value) + (unit if math.isfinite(found.value) else "")
+    if math.isinf(found.value):
+        details = ["more than half not solved"]
+    return {"name": name, "text": text, "detail": ", ".join(details), **found._asdict(),
+            "unit": unit.strip(), **counted}

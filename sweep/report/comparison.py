@@ -53,31 +53,27 @@ class Difference(NamedTuple):
 
     Attributes
     ----------
-    quantity
-        Its words.
-    value, low, high, unit
-        Value with its 95 % interval, NaN without one.
+    column, numbers
+        The quantity, and its value with its 95 % interval, NaN without one.
     verdict
         1: the best one is better; -1: it is worse; 0: not decided.
     """
 
-    quantity: str
-    value: float
-    low: float
-    high: float
-    unit: str
+    column: Column
+    numbers: Value
     verdict: int
-
-    @property
-    def numbers(self) -> Value:
-        """Value and interval."""
-        return Value(self.value, self.low, self.high)
 
     @property
     def text(self) -> str:
         """All as text: ``range RMSE ratio 0.540 (0.520 to 0.560): better``."""
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{self.quantity} {self.numbers}{unit}: {VERDICTS[self.verdict]}"
+        words, _, unit = self.column.heading.partition(", ")
+        return f"{words} {self.numbers}{f' {unit}' if unit else ''}: {VERDICTS[self.verdict]}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        words, _, unit = self.column.heading.partition(", ")
+        return {"quantity": words, **self.numbers._asdict(), "unit": unit,
+                "verdict": VERDICTS[self.verdict]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +115,7 @@ class Comparison:
         rival = min(others, key=self.verdict)
         pair = self.differences[rival]
         shown = [each for each in pair if each.verdict] or [
-            next((each for each in pair[2:] if not np.isnan(each.value)), pair[0])]
+            next((each for each in pair[2:] if not np.isnan(each.numbers.value)), pair[0])]
         counts = Counter(map(self.verdict, others))
         words = ", ".join(f"{VERDICTS[verdict]} {counts[verdict]}" for verdict in VERDICTS
                           if counts[verdict])
@@ -142,8 +138,7 @@ class Comparison:
             headings.append("verdict")
             cells = [verdicts, *cells, *map(list, zip(*pairs, strict=True))]
             columns += PAIRED
-            few = any(each.quantity == UNFLIPPED.heading
-                      for pair in self.differences for each in pair)
+            few = any(each.column is UNFLIPPED for pair in self.differences for each in pair)
             caption += (
                 f"; differences, ratios and verdict: {self.name} against each, on the same images"
                 + "; rotation without flips where few poses differ by them" * few)
@@ -154,8 +149,7 @@ class Comparison:
         """Return the differences of the best configuration from each, as JSON values."""
         return [{"configuration": self.name, "against": name,
                  "verdict": VERDICTS[self.verdict(k)],
-                 "differences": [each._asdict() | {"verdict": VERDICTS[each.verdict]}
-                                 for each in self.differences[k]]}
+                 "differences": [each.as_json() for each in self.differences[k]]}
                 for k, name in enumerate(self.known.names) if k != self.best]
 
 
@@ -163,7 +157,8 @@ def verdict_words(differences: Sequence[Difference]) -> str:
     """Return by what one configuration is better or worse: ``better: detection; worse: range``."""
     first = overall(differences)
     parts = [f"{VERDICTS[verdict]}: {', '.join(names)}" for verdict in (first, -first) if (
-        names := [each.quantity.split()[0] for each in differences if each.verdict == verdict])]
+        names := [each.column.heading.split()[0] for each in differences
+                  if each.verdict == verdict])]
     return "; ".join(parts) if first else VERDICTS[0]
 
 
@@ -233,9 +228,7 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
     for each in (DETECTION, SOLVED, rotation, RANGE):
         (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
         verdict = int(ends.low > each.level) - int(ends.high < each.level)
-        words, _, unit = each.heading.partition(", ")
-        out.append(Difference(words, numbers.value, numbers.low, numbers.high, unit,
-                              -verdict if each.level else verdict))
+        out.append(Difference(each, numbers, -verdict if each.level else verdict))
     return tuple(out)
 
 

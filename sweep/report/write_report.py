@@ -262,8 +262,8 @@ def _base64(content: bytes | str) -> str:
 
 
 def _svg(panel: Panel) -> bytes:
-    """Return a panel as SVG; hundredths of a point are enough."""
-    return re.sub(rb"(\.\d\d)\d+", rb"\1", panels_file([panel], ".svg"))
+    """Return a panel as SVG; hundredths of a point are enough, but not of a number in a text."""
+    return re.sub(rb"(\.\d\d)\d+(?=[^<>]*>)", rb"\1", panels_file([panel], ".svg"))
 
 
 def _code(text: str, language: str) -> str:

@@ -6,7 +6,7 @@ import re
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweep.report.answer import Answer, Tile
+from sweep.report.answer import Answer
 from sweep.report.figure import Figure as ReportFigure
 from sweep.report.scenes import Scene
 from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
@@ -27,7 +27,8 @@ def hostile_page():
               for picture in (b"png", None)]
     origin = {"facts": {"Store": HOSTILE, "Report": HOSTILE}, "commands": [HOSTILE],
               "axes": hostile_table(), "drawn": HOSTILE, "pipeline": HOSTILE, "file": HOSTILE}
-    numbers = Answer(HOSTILE, HOSTILE, HOSTILE, (Tile(HOSTILE, HOSTILE, HOSTILE),),
+    tile = dict.fromkeys(("name", "text", "detail"), HOSTILE)
+    numbers = Answer(HOSTILE, HOSTILE, HOSTILE, [tile],
                      (hostile_table(),), (hostile_table(),))
     return page(HOSTILE, numbers, origin, [figure], scenes, [HOSTILE])
 

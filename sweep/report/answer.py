@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from sweep.analysis import requirements as judged
-from sweep.analysis.dataset import each_cell
+from sweep.analysis.dataset import each_cell, of_photographs
 from sweep.analysis.requirements import Decision, Verdict, requirement_limits
 from sweep.errors import DatasetError, StoreError
 from sweep.report import decisions, figures
 from sweep.report.comparison import CARDS, comparison
+from sweep.report.figure import caption_of, sentences
 from sweep.report.report_data import CONFIGURATION, ReportData, configurations, course_of, notes_of
 from sweep.report.table import Column, Table, interval_text, number
 
@@ -84,11 +85,12 @@ def answer(data: ReportData) -> Answer:
         line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
                 "modelled in none.")
     warnings = [f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings]
-    notes = figures.sentences(
+    notes = sentences(
         *warnings,
         "A board counts as detected if at least one of its markers is."
         if data.pipeline.shows_boards else "",
-        figures.interval_note(data), notes_of(data, {}), data.pooled(*known.axes))
+        caption_of("intervals", photographs=of_photographs(data.results)),
+        notes_of(data, {}), data.pooled(*known.axes))
     return Answer(
         line, notes, name, tiles,
         [*(decided.tables if decided else ()), compared.table()],

@@ -18,7 +18,7 @@ from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
 from sweep.messages import nearest, notice, quoted
 from sweep.report.comparison import trade_lines
-from sweep.report.figure import Figure, write_figure
+from sweep.report.figure import Figure, caption_of, sentences, write_figure
 from sweep.report.output_file import figure_file
 from sweep.report.report_data import read_report_data
 from sweep.report.table import Column, Findings, Table, table_of
@@ -185,11 +185,9 @@ def trade_figure(
     criterion = criterion or trade_criterion(trade)
     heading = heading_of(criterion)
     return Figure(
-        "trade", "Cost and accuracy", (
-            f"Cost of detection and estimation, ms a frame, against {heading}, of each "
-            f"configuration on the same {trade.attrs.get('poses', 0):,} images, with 95 % "
-            "intervals. Joined are those on the Pareto front: no other configuration is both "
-            f"cheaper and better. {' '.join(f'{line}.' for line in lines)}").strip(),
+        "trade", "Cost and accuracy", sentences(
+            caption_of("trade", heading=heading, poses=trade.attrs.get("poses", 0)),
+            *(f"{line}." for line in lines)),
         tradeoff_table(trade, criterion), [Column(heading, criterion)], MS.heading, FRONT.heading,
         labels="configuration")
 

@@ -295,7 +295,8 @@ def alternatives(choice: Choice) -> Table:
             *map(str, answer.alternative.values()),
             *(["none" if each is None else coordinate(each) for each in (answer.value, answer.next)]
               if along else [answer.met]),
-            cost and tables.Value(cost.ms, cost.low, cost.high), within, k in choice.front,
+            cost and tables.Value(cost.ms, cost.low, cost.high), within,
+            None if cost is None else k in choice.front,
             reason(answer.next_cause), ", ".join(map(coordinate, answer.passing))])
     return Table.of(
         headline(choice),
@@ -404,8 +405,7 @@ def limit_interval(one: xr.Dataset) -> str:
     """Return the interval of the limit: ``1.1 to 1.3``; an open end is the grid's."""
     values = one[one.attrs["along"]].values
     open_ends = {-math.inf: f"below {_place(one, float(values.min()), unit=False)}",
-                 math.inf: f"beyond {_place(one, float(values.max()), unit=False)}",
-                 math.nan: "none"}
+                 math.inf: f"beyond {_place(one, float(values.max()), unit=False)}"}
     ends = [float(one[name]) for name in ("low", "high")]
     if any(map(math.isnan, ends)):
         return "none"
@@ -419,7 +419,7 @@ def _place(one: xr.Dataset, value: float, *, unit: bool = True) -> str:
     values: list[float] = axis.values.astype(float).tolist()
     texts = dict(zip(values, tables.coordinates(values), strict=True))
     units = str(axis.attrs.get("units", ""))
-    return texts.get(value, "") + (UNITS.get(units, f" {units}") if unit else "")
+    return texts.get(value, coordinate(value)) + (UNITS.get(units, f" {units}") if unit else "")
 
 
 def values_met(one: xr.Dataset) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,32 +28,13 @@ from sweep.report.table import Column, Findings, Table, Value, table_of
 from sweep.typing import Integers
 from sweep.version import __version__
 
-SCHEMA = "sweep-error-model/3"
+#: What every file says: schema, frame, formula, and what the errors are.
+TEMPLATE = Path(__file__).parent / "templates" / "error_model.json"
 
 #: Variables of the models that the file has of each quantity.
 OF_QUANTITIES = (
     *(f"{name}{end}" for name in ("sigma", "bias", "exponent") for end in INTERVAL), "knots",
     "coverage", "camera_coverage")
-
-FRAME = (
-    "sight frame: the camera's frame (x right, y down, z forward), turned by the shortest way so "
-    "that z is the line of sight to the marker's centre"
-)
-#: How the numbers of the file are used.
-FORMULA = {
-    "u": "(ln(distance_m), ln(side_px), viewing_angle_deg, bearing_deg)",
-    "region": "u was seen if low <= sum of weights * u <= high for every direction, and if seen is "
-              "true for its cell (boundaries lie between cells); elsewhere there is no answer",
-    "weight": "product of hat functions of u at knots_u: 1 at its knot, 0 at the others, linear "
-              "between",
-    "sigma": "exp(sum over knots of weight * ln_sigma)",
-    "bias": "sum over knots of weight * bias_u; of x, y, z times distance_m",
-    "use": "of the cell of u (cells_u lie between cells)",
-    "covariance": "Q diag(sigma^2) Q^T along and about the camera's axes, Q bias its bias, for "
-                  "x, y, z and the rotation each. With the unit vector (a, b, c) to the marker "
-                  "and k = 1 / (1 + c): Q = [[1 - k a^2, -k a b, a], [-k a b, 1 - k b^2, b], "
-                  "[-a, -b, c]]",
-}
 
 #: Of the usual rule for one tag: sigma = 0.02 d² metres.
 RULE_M = 0.02
@@ -92,10 +74,7 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     knots = {name: models[name].values.tolist() for name in PREDICTORS}
     return {
-        "schema": SCHEMA, "sweep": __version__, **facts,
-        "frame": FRAME, "formula": FORMULA,
-        "errors": "estimated minus true; rotations as rotation vector of R_est R_trueᵀ; poses that "
-                  "are solved and not flipped",
+        **json.loads(TEMPLATE.read_text(encoding="utf-8")), "sweep": __version__, **facts,
         "units": {name: each.units for name, each in CONDITIONS.items()},
         "conditions": {name: each.words for name, each in CONDITIONS.items()},
         "flags": {each.name: each.meaning for each in Use},

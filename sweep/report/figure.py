@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import LogLocator, NullLocator
@@ -75,6 +76,22 @@ REFERENCE: dict[str, Any] = {
 
 # --------------------------------------------------------------------------------------------------
 # A figure, and the panels that its table gives.
+
+
+#: The texts of figures, each a macro.
+CAPTIONS = Environment(
+    loader=PackageLoader("sweep.report"), autoescape=False, undefined=StrictUndefined,  # noqa: S701
+).get_template("captions.jinja").module
+
+
+def caption_of(name: str, **values: object) -> str:
+    """Return the text of a figure, on one line; pages escape it."""
+    return " ".join(str(getattr(CAPTIONS, name)(**values)).split())
+
+
+def sentences(*parts: str) -> str:
+    """Return the parts that are not empty, joined by spaces."""
+    return " ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True, slots=True)

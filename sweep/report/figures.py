@@ -11,7 +11,6 @@ import xarray as xr
 
 from sweep import analysis
 from sweep.analysis.ambiguities import ThresholdChoice
-from sweep.analysis.dataset import of_photographs
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Reached
 from sweep.analysis.summaries import ERROR_HEADINGS
@@ -22,7 +21,7 @@ from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.report import report_data
 from sweep.report.comparison import trade_lines
 from sweep.report.cost_tables import trade_figure
-from sweep.report.figure import MAX_LINES, Figure
+from sweep.report.figure import MAX_LINES, Figure, caption_of, sentences
 from sweep.report.report_data import AREA, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.table import Column, Table, table_of
 from sweep.tradeoff.pareto import configuration_label
@@ -64,28 +63,12 @@ SIGNED_CURVES = tuple(
 BOUND_CURVES = tuple(
     Column(f"{quantity} RMSE over the bound", f"{quantity}_over_bound", level=1.0)
     for quantity in ("rotation", "range"))
-INFINITE_ERRORS = (
-    "In median and p95 a pose that is not solved counts as an infinite error (drawn at the edge); "
-    "an interval that reaches the edge ends beyond all draws.")
 
 #: Groups of a numeric axis.
 MAX_BINS = 40
 
 #: Angles that are lines of one configuration, and panels of several.
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
-
-
-def sentences(*parts: str) -> str:
-    """Return the parts that are not empty, joined by spaces."""
-    return " ".join(part for part in parts if part)
-
-
-def interval_note(data: ReportData) -> str:
-    """Return a sentence that says what intervals are over."""
-    return "Intervals have 95 % and are over the " + (
-        "photographs, each with all its markers one draw; without, photographs are too few."
-        if of_photographs(data.results)
-        else "random draws, conditional on the grid; numbers without one have too few draws.")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -121,8 +104,8 @@ def figure(
     return Figure(
         name, title, sentences(
             text,
-            f"Drawn are the first {MAX_LINES} of {count:,} configurations, by rates and errors "
-            "over the whole grid; the table has all." if dims and count > MAX_LINES else "",
+            caption_of("first_lines", drawn=MAX_LINES, count=count)
+            if dims and count > MAX_LINES else "",
             report_data.notes_of(data, groups),
             data.pooled(*dims, *report_data.configurations(data).axes)),
         configuration_table(data, summary, dims, caption, columns, counted), curves,
@@ -138,7 +121,7 @@ def _along(data: ReportData, name: str) -> Figure:
 
     Along the size each angle is apart: a line of one configuration, a panel of several.
     """
-    axis, target = data.pipeline.axis(name), data.pipeline.target_word
+    axis = data.pipeline.axis(name)
     meaning = axis.meaning if axis is not None else (
         "in the image" if name == AREA else data.pipeline.parameters[name].meaning)
     groups = data.along(name, MAX_BINS)
@@ -149,11 +132,7 @@ def _along(data: ReportData, name: str) -> Figure:
     return figure(
         data, grouped(data, analysis.error_statistics, groups), groups, f"by-{name}",
         f"Rates and errors by {data.words(name)}",
-        f"Share of the poses looked for in which the {target} is detected"
-        + (", by at least one marker" * (target != "marker")) + ", median and 95 % quantile (p95) "
-        "of the rotation error and of the range error (depth, relative to the true depth), the "
-        "solved poses that are nearer to the mirror of the truth (flips; they hardly differ if it "
-        f"is frontal), and the range's mean error (bias), by {name} ({meaning}). {INFINITE_ERRORS}",
+        caption_of("along", target=data.pipeline.target_word, axis=name, meaning=meaning),
         f"Errors by {data.words(name)}", (*RATES, *ERRORS),
         [DETECTED, *ERROR_CURVES, FLIPS, RANGE_BIAS], covers=tuple(groups))
 
@@ -176,10 +155,7 @@ def _bias(data: ReportData) -> Figure | None:
     return figure(
         data, grouped(data, signed_error_statistics, groups), groups, "bias",
         f"Bias by {data.words(along)}",
-        "Mean error of the solved poses that are not flipped, estimated minus true: the range in "
-        "percent of the true depth; x (right), y (down) and z (forward) of the "
-        f"{data.pipeline.target_word}'s position in the camera's frame; yaw. The table also has "
-        "the standard deviations, and pitch and roll.", "Bias and standard deviation",
+        caption_of("bias", target=data.pipeline.target_word), "Bias and standard deviation",
         SIGNED_COLUMNS, SIGNED_CURVES, counted="solved")
 
 
@@ -198,9 +174,8 @@ def _configurations(data: ReportData) -> Figure | None:
     return figure(
         data, known.summary, {}, "configurations",
         f"Configurations compared: {', '.join(known.axes)}",
-        "Share of the poses looked for that are solved, and the median errors, of each "
-        "configuration; a pose that is not solved counts as an infinite error (right edge).",
-        "Configurations", (LOOKED_FOR, *ERRORS), (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS),
+        caption_of("configurations"), "Configurations", (LOOKED_FOR, *ERRORS),
+        (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS),
         covers=covers)
 
 
@@ -220,20 +195,18 @@ def _outcomes(data: ReportData) -> Figure:
              and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
     groups = data.along(names[0], MAX_BARS) if names else {}
     summary = grouped(data, analysis.failure_composition, groups)
-    counts = summary["count"].sum([name for name in summary["count"].dims if name != "outcome"])
-    count_of = {name: count for name, count in zip(
-        counts["outcome"].values.tolist(), counts.values.tolist(), strict=True) if count}
-    excluded = outcomes(counted=False)
-    left_out = ", ".join(f"{count_of[name]:,} {name}" for name in excluded if name in count_of)
+    counts = summary["count"].sum(
+        [name for name in summary["count"].dims if name != "outcome"]).to_series()
+    excluded = counts[list(outcomes(counted=False))]
+    left_out = ", ".join(f"{count:,} {name}" for name, count in excluded.items() if count)
     total = summary["count"].where(summary["share"].notnull(), 0).sum("outcome").astype(int)
-    happened = summary.sel(outcome=[name for name in count_of if name not in excluded])
+    happened = summary.sel(outcome=[
+        name for name, count in counts.items() if count and name not in excluded])
     share = Column("share, %", "share", 100)
     return figure(
         data, happened.assign(looked_for=total),
         {"outcome": None, **groups}, "failures", "Outcomes of the poses",
-        "Shares of the poses looked for" + (f", by {data.words(names[0])}" if names else "")
-        + ": solved, or the flag that says why not."
-        + (f" Not counted in the shares: {left_out}." if left_out else ""),
+        caption_of("outcomes", by=data.words(names[0]) if names else "", left_out=left_out),
         "Outcomes", (LOOKED_FOR, share), [share], by="outcome")
 
 
@@ -265,9 +238,8 @@ def _frame(data: ReportData) -> Figure | None:
     return figure(
         data, grouped(data, over_frame, cells, (Stage.detection,)), dict.fromkeys(cells), "frame",
         "Detection by place in the frame",
-        f"Detection rate by the place of the {pipeline.target_word}'s centre in the frame, "
-        "in percent of its width and height from the top left corner.", "Detection rate by place",
-        RATES, [DETECTED], by=data.label(DOWN))
+        caption_of("frame", target=pipeline.target_word), "Detection rate by place", RATES,
+        [DETECTED], by=data.label(DOWN))
 
 
 #: Marker IDs that have a row of their own in the figure.
@@ -294,9 +266,7 @@ def _ranking(data: ReportData) -> Figure | None:
     order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k].value))
     return Figure(
         "ranking", f"Marker IDs, the weakest first{whose}", sentences(
-            f"Detection rates of the {min(WEAKEST, len(weak))} weakest IDs. "
-            f"{sum(weak):,} of {len(weak):,} IDs are weak (diamonds): below the "
-            "rate expected if all were alike, with an adjusted p-value under 0.05.",
+            caption_of("ranking", shown=min(WEAKEST, len(weak)), weak=sum(weak), count=len(weak)),
             data.pooled(*dims)),
         dataclasses.replace(table, frame=table.frame.iloc[order]), [DETECTED], by="weak",
         rows=WEAKEST, covers=(IDS,))
@@ -318,17 +288,15 @@ def error_over_bound(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.
 
 
 def _bound(data: ReportData) -> Figure | None:
-    if "bound" not in data.results or not bool(data.once("has bound", lambda: xr.Dataset(
-            {"any": data.results["bound"].isin(present_values(BoundStatus)).any()}))["any"]):
+    if "bound" not in data.results or not data.once("has bound", lambda: bool(
+            data.results["bound"].isin(present_values(BoundStatus)).any())):
         return None
     along = data.size_axis or data.angle_axis
     groups = data.along(along, SIZE_COLUMNS) if along else {}
     return figure(
         data, grouped(data, error_over_bound, groups), groups, "bound",
         "Errors relative to the accuracy bound",
-        "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not flipped "
-        "and have a bound: 1 (dashed) is the best that an unbiased estimator can reach.",
-        "RMSE over the bound", BOUND_CURVES, BOUND_CURVES)
+        caption_of("bound"), "RMSE over the bound", BOUND_CURVES, BOUND_CURVES)
 
 
 # Thresholds on the ambiguity: what they keep of the poses, and of the flips.
@@ -373,11 +341,7 @@ def _ambiguity(data: ReportData) -> Figure | None:
     wanted = 100 * float(pooled.attrs["flip_rate"])
     return Figure(
         "ambiguity", "A threshold on the ambiguity: flips and poses that it keeps", sentences(
-            "A pose is kept if its reprojection error is at most the threshold times the error of "
-            "the other planar solution; poses without another solution are always kept. Each point "
-            f"is a threshold. The table of thresholds below has the largest that is shown to keep "
-            f"{wanted:g} % flips of the kept poses at most (the 95 % bound of all thresholds tried "
-            "together), or says why there is none.", data.pooled()),
+            caption_of("ambiguity", wanted=f"{wanted:g}"), data.pooled()),
         dataclasses.replace(
             table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
                      KEPT), stub=1),  # the points of a line, not panels

@@ -10,31 +10,26 @@ from typing import Any
 
 import numpy as np
 
+from sweep.adapters import adapter
 from sweep.plugins import DetectorPlugin, Markers, parameter
 
 # --------------------------------------------------------------------------------------------------
 # Common to the wrappers of AprilTag's C library: families, settings, the order of corners.
 
 #: AprilTag's corners run counter-clockwise from the bottom left of its own bitmap, which OpenCV's
-#: dictionaries have turned by 180°.
-CORNER_ORDER = (1, 0, 3, 2)
-
-#: AprilTag's coordinates have the image's top left corner at the origin.
-PIXEL_CENTER = 0.5
-
-#: Dictionaries of OpenCV by AprilTag's names. (DICT_APRILTAG_36h10 no wrapper offers.)
-OPENCV_FAMILIES = {
-    "DICT_APRILTAG_16h5": "tag16h5",
-    "DICT_APRILTAG_25h9": "tag25h9",
-    "DICT_APRILTAG_36h11": "tag36h11",
-}
+#: dictionaries have turned by 180°. Its coordinates have the image's top left corner at the origin.
+CONVENTIONS: dict[str, Any] = {"corner_order": (1, 0, 3, 2), "pixel_center": 0.5}
 
 #: Families that OpenCV lacks; they are drawn as AprilTag draws them.
 OWN_FAMILIES = (
     "tagCircle21h7", "tagCircle49h12", "tagCustom48h12", "tagStandard41h12", "tagStandard52h13",
 )
 
-FAMILIES = {**OPENCV_FAMILIES, **{name: name for name in OWN_FAMILIES}}
+#: Dictionaries by AprilTag's names. (DICT_APRILTAG_36h10 no wrapper offers.)
+FAMILIES = {
+    "DICT_APRILTAG_16h5": "tag16h5", "DICT_APRILTAG_25h9": "tag25h9",
+    "DICT_APRILTAG_36h11": "tag36h11", **{name: name for name in OWN_FAMILIES},
+}
 
 
 @dataclass(frozen=True)
@@ -71,8 +66,8 @@ class AprilTagSettings:
 def markers(family: str, found: list[tuple[int, Any]]) -> Markers:
     """Return ID and corners (4, 2) of each marker, in the order of corners of tag families.
 
-    Markers of AprilTag's own families are turned by 180°: there :data:`CORNER_ORDER` is of bitmaps
-    that are as AprilTag draws them.
+    Markers of AprilTag's own families are turned by 180°: there the order of corners
+    belongs to bitmaps as AprilTag draws them.
     """
     corners = np.array([quad for _, quad in found], dtype=np.float64).reshape(-1, 4, 2)
     if family in OWN_FAMILIES:
@@ -80,14 +75,14 @@ def markers(family: str, found: list[tuple[int, Any]]) -> Markers:
     return Markers(corners, np.array([number for number, _ in found], dtype=np.int64))
 
 
-def wrapper_plugin(package: str, distribution: str, meaning: str) -> DetectorPlugin:
+def wrapper(package: str, meaning: str) -> DetectorPlugin:
     """Return the plug-in of a package that wraps the C library by ctypes.
 
     Both have the same class ``Detector``: one is the other's descendant.
     """
 
     def make(settings: AprilTagSettings, family: str) -> Callable[[Any], Markers]:
-        detector = importlib.import_module(package).Detector(
+        detector = importlib.import_module(package.replace("-", "_")).Detector(
             families=family, nthreads=1, quad_decimate=settings.quad_decimate,
             quad_sigma=settings.quad_sigma, refine_edges=int(settings.refine_edges),
             decode_sharpening=settings.decode_sharpening,
@@ -102,27 +97,12 @@ def wrapper_plugin(package: str, distribution: str, meaning: str) -> DetectorPlu
 
         return search
 
-    return DetectorPlugin(
-        make=make, settings=AprilTagSettings, meaning=meaning, distribution=distribution,
-        install=f"pip install 'fiducial-sweep[{distribution}]'", families=FAMILIES,
-        corner_order=CORNER_ORDER, pixel_center=PIXEL_CENTER,
-    )
+    return adapter(package, meaning, make, AprilTagSettings, FAMILIES, **CONVENTIONS)
 
 
-# --------------------------------------------------------------------------------------------------
-# The detector of the package pupil-apriltags: AprilTag's C library before its fix of edges.
-
-PUPIL_APRILTAGS = wrapper_plugin(
-    "pupil_apriltags", "pupil-apriltags", "AprilTag's C library 3.1 (pupil-apriltags)"
-)
-
-
-# --------------------------------------------------------------------------------------------------
-# The detector of the package pyapriltags: AprilTag's C library 3.4, with its fix of edges.
-
-PYAPRILTAGS = wrapper_plugin(
-    "pyapriltags", "pyapriltags", "AprilTag's C library 3.4 (pyapriltags)"
-)
+#: Before AprilTag's fix of edges, and with it.
+PUPIL_APRILTAGS = wrapper("pupil-apriltags", "AprilTag's C library 3.1")
+PYAPRILTAGS = wrapper("pyapriltags", "AprilTag's C library 3.4")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -187,14 +167,8 @@ def make(settings: WPILibSettings, family: str) -> Callable[[Any], Markers]:
     return search
 
 
-ROBOTPY_APRILTAG = DetectorPlugin(
-    make=make, settings=WPILibSettings,
-    meaning="WPILib's build of AprilTag's C library (robotpy-apriltag)",
-    distribution=("robotpy-apriltag", "robotpy-native-apriltag"),
-    install="pip install 'fiducial-sweep[robotpy-apriltag]'",
-    families={
-        name: family for name, family in OPENCV_FAMILIES.items()
-        if family in ("tag16h5", "tag36h11")
-    },
-    corner_order=CORNER_ORDER, pixel_center=PIXEL_CENTER,
+ROBOTPY_APRILTAG = adapter(
+    "robotpy-apriltag", "WPILib's build of AprilTag's C library", make, WPILibSettings,
+    {"DICT_APRILTAG_16h5": "tag16h5", "DICT_APRILTAG_36h11": "tag36h11"},
+    "robotpy-native-apriltag", **CONVENTIONS,
 )

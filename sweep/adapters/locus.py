@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plugins import DetectorPlugin, EstimatorPlugin, Markers, Poses, parameter
+from sweep.adapters import adapter, install
+from sweep.plugins import EstimatorPlugin, Markers, Poses, parameter
 
 # --------------------------------------------------------------------------------------------------
 # The detector of the package locus-tag, for AprilTag's and ArUco's dictionaries.
@@ -53,10 +54,7 @@ def make(settings: LocusSettings, family: str) -> Callable[[Any], Markers]:
     return search
 
 
-DETECTOR = DetectorPlugin(
-    make=make, settings=LocusSettings, meaning="Locus (locus-tag)", distribution="locus-tag",
-    install="pip install 'fiducial-sweep[locus-tag]'", families=FAMILIES, pixel_center=0.5,
-)
+DETECTOR = adapter("locus-tag", "Locus", make, LocusSettings, FAMILIES, pixel_center=0.5)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -191,5 +189,5 @@ def _rotation(quaternion: Floats) -> Floats:
 SOLVER = EstimatorPlugin(
     make=make_board_estimator, settings=LocusBoardSettings, needs_images=True, of_boards=True,
     meaning="Locus' own board estimator (locus-tag): it searches the image by itself",
-    distribution="locus-tag", install="pip install 'fiducial-sweep[locus-tag]'",
+    distribution="locus-tag", install=install("locus-tag"),
 )

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.plugins import DetectorPlugin, Markers, parameter
+from sweep.adapters import adapter
+from sweep.plugins import Markers, parameter
 
 LIBRARIES = {f"STAG_HD{distance}": str(distance) for distance in range(11, 25, 2)}
 
@@ -44,7 +45,4 @@ def make(settings: StagSettings, library: str) -> Callable[[Any], Markers]:
     return search
 
 
-DETECTOR = DetectorPlugin(
-    make=make, settings=StagSettings, meaning="STag (stag-python)", distribution="stag-python",
-    install="pip install 'fiducial-sweep[stag-python]'", families=LIBRARIES,
-)
+DETECTOR = adapter("stag-python", "STag", make, StagSettings, LIBRARIES)

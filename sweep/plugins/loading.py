@@ -34,22 +34,13 @@ def printing_to_stderr() -> Iterator[None]:
     It holds for all threads, so it is not for every call: Python's own prints are redirected there
     (:func:`call`).
     """
-    with contextlib.redirect_stdout(sys.stderr):
-        try:
+    with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there is none
             kept = os.dup(1)
-        except OSError:  # there is none
-            yield
-            return
-        try:
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                if sys.__stdout__ is not None:
-                    sys.__stdout__.flush()
-            with contextlib.suppress(OSError):
-                os.dup2(2, 1)
-            yield
-        finally:
-            os.dup2(kept, 1)
-            os.close(kept)
+            stack.callback(os.close, kept)
+            os.dup2(2, 1)
+            stack.callback(os.dup2, kept, 1)
+        yield
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import re
+from functools import cache
 from typing import Literal, NoReturn
 
 from sweep.cli import answers, experiments  # noqa: F401  (they declare the commands)
@@ -98,6 +99,7 @@ def _meant(word: str) -> str:
     return "; values are set by --set KEY=VALUE, in quotes if there are spaces in it"
 
 
+@cache
 def build_parser() -> tuple[Parser, list[argparse.ArgumentParser]]:
     """Return the parser of ``sweep``, and the commands' parsers.
 

@@ -37,7 +37,7 @@ REFUSED = {"calibration": "expected at least", "error-model": "needs 200 or more
 
 COMMANDS = {
     "status": [], "plan": [], "verify": ["--sample", "2"], "error-model": [], "calibration": [],
-    "tradeoff": ["--seconds", "0.1"], "require": ["detection >= 0.5", "--per", ""],
+    "tradeoff": ["--seconds", "0.02"], "require": ["detection >= 0.5", "--per", ""],
     "report": ["-o", "report.md"], "export": ["images"], "compare": ["mixed.zarr"],
     "show": ["--at", "trial=0", "-o", "scene.png"],
     "repro": ["--at", "trial=0"],

@@ -132,7 +132,7 @@ PROCESSING = [
     *((setting, []) for setting in SETTINGS), *(({}, scene) for scene in PROCESSING),
     (WIDE, WHOLE),
 ], ids=str)
-@lengths(10, 100)
+@lengths(7, 100)
 def test_window_finds_what_the_frame_holds_under_any_setting_and_processing(count, setting, scene):
     compared(visible_scenes(count, settings=scene), DetectorSetting(**setting))
 
@@ -182,7 +182,7 @@ def board_of(name, noise, window, trials):
 
 @pytest.mark.parametrize("noise", [0, 3])
 @pytest.mark.parametrize("name", BOARDS)
-@lengths(6, 40)
+@lengths(4, 40)
 def test_window_finds_of_a_board_what_the_frame_holds_but_for_stated_exceptions(
     count, name, noise, claim
 ):

@@ -131,8 +131,7 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(
 ):
     grown = Pipeline.from_text(text, settings, name="grown")
     fresh, reusing, back = (str(tmp_path / f"{name}.zarr") for name in ("fresh", "reusing", "back"))
-    cuts = {"distance_m": 3, "background": 1}
-    extents = tuple(min(len(axis), cuts.get(axis.name, 2))
+    extents = tuple(min(len(axis), 1 if axis.name == "background" else 3)
                     for axis in grown.experiment.scene_axes)
     by_hand(fresh, grown, extents)
     store = create_store(reusing, grown, extents)

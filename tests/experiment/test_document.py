@@ -39,7 +39,7 @@ MORE = {
 }
 
 
-@lengths(40, 400)
+@lengths(25, 400)
 def test_text_of_a_pipeline_reads_back_to_an_equal_one(count):
     @settings(max_examples=count, deadline=None)
     @given(st.integers(0, 2**63 - 1), st.text(CHARACTERS, max_size=20), st.booleans())
@@ -54,7 +54,7 @@ def test_text_of_a_pipeline_reads_back_to_an_equal_one(count):
     check()
 
 
-@lengths(50, 500)
+@lengths(25, 500)
 def test_any_document_is_written_as_toml_that_means_the_same(count):
     values = st.recursive(
         st.one_of(st.booleans(), st.integers(), st.floats(allow_nan=False), st.dates(),

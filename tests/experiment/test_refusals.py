@@ -321,7 +321,7 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
     assert "expected UTF-8: byte 0 is not" in faults_of(Pipeline.from_toml, tmp_path / "p.toml")[0]
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(st.one_of(
     st.text(),
     st.binary().map(lambda data: data.decode("latin-1")),

@@ -207,7 +207,7 @@ def counting(settings):
 
 CHANGING = """
 pose = { side_px = { uniform = [40, 60] }, tilt_deg = 30, azimuth_deg = 40 }
-axes = { solver = ["mine:counting", "ippe_square"], trial = 12 }
+axes = { solver = ["mine:counting", "ippe_square"], trial = 6 }
 """
 
 

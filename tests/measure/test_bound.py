@@ -182,7 +182,7 @@ def known(value, most=3):
     return Reference(value).found().std[0, :3].max() < most
 
 
-@lengths(24, 300)
+@lengths(16, 300)
 def test_bound_is_that_of_differences_of_the_exact_image(count, claim):
     scenes = [value for value in drawn(count, 1) if known(value)]
     assert len(scenes) > 0.95 * count

@@ -65,7 +65,10 @@ def in_waves(store, most=None):
 
 def same(a, b):
     """Tell whether two stores hold the same decoded values, bit for bit."""
-    with xr.open_zarr(a, consolidated=False) as one, xr.open_zarr(b, consolidated=False) as other:
+    with (
+        xr.open_zarr(a, consolidated=False, chunks=None) as one,
+        xr.open_zarr(b, consolidated=False, chunks=None) as other,
+    ):
         assert set(one.variables) == set(other.variables)
         for name in one.variables:
             x, y = one[name].to_numpy(), other[name].to_numpy()

@@ -89,7 +89,7 @@ def store(tmp_path_factory):
 def trade(store):
     """What the command says of the store as JSON, told apart by side_px, and what it wrote."""
     said = json.loads(told(
-        store, "--per", "side_px", "--seconds", "0.2", "--budget-ms", "1e9", "--json"))
+        store, "--per", "side_px", "--seconds", "0.05", "--budget-ms", "1e9", "--json"))
     return said, group(store, "cost/tradeoff")
 
 
@@ -121,7 +121,7 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
     results, spent = group(store), group(store, "cost")
     assert "side_px" in trade[0]["dims"]  # of which nothing is to be left
     printed = json.loads(told(
-        store, "--seconds", "0.1", "--per", "tilt_deg", "--budget-ms", "1e-6", "--json"))
+        store, "--seconds", "0.02", "--per", "tilt_deg", "--budget-ms", "1e-6", "--json"))
     assert "nothing fits 1e-06 ms a frame; the nearest is " in " ".join(printed.pop("advice"))
     written = group(store, "cost/tradeoff")
     assert written["cost_ms"].dims == ("tilt_deg", "treatment")
@@ -139,7 +139,7 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
 
 def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(tmp_path):
     url = made(tmp_path, RENDERERS, "renderers")
-    said = json.loads(told(url, "--seconds", "0.2", "--json"))["renderers"]
+    said = json.loads(told(url, "--seconds", "0.1", "--json"))["renderers"]
     written = group(url, "cost/renderers")
     assert json.loads(to_json(written.to_dict()))["data_vars"] == said["data_vars"]
     exact, others = (written.sel(renderer=names) for names in (

@@ -101,7 +101,7 @@ def test_a_missing_package_is_told_with_its_command(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", missing)
     monkeypatch.setattr(families, "library_path", lambda: None)
     monkeypatch.setattr(families, "library_file", lambda: None)
-    for settings, extra in ((["detector=['locus-tag']"], "locus-tag"),
+    for settings, extra in (*(([f"detector=['{name}']"], name) for name in MODULES),
                             (["dictionary=tagStandard41h12"], "pyapriltags"),
                             (["dictionary=STAG_HD21"], "stag-python")):
         told = refusal(RUN | {"axes": {"trial": 4}}, *settings)

@@ -10,6 +10,7 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline, cell
+from sweep.report.comparison_tables import calibration_findings
 from sweep.store.lifecycle import open_dataset
 
 PIPELINE = {
@@ -104,6 +105,8 @@ def test_the_summary_is_that_of_numpy(results):
     held = (np.abs(error) <= 1.96 * std).mean(axis=0)
     np.testing.assert_allclose(summary["coverage"].values[0][:5], held[:5])
     assert np.isnan(summary["coverage"].values[0][5:]).all()  # they are not estimated
+    rows = calibration_findings(summary, "a.zarr").numbers["rows"]
+    np.testing.assert_allclose([row["bias"] for row in rows], error.mean(axis=0)[:len(rows)])
 
 
 @pytest.mark.parametrize(("arguments", "fault"), [

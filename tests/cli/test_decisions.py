@@ -3,6 +3,7 @@
 import functools
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -99,6 +100,16 @@ def test_a_store_is_worse_than_another_and_not_than_itself(folder, require):
                                "--against", "two.zarr")
         assert code == status
         assert any(line.startswith(words) for line in out.splitlines()), out
+
+
+@pytest.mark.usefixtures("require")
+def test_the_limits_of_a_store_are_printed_and_drawn():
+    asked = "--require", "detection >= 0.8", "--along", "side_px", "-o", "limit.svg"
+    code, out, err = command("limit", "two.zarr", *asked, "--json")
+    found = json.loads(out)
+    assert (code, err, Path("limit.svg").read_text()[:5]) == (0, "", "<?xml")
+    assert [each["value"] for each in found["limits"]] == [40.0, 40.0]
+    assert [each["condition"]["solver"] for each in found["limits"]] == ["ippe_square", "iterative"]
 
 
 @pytest.mark.parametrize(("arguments", "line"), [

@@ -1,5 +1,6 @@
 """Scenes that are fitted to photographs with known effects: rendered, saved, and fitted."""
 
+import json
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import xarray as xr
 import sweep
 from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
+from support.reports import command
 from sweep.analysis.comparisons import GAP_STATISTICS
 from sweep.fitting.folders import REPEATS, needed
 from sweep.model.exposure import marker_boxes
@@ -92,17 +94,21 @@ def test_every_effect_is_found_its_interval_holds_the_truth_and_the_scene_is_a_p
     assert "# Fitted to 36 markers in 6 photographs" in found.text
 
 
-@pytest.mark.evidence
 def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path):
-    plain = fitted(tmp_path, PLAIN, 8, 4, 4)
-    terms = terms_of(plain)
-    assert terms["blur_px"].kept
-    assert terms["blur_px"].estimate.value == pytest.approx(0.5, abs=0.02)
-    absent = [name for name in ("sharpening", "bloom", "geometry_px") if not terms[name].kept]
+    (shots,), files = taken(tmp_path, PLAIN, 8, 4)
+    code, out, _ = command(
+        "fit", shots, "--camera", files["camera"], "--board", files["board"], "--markers", "4",
+        "--no-check", "-o", tmp_path / "scene.toml", "--json")
+    found, text = json.loads(out), (tmp_path / "scene.toml").read_text()
+    terms = {each["parameter"]: each for each in found["terms"]}
+    assert code == 0
+    assert terms["blur_px"]["kept"]
+    assert terms["blur_px"]["value"] == pytest.approx(0.5, abs=0.02)
+    absent = [name for name in ("sharpening", "bloom", "geometry_px") if not terms[name]["kept"]]
     assert len(absent) >= 2  # a false alarm of each has a probability of 5 %
     for name in absent:
-        assert f"#   left out: {terms[name].name}: {terms[name].reason}\n" in plain.text
-        assert name not in plain.found.scene
+        assert f"#   left out: {terms[name]['name']}: {terms[name]['reason']}\n" in text
+        assert name not in found["scene"]
 
 
 def gap(simulated, photographs=1.0):

@@ -100,6 +100,8 @@ def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
     text = output.read_text(encoding="utf-8")
     assert not re.search(r"\bnan\b|\binf\b", re.sub(r"<pre.*?</pre>", "", text))
     assert {path.name for path in tmp_path.iterdir()} == {"odd.zarr", "report.html"}
+    assert "finished" in command("status", url)[1]
+    assert command("plan", url)[0] == 0
 
 
 def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):

@@ -43,9 +43,7 @@ from sweep.plugins import DetectorPlugin, parameter
 class Settings:
     shift_px: float = parameter(0.0, "shift of the corners", unit="px", low=-9, high=9)
 
-class Turned:
-    """OpenCV's own search, with other conventions."""
-
+class Turned:  # OpenCV's own search, with other conventions
     def __init__(self, settings, family):
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
         self.search = cv2.aruco.ArucoDetector(dictionary).detectMarkers

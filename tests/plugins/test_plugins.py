@@ -33,7 +33,7 @@ from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from sweep.tradeoff.costs import clock_of
 
-MINE = '''
+MINE = """
 from dataclasses import dataclass
 import cv2
 import numpy as np
@@ -59,7 +59,7 @@ class Turned:  # OpenCV's own search, with other conventions
 TURNED = DetectorPlugin(
     make=Turned, settings=Settings, pixel_center=0.5, corner_order=(2, 3, 0, 1), margin_px=16,
 )
-'''
+"""
 
 GRID = """
 [camera]

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 
 
 class SweepError(Exception):
-    """An error that the user can correct: one line a fault, shown without a traceback."""
+    """An error that the user can correct: one line a fault, shown without a traceback.
+
+    Errors whose text is made of parts keep the parts as ``args``, by which another process makes
+    them again: their ``__init__`` does not call this one's.
+    """
 
 
 class PipelineError(SweepError):
@@ -19,12 +23,10 @@ class PipelineError(SweepError):
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
-        super().__init__("\n".join(faults))
         self.faults = tuple(faults)
 
-    def __reduce__(self) -> tuple[type[PipelineError], tuple[tuple[str, ...]]]:
-        """Return how to make it again in another process."""
-        return PipelineError, (self.faults,)
+    def __str__(self) -> str:
+        return "\n".join(self.faults)
 
 
 class ArgumentError(SweepError, ValueError):
@@ -46,13 +48,11 @@ class ArgumentError(SweepError, ValueError):
     """
 
     def __init__(self, argument: str, value: object, problem: str) -> None:
-        given = f" = {value}" if str(value) else ""
-        super().__init__(f"{argument}{given}: {problem}")
         self.argument, self.value, self.problem = argument, value, problem
 
-    def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, object, str]]:
-        """Return how to make it again in another process."""
-        return ArgumentError, (self.argument, self.value, self.problem)
+    def __str__(self) -> str:
+        given = f" = {self.value}" if str(self.value) else ""
+        return f"{self.argument}{given}: {self.problem}"
 
 
 class MissingPackageError(SweepError):
@@ -84,20 +84,15 @@ class OtherExperimentError(StoreError):
     """
 
     def __init__(self, url: str, differences: Sequence[str], reusable: bool) -> None:
-        advice = (
-            "its cells can be reused: give another store, and this one as reuse"
-            if reusable else "choose another store, or overwrite it"
-        )
-        super().__init__(
-            "\n".join([
-                f"{url}: holds another experiment; {advice}", *(f"  {d}" for d in differences)
-            ])
-        )
         self.url, self.differences, self.reusable = url, tuple(differences), reusable
 
-    def __reduce__(self) -> tuple[type[OtherExperimentError], tuple[str, tuple[str, ...], bool]]:
-        """Return how to make it again in another process."""
-        return OtherExperimentError, (self.url, self.differences, self.reusable)
+    def __str__(self) -> str:
+        advice = (
+            "its cells can be reused: give another store, and this one as reuse"
+            if self.reusable else "choose another store, or overwrite it"
+        )
+        return "\n".join([f"{self.url}: holds another experiment; {advice}",
+                          *(f"  {each}" for each in self.differences)])
 
 
 class StoreReplacedError(StoreError):
@@ -120,12 +115,10 @@ class MachineFaultError(RunError):
     """
 
     def __init__(self, fault: str, machine: str) -> None:
-        super().__init__(f"machine fault on {machine}: {fault}")
         self.fault, self.machine = fault, machine
 
-    def __reduce__(self) -> tuple[type[MachineFaultError], tuple[str, str]]:
-        """Return how to make it again in another process."""
-        return MachineFaultError, (self.fault, self.machine)
+    def __str__(self) -> str:
+        return f"machine fault on {self.machine}: {self.fault}"
 
 
 class PluginError(SweepError):

@@ -39,7 +39,8 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
         for action in added._actions:  # noqa: SLF001  (argparse offers no other list)
             if action.metavar in FILES:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
-    print(shtab.complete(parser, shell))
+    with printing():
+        print(shtab.complete(parser, shell))
     return 0
 
 

@@ -35,6 +35,16 @@ DIRECTIONS = ("centre", "corner")
 #: The points of a calibration -> the variable that has their errors.
 POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_error_px"}
 
+#: Variables of calibrations: dimensions of their own, meaning, units, flags.
+OUTPUTS: dict[str, tuple[Any, ...]] = {
+    "calibration": ((), "what became of the calibration", "", CalibrationStatus),
+    "used_views": ((), "views with enough of the board"),
+    "rms_px": ((), "root mean square of the residuals", "px"),
+    "intrinsic_error": (("intrinsic",), "estimated minus true", "px, 1"),
+    "intrinsic_std": (("intrinsic",), "standard deviation that OpenCV reports", "px, 1"),
+    "position_error_m": (("direction", "xyz"), "error of a target's position, camera frame", "m"),
+}
+
 #: Share of the way from the principal point to the frame's corner.
 _AT_CORNER = 0.8
 
@@ -106,53 +116,41 @@ def camera_calibrations(
     if not counts or counts[0] < MIN_VIEWS:
         raise ArgumentError("views", list(views), f"expected numbers of at least {MIN_VIEWS}")
     if coefficients not in FREE_COEFFICIENTS:
-        raise ArgumentError(
-            "coefficients", coefficients,
-            f"expected one of {', '.join(map(str, FREE_COEFFICIENTS))}",
-        )
+        raise ArgumentError("coefficients", coefficients,
+                            f"expected one of {', '.join(map(str, FREE_COEFFICIENTS))}")
     if not 0 < target_m < float("inf"):
         raise ArgumentError("target_m", target_m, "expected a distance above 0 m")
-    name = _points_of(results, points)
+    if points is None:
+        points = "chessboard" if POINTS["chessboard"] in results else "markers"
+    if POINTS.get(points) not in results:
+        there = [name for name, variable in POINTS.items() if variable in results]
+        raise ArgumentError("points", points, f"expected one of {', '.join(there)}")
     trials = results.sizes.get(DRAWS, 1)
     sets = trials // counts[-1]
     if sets == 0:
         raise DatasetError(
             f"{trials} trials: expected at least {counts[-1]}, the views of a set; run the "
-            "pipeline with a longer axis trial"
-        )
+            "pipeline with a longer axis trial")
     dims = [dim for dim in axes_of(results, Stage.scene, Stage.detection) if dim != DRAWS]
     shape = [results.sizes[dim] for dim in dims]
     rows = []
     for index in itertools.product(*map(range, shape)):
         objects, pixels, camera, frame = _views(
-            results, pipeline, dict(zip(dims, index, strict=True)), name)
+            results, pipeline, dict(zip(dims, index, strict=True)), points)
         truth = np.concatenate([camera.view[0], camera.lenses[0, :5]])  # as INTRINSICS
         for count, number in itertools.product(counts, range(sets)):
             chosen = slice(number * counts[-1], number * counts[-1] + count)
             one = calibrate(objects[chosen], [each + offset_px for each in pixels[chosen]],
                             frame, coefficients)
-            position = _position_errors(one, camera, frame, target_m) if (
-                one.status == CalibrationStatus.calibrated) else np.full((2, 3), np.nan)
-            rows.append((
-                np.uint8(one.status), one.views, one.rms_px, one.values - truth, one.std, position))
-    grid = (*dims, "views", "set")
-    outputs: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
-        "calibration": ((), cf_attributes(
-            "what became of the calibration", flags=CalibrationStatus)),
-        "used_views": ((), cf_attributes("views with enough of the board")),
-        "rms_px": ((), cf_attributes("root mean square of the residuals", "px")),
-        "intrinsic_error": (("intrinsic",), cf_attributes("estimated minus true", "px, 1")),
-        "intrinsic_std": (("intrinsic",), cf_attributes(
-            "standard deviation that OpenCV reports", "px, 1")),
-        "position_error_m": (("direction", "xyz"), cf_attributes(
-            f"error of the position of a target at {target_m:g} m, camera frame", "m")),
-    }
+            rows.append((np.uint8(one.status), one.views, one.rms_px, one.values - truth, one.std,
+                         _position_errors(one, camera, frame, target_m)))
     variables = {}
-    for (label, (inner, attributes)), column in zip(
-            outputs.items(), zip(*rows, strict=True), strict=True):
-        values = np.array(column)
-        variables[label] = ((*grid, *inner), values.reshape(
-            (*shape, len(counts), sets, *values.shape[1:])), attributes)
+    for (name, (inner, *described)), column in zip(
+            OUTPUTS.items(), map(np.array, zip(*rows, strict=True)), strict=True):
+        variables[name] = (
+            (*dims, "views", "set", *inner),
+            column.reshape(*shape, len(counts), sets, *column.shape[1:]),
+            cf_attributes(*described))
     return xr.Dataset(
         variables,
         coords={
@@ -160,7 +158,7 @@ def camera_calibrations(
             "views": counts, "set": np.arange(sets), "intrinsic": list(INTRINSICS),
             "direction": list(DIRECTIONS), "xyz": ["x", "y", "z"],
         },
-        attrs={"points": name, "coefficients": coefficients, "target_m": target_m},
+        attrs={"points": points, "coefficients": coefficients, "target_m": target_m},
     )
 
 
@@ -243,17 +241,6 @@ def _pipeline_of(results: xr.Dataset) -> Pipeline:
     return pipeline
 
 
-def _points_of(results: xr.Dataset, points: str | None) -> str:
-    """Return the points that are used, a key of :data:`POINTS`."""
-    if points is None:
-        return "chessboard" if POINTS["chessboard"] in results else "markers"
-    if points not in POINTS:
-        raise ArgumentError("points", points, f"expected one of {', '.join(POINTS)}")
-    if POINTS[points] not in results:
-        raise ArgumentError("points", points, "expected markers: the board has no chessboard")
-    return points
-
-
 def _views(
     results: xr.Dataset, pipeline: Pipeline, at: dict[str, int], name: str
 ) -> tuple[list[Floats], list[Floats], Cameras, tuple[int, int]]:
@@ -290,26 +277,26 @@ def _views(
 def _position_errors(
     one: Intrinsics, camera: Cameras, frame: tuple[int, int], distance_m: float
 ) -> Floats:
-    """Return the errors (2, 3) in m of the position of a target of 0.2 m at :data:`DIRECTIONS`."""
-    side = 0.2
-    grid = np.stack(np.meshgrid(*[np.linspace(-side / 2, side / 2, 5)] * 2), axis=-1)
-    target = np.column_stack([grid.reshape(-1, 2), np.zeros(25)])
+    """Return the errors (2, 3) in m of the position of a target of 0.2 m at :data:`DIRECTIONS`.
+
+    NaN without a calibration, and where the lens does not show the target or no pose fits it.
+    """
+    errors = np.full((len(DIRECTIONS), 3), np.nan)
+    if one.status != CalibrationStatus.calibrated:
+        return errors
+    line = np.linspace(-0.1, 0.1, 5)
+    target = np.array([(x, y, 0.0) for y in line for x in line])
     rotation = np.diag([1.0, -1.0, -1.0])[None]
-    fx, fy, cx, cy = camera.view[0]
-    corner = np.array([
-        _AT_CORNER * (frame[0] - 1 - cx) / fx, _AT_CORNER * (frame[1] - 1 - cy) / fy
-    ])
+    focal, centre = np.split(camera.view[0], 2)
     assumed = Cameras(
         one.values[None, :4], np.array([pack(tuple(one.values[4:].tolist()))]),
         np.array([one.values[4:].any()]),
     )
-    errors = np.full((len(DIRECTIONS), 3), np.nan)
-    for k, bearing in enumerate((np.zeros(2), corner)):
+    for k, share in enumerate((0.0, _AT_CORNER)):
+        bearing = share * (np.array(frame) - 1 - centre) / focal
         position = np.array([*(bearing * distance_m), distance_m])
         pixels = camera.project(transform_points(target[None], rotation, position[None]))[0]
-        if not np.isfinite(pixels).all():
-            continue
-        poses = GuardedPoints.of(target, pixels, assumed).poses(cv2.SOLVEPNP_IPPE)
-        if poses:
+        if np.isfinite(pixels).all() and (
+                poses := GuardedPoints.of(target, pixels, assumed).poses(cv2.SOLVEPNP_IPPE)):
             errors[k] = poses[0][1] - position
     return errors

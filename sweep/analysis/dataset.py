@@ -366,29 +366,14 @@ def image_sides(results: xr.Dataset) -> xr.DataArray:
             raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid")
     if by_side:
         return _checked(results["side_px"])
-    return sides_of(functools.partial(parameter_value, results))
-
-
-def sides_of(value: Callable[[str], Any]) -> xr.DataArray:
-    """Return the sides in pixels from distance, size and camera.
-
-    Parameters
-    ----------
-    value
-        Returns the value of a parameter, or its values over the dimensions that it has.
-
-    Raises
-    ------
-    DatasetError
-        If they cannot be computed.
-    """
-    distance = value("distance_m")
+    distance = parameter_value(results, "distance_m")
     if distance is None:
         raise DatasetError(
             "distance_m: is no number of this store, whose poses are given in the world; a "
             "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
-    fx = xr.DataArray(intrinsics(*map(value, VIEW_PARAMETERS))[0])
-    return _checked(fx * value("size_m") / distance)
+    fx = xr.DataArray(intrinsics(*(
+        parameter_value(results, name) for name in VIEW_PARAMETERS))[0])
+    return _checked(fx * parameter_value(results, "size_m") / distance)
 
 
 def _checked(sides: xr.DataArray) -> xr.DataArray:

@@ -12,31 +12,11 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
+from sweep.analysis import requirements as decisions
 from sweep.analysis.dataset import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.intervals import looks_factor
-from sweep.analysis.requirements import (
-    CONFIDENCE,
-    ERROR_PROBABILITY,
-    MIN_DRAWS,
-    ChoiceCells,
-    Decision,
-    ErrorShares,
-    Requirable,
-    Requirement,
-    check_required,
-    choice_cells,
-    combined_decision,
-    decide,
-    error_shares,
-    is_harder_upwards,
-    kept_by,
-    met_run,
-    parse_requirements,
-    precision_reached,
-    read_requirements,
-    wanted_precisions,
-)
+from sweep.analysis.requirements import Decision, ErrorShares, Requirable, Requirement
 from sweep.errors import PipelineError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL, Block
@@ -119,7 +99,7 @@ def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Ma
     at = np.flatnonzero(judged)
     keeps, met, not_met = keeps[at], met[at], not_met[at]
     index = np.arange(len(at))
-    run = met_run(keeps, np.ones(len(at), dtype=bool))
+    run = decisions.met_run(keeps, np.ones(len(at), dtype=bool))
     start = run[0] if run else 0
     ends = np.flatnonzero(not_met & (index >= start))
     end = ends[0] if len(ends) else len(at)
@@ -182,17 +162,17 @@ def pooled_cells(pipeline: Pipeline, rule: StoppingRule) -> int:
 
 def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the values of the axis at which trials decide the limit."""
-    check_required(rule.requirements, pipeline.source)
-    required = parse_requirements(rule.requirements)
+    decisions.check_required(rule.requirements, pipeline.source)
+    required = decisions.parse_requirements(rule.requirements)
     searched = (*rule.per, *rule.at_all, rule.along)
-    shares = error_shares(
+    shares = decisions.error_shares(
         looks_factor(len(rule.ends)),
         len(required) * product_of(pipeline, (rule.along, *rule.at_all)))
     most = rule.max_trials * pooled_cells(pipeline, rule)
 
     def open_cells(dataset: xr.Dataset) -> xr.DataArray:
-        table = decide(dataset, required, searched, shares=shares)
-        keeps = kept_by(table, required)
+        table = decisions.decide(dataset, required, searched, shares=shares)
+        keeps = decisions.kept_by(table, required)
         inner = [*rule.at_all, "requirement"]
         arrays = [array.sortby(rule.along) for array in (
             table["decision"], keeps, may_be_decided(table, keeps, required, shares, most))]
@@ -216,7 +196,7 @@ def may_be_decided(
     that saves 15 % of the poses, and the intervals stay as they were.
     """
     value, draws, limit = table["value"], table["draws"], table["limit"]
-    met, not_met = (-float(special.ndtri(ERROR_PROBABILITY / 2.0 * share))
+    met, not_met = (-float(special.ndtri(decisions.ERROR_PROBABILITY / 2.0 * share))
                     for share in (shares.met, shares.not_met))
     errors = xr.full_like(value, not_met).where(~keeps, met)
     width = (value - table["low"]).where(value >= limit, table["high"] - value)
@@ -232,9 +212,9 @@ def _of_row(
     """Return which decisions (values, *at_all, requirement) along an axis need trials."""
     inner = tuple(range(1, decision.ndim))
     keep = keeps | (decision == Decision.not_applicable)
-    upwards = is_harder_upwards(along, keeps)
+    upwards = decisions.is_harder_upwards(along, keeps)
     step = slice(None, None, 1 if upwards else -1)
-    of_values = combined_decision(decision, inner)[step]
+    of_values = decisions.combined_decision(decision, inner)[step]
     values = wanted_values(
         keep.all(axis=inner)[step], of_values == Decision.met, of_values == Decision.not_met,
         of_values != Decision.not_applicable)[step]
@@ -247,7 +227,7 @@ def _of_row(
 
 def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
     """Return the shares of the error probability that each decision of a choice may spend."""
-    return error_shares(
+    return decisions.error_shares(
         len(rule.ends) * product_of(pipeline, rule.among),
         product_of(pipeline, (rule.along, *rule.at_all)) * len(rule.requirements))
 
@@ -260,12 +240,12 @@ def least_draws(requirement: Requirement, share: float) -> int:
 
     Examples
     --------
-    >>> least_draws(parse_requirements("detection >= 0.99")[0], 1.0)
+    >>> least_draws(decisions.parse_requirements("detection >= 0.99")[0], 1.0)
     368
     """
     what = requirement.requirable
     if not what.exact:
-        return MIN_DRAWS
+        return decisions.MIN_DRAWS
     # The share of the draws that must not be seen, or must be.
     below = requirement.limit if what.percent is None else what.percent / 100.0
     rare = below if requirement.at_least == (what.percent is not None) else 1.0 - below
@@ -274,20 +254,23 @@ def least_draws(requirement: Requirement, share: float) -> int:
 
 def _choice(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the cells that decide the smallest, or the cheapest, choice."""
-    shares, required = choice_shares(pipeline, rule), read_requirements(rule.requirements)[0]
+    shares = choice_shares(pipeline, rule)
+    required = decisions.read_requirements(rule.requirements)[0]
     lines = [
         _too_few(pipeline, rule, least, f"fewer cannot show {each.text} with "
-                 f"{100 * CONFIDENCE:g} % confidence, even if all meet it")
+                 f"{100 * decisions.CONFIDENCE:g} % confidence, even if all meet it")
         for each in required if (least := least_draws(each, shares.met))]
-    lines = [line for line in lines if line]
-    check_required(rule.requirements, pipeline.source, PipelineError(lines) if lines else None)
-    return [each.requirable for each in required], lambda dataset: choice_cells(
+    faults = PipelineError(lines) if (lines := list(filter(None, lines))) else None
+    decisions.check_required(rule.requirements, pipeline.source, faults)
+    return [each.requirable for each in required], lambda dataset: decisions.choice_cells(
         dataset, rule, shares).needed()
 
 
-def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule) -> ChoiceCells:
+def store_cells(
+    results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule
+) -> decisions.ChoiceCells:
     """Return the decisions of a store's whole dataset, as the search made the last ones."""
-    return choice_cells(results, rule, choice_shares(pipeline, rule))
+    return decisions.choice_cells(results, rule, choice_shares(pipeline, rule))
 
 
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
@@ -299,7 +282,7 @@ def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the conditions at which an interval is wider than was wanted."""
     widths = dict(rule.precision)
     try:
-        wanted = wanted_precisions(widths)
+        wanted = decisions.wanted_precisions(widths)
     except ValueError as error:
         raise refusal([f"{pipeline.source}: search.precision.{line}"
                        for line in str(error).splitlines()]) from None
@@ -307,7 +290,7 @@ def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
                       f"has a half-width of {each.half_width:g}") for each in wanted]
     if any(lines):
         raise refusal(list(filter(None, lines)))
-    return [each.requirable for each in wanted], lambda dataset: ~precision_reached(
+    return [each.requirable for each in wanted], lambda dataset: ~decisions.precision_reached(
         dataset, widths, rule.per, rule.max_trials)["settled"]
 
 

@@ -920,8 +920,7 @@ def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
     if name in results.dims:
         return results
     value = parameter_value(results, name) if name in PARAMETERS else None
-    if isinstance(value, xr.DataArray):
-        value = value.item()
+    value = value.item() if isinstance(value, xr.DataArray) else value
     if value is None:
         raise DatasetError(f"{name}: one of both does not have this axis; measure both with it")
     if other[name].dtype.kind in "OU":

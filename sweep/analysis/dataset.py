@@ -77,11 +77,6 @@ def is_fixed(coordinate: xr.DataArray) -> bool:
     return not coordinate.dims and FIXED in coordinate.attrs
 
 
-def without_fixed(array: xr.DataArray) -> xr.DataArray:
-    """Return an array without the coordinates of fixed parameters."""
-    return array.drop_vars([name for name, each in array.coords.items() if is_fixed(each)])
-
-
 def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
     """Return the fingerprint in a dataset's attributes; empty if they have none."""
     fingerprint = _run_metadata(results).get("fingerprint")
@@ -382,7 +377,7 @@ def _checked(sides: xr.DataArray) -> xr.DataArray:
     if not (np.isfinite(sides) & (sides > 0)).all():
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
                            "the distance and the camera")
-    return without_fixed(sides)
+    return sides.drop_vars([name for name, each in sides.coords.items() if is_fixed(each)])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -761,11 +756,6 @@ class Poses:
         return self.solved & ~self.flipped
 
     @cached_property
-    def rotation_deg(self) -> Floats:
-        """Rotation error vectors, (..., xyz), in degrees."""
-        return np.asarray(np.degrees(self["rotation_error_rad"], dtype=np.float64))
-
-    @cached_property
     def range_percent(self) -> Floats:
         """Depth error in percent of the true depth, (..., 1)."""
         return self.percent_of_depth(self["translation_error_m"][..., 2])[..., None]
@@ -780,11 +770,6 @@ class Poses:
         """Errors along axes and about angles."""
         return SignedErrors(self["true_rvec"], self["true_tvec_m"], self["rotation_error_rad"],
                             self["translation_error_m"])
-
-    @cached_property
-    def position_m(self) -> Floats:
-        """Position error vectors, (..., xyz), in metres."""
-        return np.asarray(self["translation_error_m"], dtype=np.float64)
 
 
 def norm_squared(vectors: NDArray[Any]) -> Floats:
@@ -854,11 +839,12 @@ class Quantity:
 
 #: Kinds of error in `sweep.analysis.error_statistics` unless others are asked for.
 QUANTITIES = (
-    Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg,
-             bound=180.0),
+    Quantity("rotation", "deg", "degree", "rotation error",
+             lambda poses: np.degrees(poses["rotation_error_rad"], dtype=np.float64), bound=180.0),
     Quantity("range", "percent", "percent", "depth error of the true depth",
              lambda poses: poses.range_percent, signed=True),
-    Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
+    Quantity("position", "m", "m", "position error",
+             lambda poses: poses["translation_error_m"].astype(np.float64)),
 )
 
 

@@ -862,8 +862,9 @@ def matched_sides(
     read_bins(first, kept, bins)
     scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
     std = second.get(TRUTH_STD)
-    first, second = (side[list(ERROR_INPUTS)].assign({
-        name: _binned(side, name) for name in bins}).drop_attrs() for side in (first, second))
+    first, second = (
+        side[list(ERROR_INPUTS)].assign({name: _binned(side, name) for name in bins})
+        .drop_attrs(deep=False) for side in (first, second))
     if paired:
         trials = _trials_of(photographs, simulated)
         some = np.flatnonzero((trials >= 0).any(axis=1))

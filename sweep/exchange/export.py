@@ -7,7 +7,6 @@ import functools
 import hashlib
 import json
 import multiprocessing
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -366,8 +365,8 @@ class Export:
     images, invisible
         Scenes with an image, and scenes without: the marker is not visible, or the lens folds.
     written, kept, damaged
-        Images that were rendered now; that were there; and of those rendered now, those that an
-        earlier export had listed, and that were missing or had been changed.
+        Images that were written now; that were there; and of those written now, those of a
+        finished export that were missing or had been changed.
     bytes
         Size of the images.
     cameras
@@ -399,7 +398,8 @@ def export(
     """Write the images of an experiment, their truth and camera files into a folder.
 
     A folder with an unfinished export of the same experiment is continued: images are written
-    whole, so that those that are there are done, unless a finished export listed other digests.
+    whole, so that those that are there are done. Those of a finished one are rendered again, and
+    what is missing or was changed is written.
 
     Parameters
     ----------
@@ -440,10 +440,10 @@ def export(
         if not begun:
             _write_experiment(pipeline, target)
             write_whole(target / MARK, json.dumps(mark, indent=2).encode() + b"\n")
-        damaged = _remove_changed(target)
+        finished = (target / CHECKSUMS).exists()
         files: list[ImageFile] = []
         truths: list[Truth] = []
-        for of_images, truth in _parts(pipeline, target, count, windowed, workers):
+        for of_images, truth in _parts(pipeline, target, windowed, finished, workers):
             files += of_images
             truths.append(truth)
             if progress is not None:
@@ -457,8 +457,9 @@ def export(
         ).encode())
     written = sum(each.written for each in files)
     return Export(
-        str(folder), len(files), count - len(files), written, len(files) - written, damaged,
-        sum(each.size for each in files), cameras, time.perf_counter() - started,
+        str(folder), len(files), count - len(files), written, len(files) - written,
+        written * finished, sum(each.size for each in files), cameras,
+        time.perf_counter() - started,
     )
 
 
@@ -522,24 +523,6 @@ def _write_experiment(pipeline: Pipeline, folder: Path) -> None:
     write_whole(home / "pipeline.toml", pipeline.text.encode())
 
 
-def _remove_changed(folder: Path) -> int:
-    """Delete the images that differ from the digests of an export that was finished here.
-
-    Returns how many of the listed images were missing or had been changed.
-    """
-    try:
-        text = (folder / CHECKSUMS).read_text(encoding="utf-8")
-    except (FileNotFoundError, ValueError):
-        return 0
-    count = 0
-    for digest, name in re.findall(r"^([0-9a-f]{64})  (images/[^/\n]+)$", text, re.MULTILINE):
-        path = folder / name
-        if not path.exists() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-            path.unlink(missing_ok=True)
-            count += 1
-    return count
-
-
 class ImageFile(NamedTuple):
     """An image of an export: its path and digest, its bytes, and whether it was written now."""
 
@@ -550,11 +533,12 @@ class ImageFile(NamedTuple):
 
 
 def _parts(
-    pipeline: Pipeline, folder: Path, count: int, windowed: bool, workers: int | None
+    pipeline: Pipeline, folder: Path, windowed: bool, finished: bool, workers: int | None
 ) -> Iterator[tuple[list[ImageFile], Truth]]:
     """Yield the parts of an export, in this process or from several."""
+    count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
-    work = functools.partial(write_images, pipeline, folder, windowed)
+    work = functools.partial(write_images, pipeline, folder, windowed, finished)
     if workers is None or workers == 1 or len(parts) == 1:
         yield from map(work, parts)
         return
@@ -564,9 +548,11 @@ def _parts(
 
 
 def write_images(
-    pipeline: Pipeline, folder: Path, windowed: bool, numbers: range
+    pipeline: Pipeline, folder: Path, windowed: bool, finished: bool, numbers: range
 ) -> tuple[list[ImageFile], Truth]:
     """Write the images of scenes by their numbers that are missing; return all, and their truth.
+
+    Images of an export that was ``finished`` are not believed: they are rendered again.
 
     Raises
     ------
@@ -578,12 +564,12 @@ def write_images(
     for row in np.flatnonzero(images.batch.visible).tolist():
         name = f"images/{images.names[row]}"
         path = folder / name
-        missing = not path.exists()
-        if missing:
-            write_whole(path, encoded_image(images, row))
-        content = path.read_bytes()
+        found = path.read_bytes() if path.exists() else None
+        content = encoded_image(images, row) if found is None or finished else found
+        if content != found:
+            write_whole(path, content)
         digest = hashlib.sha256(content).hexdigest()
-        files.append(ImageFile(name, digest, len(content), missing))
+        files.append(ImageFile(name, digest, len(content), content != found))
     return files, truth_of(images)
 
 

@@ -240,19 +240,13 @@ def named(name: str) -> Requirable:
     kinds = [other for other in known if other.startswith(f"{stem}_") and any(
         f"_{each}_" in other for each in STATISTICS)]
     if ending in UNITS:
-        problem = f"its unit is {UNITS[ending]}: write {stem}_{ending}"
-    elif f"{stem}_rate" in known:
-        problem = f"is a share from 0 to 1: write {stem}_rate"
-    elif kinds:
-        problem = f"which statistic of it? There are {', '.join(kinds)}"
-    elif short in {"looked_for", "detected", "count", "draws"}:
-        problem = "is a count, which has no interval; expected a rate or an error"
-    else:
-        hint = nearest(short, [*known]) or (
-            f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
-            "the guide sweep/analysis/README.md")
-        problem = f"nothing of this name has an interval{hint}"
-    raise ValueError(problem)
+        raise ValueError(f"its unit is {UNITS[ending]}: write {stem}_{ending}")
+    if kinds:
+        raise ValueError(f"which statistic of it? There are {', '.join(kinds)}")
+    hint = nearest(short, [*known]) or (
+        f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
+        "the guide sweep/analysis/README.md")
+    raise ValueError(f"nothing of this name has an interval{hint}")
 
 
 EXAMPLES = ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "range_p95_percent",
@@ -260,37 +254,23 @@ EXAMPLES = ("detection_rate", "solved_rate", "flip_rate", "rotation_p95_deg", "r
 
 
 def fault_of(what: Requirable, given: RequirementText) -> str:
-    """Return the fault of a limit and its unit; empty without one."""
-    limit, more = given.limit, given.relation in (">=", ">")
-    share = f": write {limit / 100:g} for {limit:g} %" if 2.0 <= limit <= 100.0 else ""
+    """Return the fault of a limit and its unit; empty without one.
+
+    A limit is above 0 and below the largest value: draws cannot show others, or they hold always.
+    """
+    if given.unit:
+        ending = what.name.rpartition("_")[2]
+        words = f"in {UNITS[ending]}" if ending in UNITS else "without a unit"
+        if what.is_rate and given.unit in ("%", "percent"):
+            words = f"a share from 0 to 1: write {given.limit / 100:g}"
+        return f"{plain(given.unit)} after the limit: expected the number alone, {words}"
+    if 0.0 < given.limit < what.largest:
+        return ""
+    below = f" and below {what.largest:g}" if math.isfinite(what.largest) else ""
+    share = f": write {given.limit / 100:g} for {given.limit:g} %" if (
+        what.is_rate and 2.0 <= given.limit < 100.0) else ""
     sign = " (of a bias the absolute value is required)" if what.signed else ""
-    example = ", such as 0.01" if what.is_rate else ""
-    faults = (
-        (given.unit, _wrong_unit(what, given)),
-        (what.is_rate and not 0.0 <= limit <= 1.0, f"a share is from 0 to 1{share}"),
-        (limit < 0.0, f"{what.name} is never negative{sign}: expected a limit above 0"),
-        (limit > what.largest, f"{what.name} is never above {what.largest:g} {what.units}"),
-        (more and limit == 0.0, "holds always: expected a limit above 0"),
-        (not more and limit == what.largest,
-         f"holds always: expected a limit below {what.largest:g}"),
-        (more and what.is_rate and limit == 1.0,
-         "no number of draws can show a rate of 1: write 0.99, for instance"),
-        (not more and limit == 0.0,
-         f"no number of draws can show 0: expected a limit above it{example}"),
-    )
-    return next((text for is_so, text in faults if is_so), "")
-
-
-def _wrong_unit(what: Requirable, given: RequirementText) -> str:
-    if decimal := re.fullmatch(r",(\d+)", given.unit):
-        return f"a comma in a number: write {given.limit:g}.{decimal[1]}"
-    unit = "percent" if given.unit == "%" else given.unit
-    if what.is_rate and unit == "percent":
-        return f"the limit is a share from 0 to 1: write {given.limit / 100:g}"
-    ending = what.name.rpartition("_")[2]
-    words = f"in {UNITS[ending]}" if ending in UNITS else "without a unit"
-    more = "; each requirement is a text of its own" if re.search(r"[<>≤≥]", unit) else ""
-    return f"{plain(given.unit)} after the limit: expected the number alone, {words}{more}"
+    return f"expected a limit above 0{below}{share}{sign}"
 
 
 def contradictions(given: Sequence[Requirement]) -> list[tuple[str, str]]:

@@ -19,7 +19,6 @@ from sweep.analysis.dataset import (
     DRAWS,
     ERROR_INPUTS,
     INSIDE,
-    OF_MARKERS,
     QUANTITIES,
     Labelled,
     Poses,
@@ -308,8 +307,7 @@ class RateDifference(Statistic[Pair]):
 
 def _both_squares(quantity: Quantity, pair: Pair) -> Floats:
     """Return the squared absolute errors (..., 2) of both poses."""
-    return np.stack([norm_squared(quantity.vector(side)) for side in (pair.first, pair.second)],
-                    axis=-1)
+    return np.concatenate([quantity.squares(pair.first), quantity.squares(pair.second)], axis=-1)
 
 
 def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
@@ -335,16 +333,8 @@ def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
 # --------------------------------------------------------------------------------------------------
 # Changes by a renderer against the exact one, paired scene by scene.
 
-CORNERS = "corner_error_px"
-OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
-
-#: Groups, cells, draws and settings: what stands before the dimensions of a pose's corners.
-_POSE_DIMENSIONS = 4
-
-
-def corners_of(results: xr.Dataset) -> str:
-    """Return the name of the corners' errors: a marker's, or a board's markers'."""
-    return OF_BOARDS if OF_BOARDS in results else CORNERS
+#: Variables of corners: of a single marker, or of a board's markers and of its chessboard.
+CORNER_VARIABLES = ("corner_error_px", "marker_corner_error_px", "chessboard_corner_error_px")
 
 
 @describes
@@ -402,7 +392,8 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     def kept(name: str) -> list[str]:
         return ["renderer", *(str(dim) for dim in results[name].dims if dim not in scene)]
 
-    corners, whose = corners_of(results), "minus the reference's"
+    single, of_boards, _ = CORNER_VARIABLES
+    corners, whose = of_boards if of_boards in results else single, "minus the reference's"
     of_detections: list[PairStatistic] = [
         Rate("detection_disagreement", "differing of compared",
              lambda pair: pair.first.detected != pair.second.detected, lambda pair: pair.compared,
@@ -437,9 +428,7 @@ def _corner_shift(pair: Pair, corners: str) -> Floats:
     Of a board the corners count that both found; one without any does not count.
     """
     moved = np.subtract(pair.second[corners], pair.first[corners], dtype=np.float64) ** 2
-    inner = tuple(range(_POSE_DIMENSIONS, moved.ndim))
-    if corners == CORNERS:
-        return np.asarray(moved.mean(axis=inner)[..., None])
+    inner = tuple(range(4, moved.ndim))  # behind groups, cells, draws and settings
     found = np.isfinite(moved).sum(axis=inner)
     total = np.nansum(moved, axis=inner)
     return np.where(found > 0, total / np.maximum(found, 1), np.nan)[..., None]
@@ -536,7 +525,7 @@ def regressions(
 
 
 def _first_error(quantity: Quantity, pair: Pair) -> Floats:
-    return np.sqrt(_both_squares(quantity, pair)[..., :1])
+    return quantity.norm(pair.first)[..., None]
 
 
 def _worst(
@@ -562,11 +551,8 @@ def _worst(
 # --------------------------------------------------------------------------------------------------
 # Differences between two stores of one pipeline, such as two versions of OpenCV made.
 
-#: Variables of corners: of a single marker, or of a board's markers and of its chessboard.
-CORNER_VARIABLES = ("corner_error_px", "marker_corner_error_px", "chessboard_corner_error_px")
-
-#: Coordinates of the dimension ``statistic``.
-STATISTICS = ("median", "p99", "worst")
+#: Coordinates of the dimension ``statistic`` -> share of the differences up to it.
+STATISTICS = {"median": 0.5, "p99": 0.99, "worst": 1.0}
 
 #: Relative difference of true poses up to which they are one: other processors round otherwise.
 TRUTH_RTOL = 1e-9
@@ -638,17 +624,19 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
         done[stage] = [~each.isin((kind.not_run, kind.not_needed)) for each in flags]
         both = done[stage][0] & done[stage][1]
         columns |= {
-            f"{stage}s_compared": (both.sum(scene), "poses computed in both", "1"),
             f"{stage}s_differing": (((flags[0] != flags[1]) & both).sum(scene),
                                     "poses computed in both, with another flag", "1"),
             f"{stage}s": (_by_flags(kind, stage, flags, both, scene),
                           "poses by their flags in the first and in the second store", "1")}
     found = done["detection"]
-    corners = _summed([_corners_apart(sides, name, found[0] & found[1])
-                       for name in CORNER_VARIABLES if name in read], scene)
+    both = found[0] & found[1]
+    corners = _summed([_apart([side[name] for side in sides], [
+        xr.apply_ufunc(np.isfinite, side[name]).all("xy") & both for side in sides], "xy")
+        for name in CORNER_VARIABLES if name in read], scene)
     poses = _summed([_poses_apart(sides)], scene)
     differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
     columns |= {
+        "detections_compared": (both.sum(scene), "poses computed in both", "1"),
         "computed_once": ((found[0] ^ found[1]).sum(scene),
                           "poses that one store computed and the other did not", "1"),
         "corners_compared": (corners["both"], "corners that both found", "1"),
@@ -664,7 +652,6 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
                          dims=("entry", "store")),
             "what the results depend on and differs between the stores", ""),
     }
-    del columns["estimates_compared"]
     return xr.Dataset(
         {name: array.assign_attrs(cf_attributes(meaning, units))
          for name, (array, meaning, units) in columns.items()},
@@ -701,14 +688,6 @@ def _apart(
         "distance": ((second.astype(np.float64) - first) ** 2).sum(across) ** 0.5})
 
 
-def _corners_apart(
-    sides: Sequence[xr.Dataset], name: str, computed: xr.DataArray
-) -> xr.Dataset:
-    """Return which corners differ, and how far, px."""
-    return _apart([side[name] for side in sides], [
-        xr.apply_ufunc(np.isfinite, side[name]).all("xy") & computed for side in sides], "xy")
-
-
 def _poses_apart(sides: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return which poses differ, and how far: m, degrees."""
     solved = [side["estimate"] == EstimateStatus.solved for side in sides]
@@ -731,9 +710,8 @@ def _summed(parts: Sequence[xr.Dataset], scene: Sequence[str]) -> xr.Dataset:
     They are over all dimensions of scenes and of labels.
     """
     def statistics(length: Floats, differ: Masks) -> Floats:
-        some = length[differ]
-        return np.array([*np.quantile(some, (0.5, 0.99)), some.max()]) if some.size else (
-            np.full(len(STATISTICS), np.nan))
+        some = length[differ] if differ.any() else np.array([np.nan])
+        return np.asarray(np.quantile(some, [*STATISTICS.values()]))
 
     table = xr.concat([part.stack(
         item=[dim for dim in part.dims if dim in scene or dim in LABELS], create_index=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import zlib
 
 import pytest
 
@@ -166,3 +167,8 @@ def test_names_of_variables_and_parameters_are_short_and_distinct():
     declared = [name for groups, _ in SECTIONS.values() for each in groups
                 for name in declared_fields(each)]
     assert len(declared) == len(PARAMETERS)
+
+
+def test_defaults_and_ranges_are_those_that_were_recorded():
+    declared = [(p.section, name, p.default, p.low, p.high) for name, p in PARAMETERS.items()]
+    assert zlib.crc32(repr(declared).encode()) == 140932006, "results of old pipelines would change"

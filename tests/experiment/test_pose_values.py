@@ -117,6 +117,15 @@ def test_shares_of_0_and_1_touch_the_edges(distortion):
         )
 
 
+def test_a_lens_that_folds_before_the_edges_keeps_left_and_right_alike():
+    # r (1 - 0.8 r²) grows up to r = 0.645, which is 215 px of 320 from the middle.
+    _, scenes = made({"frame_y": 0.5, "distance_m": 1}, {"frame_x": [0, 1]},
+                     marker={"size_m": 0.1}, camera={"fx_px": 500, "distortion": [-0.8, 0, 0, 0]})
+    left, right = scenes.corners_px[:, :, 0]
+    np.testing.assert_allclose(np.sort(639 - left), np.sort(right), atol=1e-6)
+    assert left.min() == pytest.approx(319.5 - 500 * 0.645 * 2 / 3, abs=1)
+
+
 # The world
 
 @lengths(1000, 100_000)

@@ -20,8 +20,10 @@ from sweep.model.exposure import (
     defocus_px,
     marker_boxes,
     not_modelled,
+    outline_extent,
     seen_sheets,
 )
+from sweep.model.polygon import Projection
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
 
@@ -275,6 +277,19 @@ def test_all_that_an_exposed_marker_touches_lies_in_its_box(count, exposed, lens
         # 6e-7 of the point spread lie beyond its reach: 1.5e-4 levels. Right of a blurred marker
         # the errors of its edges' quadratures add up, in the whole frame as in the box.
         assert beyond.max() < BLUR_TOLERANCE
+
+
+def test_extent_of_points_over_a_plane_is_that_of_their_projections():
+    rng = np.random.default_rng(4)
+    turn = Rotation.from_euler("xyz", [205, -35, 10], degrees=True).as_matrix()
+    outline = rng.uniform(-5, 5, (8, 3))
+    points = 0.01 * outline * [1, -1, 1] @ turn.T + [0.02, -0.03, 0.4]
+    plane = np.column_stack([0.01 * turn[:, 0], -0.01 * turn[:, 1], [0.02, -0.03, 0.4]])
+    optics, extent = build_scenes(scene(), 1).cameras.optics(0), np.empty(4)
+    behind, folds = outline_extent(Projection(plane, optics), outline, extent)
+    pixels = points[:, :2] / points[:, 2:] * optics.intrinsics[:2] + optics.intrinsics[2:]
+    np.testing.assert_allclose(extent, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-12)
+    assert (behind, folds) == (0, False)
 
 
 @pytest.mark.parametrize("given", [

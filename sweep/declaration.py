@@ -221,30 +221,6 @@ def check_table(
     return values, lines
 
 
-def table_reader(
-    declared: Mapping[str, Declared], owner: str, expected: str = ""
-) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
-    """Return a reader of tables as tuples of the values of ``declared``, in its order.
-
-    It raises ValueError if they are no tables, in words that are ``expected``, and
-    :class:`TablesError` for the faults in them, as :func:`check_table` tells them.
-    """
-    expected = expected or f"tables with {', '.join(declared)}"
-
-    def read(value: Any) -> tuple[tuple[Any, ...], ...]:
-        if not isinstance(value, (list, tuple)) or not all(
-                isinstance(table, Mapping) for table in value):
-            raise ValueError(expected)
-        checked = [check_table(declared, table, owner) for table in value]
-        lines = [f"[{number}].{line}" for number, (_, faults) in enumerate(checked)
-                 for line in faults]
-        if lines:
-            raise TablesError(expected, lines)
-        return tuple(tuple(row.values()) for row, _ in checked)
-
-    return read
-
-
 def plain_types(hint: Any) -> tuple[type, ...]:
     """Return the plain types of an annotation, without None.
 

@@ -26,6 +26,7 @@ from sweep.errors import ArgumentError, RunError, StoreError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
+from sweep.exchange.answers import CORNER_COLUMNS, POSITION, VECTOR
 from sweep.execution.forecast import FreeDisk, free_disk
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
@@ -147,14 +148,11 @@ class FileCamera:
 # --------------------------------------------------------------------------------------------------
 # The truth of exported images: arrays over the scenes, and a row for each square of an image.
 
-#: Columns of the corners: x0, y0 of the top left one, then clockwise on the marker.
-CORNERS = tuple(f"{axis}{corner}" for corner in range(4) for axis in "xy")
-
 #: Columns of where the corners are on the target, in its frame.
 PLACES = tuple(f"{axis}{corner}_m" for corner in range(4) for axis in "XYZ")
 
 #: Columns of the rotation vector in rad and of the position in m.
-POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
+POSE = (*VECTOR, *POSITION)
 
 
 class Truth(NamedTuple):
@@ -216,7 +214,7 @@ def truth_of(images: Images) -> Truth:
     squares = pd.DataFrame({
         "image": arrays["image"][row], "id": targets.marker_id[row, square],
         "dictionary": [targets.targets[i].dictionary for i in row.tolist()],
-        **_columns(CORNERS, targets.corners_px[row, square] - first[row, None]),
+        **_columns(CORNER_COLUMNS, targets.corners_px[row, square] - first[row, None]),
         "visible": (targets.flags[row, square] == DetectionStatus.not_run).astype(np.int64),
         **_columns(PLACES, np.array(places)),
     }).join(of_image.iloc[row].reset_index(drop=True))
@@ -269,7 +267,7 @@ COCO_INFO = {
 
 def _coco(squares: pd.DataFrame) -> dict[str, Any]:
     """Return rows of truth.csv as COCO keypoints; a category is a dictionary's marker."""
-    points = squares[list(CORNERS)].to_numpy().reshape(-1, 4, 2)
+    points = squares[list(CORNER_COLUMNS)].to_numpy().reshape(-1, 4, 2)
     size = squares[["width_px", "height_px"]].to_numpy()[:, None]
     seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=2) & (
         squares[["visible"]].to_numpy() > 0)
@@ -285,8 +283,8 @@ def _coco(squares: pd.DataFrame) -> dict[str, Any]:
         # COCO's 2: visible.
         "keypoints": np.dstack([points, 2 * seen]).reshape(-1, 12).tolist(),
         "num_keypoints": seen.sum(axis=1),
-        "rvec": squares[list(POSE[:3])].to_numpy().tolist(),
-        "tvec_m": squares[list(POSE[3:])].to_numpy().tolist(),
+        "rvec": squares[list(VECTOR)].to_numpy().tolist(),
+        "tvec_m": squares[list(POSITION)].to_numpy().tolist(),
     })
     images = numbered.drop_duplicates("image_id")
     categories = numbered.drop_duplicates("category_id")

@@ -16,7 +16,7 @@ import tomlkit
 
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export
-from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
+from sweep.exchange.answers import CORNER_COLUMNS, CORNERS, Answers, Conventions, read_answers
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
@@ -132,15 +132,15 @@ class _Images:
         origin = ["origin_x_px", "origin_y_px"]
         try:
             table = pd.read_csv(
-                folder / "truth.csv", usecols=["image", "id", *origin, *export.CORNERS],
-                dtype=dict.fromkeys(export.CORNERS, np.float64))
+                folder / "truth.csv", usecols=["image", "id", *origin, *CORNER_COLUMNS],
+                dtype=dict.fromkeys(CORNER_COLUMNS, np.float64))
             image, names = pd.factorize(table["image"])
             indices = pipeline.experiment.all_scenes.indices(
                 np.array([name.partition("-")[0] for name in names], dtype=np.intp))
         except (OSError, ValueError) as error:
             raise StoreError(f"{shown}: truth.csv cannot be read ({plain(error)}); the same "
                              "`sweep export` writes it") from None
-        corners = table.set_index([image, "id"])[[*export.CORNERS]]
+        corners = table.set_index([image, "id"])[[*CORNER_COLUMNS]]
         return _Images(
             pipeline, {Path(name).stem: k for k, name in enumerate(names)},
             pipeline.experiment.image_keys(indices),

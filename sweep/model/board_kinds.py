@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sweep.declaration import declared_fields, parameter, table_reader
+from sweep.declaration import Declared, TablesError, check_table, declared_fields, parameter
 from sweep.model import board, marker
 from sweep.model.board import Board, Chessboard, Print
 from sweep.model.coverage import joined
@@ -35,6 +35,30 @@ class Fault(NamedTuple):
     key: str
     value: Any
     expected: str
+
+
+def table_reader(
+    declared: Mapping[str, Declared], owner: str, expected: str = ""
+) -> Callable[[Any], tuple[tuple[Any, ...], ...]]:
+    """Return a reader of tables as tuples of the values of ``declared``, in its order.
+
+    It raises ValueError if they are no tables, in words that are ``expected``, and
+    `TablesError` for the faults in them, as `check_table` tells them.
+    """
+    expected = expected or f"tables with {', '.join(declared)}"
+
+    def read(value: Any) -> tuple[tuple[Any, ...], ...]:
+        if not isinstance(value, (list, tuple)) or not all(
+                isinstance(table, Mapping) for table in value):
+            raise ValueError(expected)
+        checked = [check_table(declared, table, owner) for table in value]
+        lines = [f"[{number}].{line}" for number, (_, faults) in enumerate(checked)
+                 for line in faults]
+        if lines:
+            raise TablesError(expected, lines)
+        return tuple(tuple(row.values()) for row, _ in checked)
+
+    return read
 
 
 def required(meaning: str, **declared: Any) -> Any:

@@ -91,19 +91,15 @@ class _IsolatedCells:
         self.cells = CellsResult.not_run(pipeline.experiment, len(need))
 
     def compute(self, rows: NDArray[np.intp]) -> None:
-        """Compute scenes ``rows`` (n,) together; in smaller pieces if they end the process."""
-        try:
-            self._take(rows, self._run(PIECE, rows, self._need[rows]))
-        except ChildError:
-            if len(rows) > 1:
-                self.compute_pieces(rows)
-            else:
-                self._compute_scene(int(rows[0]))
-
-    def compute_pieces(self, rows: NDArray[np.intp]) -> None:
-        """Compute scenes ``rows`` (n,) in pieces."""
+        """Compute scenes ``rows`` (n,) in pieces; those that end the process in smaller ones."""
         for piece in np.array_split(rows, min(PIECES, len(rows))):
-            self.compute(piece)
+            try:
+                self._take(piece, self._run(PIECE, piece, self._need[piece]))
+            except ChildError:
+                if len(piece) > 1:
+                    self.compute(piece)
+                else:
+                    self._compute_scene(int(piece[0]))
 
     def _run(self, share: float, rows: NDArray[np.intp], *masks: Masks) -> CellsResult:
         """Call ``run_cells`` for some scenes with a share of the time limit.
@@ -247,7 +243,7 @@ def run_cells_isolated(
         computes a single scene is ended twice by a signal from outside.
     """
     with contextlib.closing(_IsolatedCells(pipeline, indices, need, limit_s)) as isolated:
-        isolated.compute_pieces(np.arange(len(need)))
+        isolated.compute(np.arange(len(need)))
         return isolated.cells
 
 

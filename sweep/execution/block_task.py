@@ -122,7 +122,7 @@ class Source:
         ]
         return Source(store, new, done, tuple(
             Key(axis, names, find,
-                tuple(each for each in new.axes if not each.columns.keys().isdisjoint(names)),
+                tuple(sorted(new.axes_with(names), key=lambda each: each.stage)),
                 {name: fixed_value(new, name) for name in names})
             for axis, names, find in looked_up))
 
@@ -134,7 +134,7 @@ class Source:
         Parameters
         ----------
         order
-            The new grid's axes, along which the results' dimensions are.
+            The new grid's axes, stage by stage, along which the results' dimensions are.
         cuts
             The box: axis -> indices.
 
@@ -147,11 +147,9 @@ class Source:
         indices: dict[str, NDArray[np.intp]] = {}
         for key in self.keys:
             names = [axis.name for axis in key.new]
-            along = [cuts[name] for name in names]
-            at = np.array([-1 if index is None else index for index in key.found(along)])
-            axes = [names.index(name) for name in order if name in names]
-            spread = at.reshape([len(part) for part in along]).transpose(axes)[
-                tuple(slice(None) if name in names else None for name in order)]
+            at = [-1 if k is None else k for k in key.found([cuts[name] for name in names])]
+            spread = np.array(at).reshape([len(cuts[name]) if name in names else 1
+                                           for name in order])
             exists &= spread >= 0
             if key.axis is not None:
                 indices[key.axis] = np.broadcast_to(spread, shape)

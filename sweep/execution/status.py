@@ -499,18 +499,15 @@ def summary_of(
         account["warnings"].append(
             f"warning: {unsettled:,} of {account['conditions']:,} conditions are not settled after "
             f"all {rule.max_trials:,} trials; the report's table of precision names them")
-    tried, lost = sum(retried.values()), totals.lost
+    tried = sum(retried.values())
+    account |= {f"computed_{what}": computed.get(what, 0)
+                for what in ("blocks", "scenes", "estimates")}
     return Summary(
-        **account,
+        **account | totals.lost,
         data=store.data_url,
         results=math.prod(len(axis) for axis in store.pipeline.axes),
         detected=int(totals.detection[DetectionStatus.detected]),
-        computed_blocks=computed.get("blocks", 0),
-        computed_scenes=computed.get("scenes", 0),
-        computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
-        crashed=lost["crashed"],
-        failed=lost["failed"],
         retried=tried,
         recovered=tried - sum(failed_blocks(store, retried).values()),
         unsettled=unsettled,

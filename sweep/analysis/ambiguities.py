@@ -31,7 +31,7 @@ from sweep.analysis.estimator import (
     Count,
     Rate,
     Statistic,
-    aggregate,
+    aggregates,
     scaled_to_draws,
 )
 from sweep.analysis.intervals import TAIL, clopper_pearson
@@ -176,18 +176,18 @@ def ambiguity(
     if not 0.0 <= min_kept <= 1.0:
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
     kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
-    inputs = {name: array.compute() for name, array in pose_arrays(results, RATIO_INPUTS).items()}
     counts: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution", lambda poses:
               poses.solved & np.isnan(poses["alternative_reprojection_error_px"]))]
-    table = aggregate(results, inputs, kept, counts, AmbiguousPoses, bins)
     levels = np.unique([*tried, np.inf])
-    table = table.assign(stacked([
-        aggregate(results, inputs, kept, _rates(level), AmbiguousPoses, bins) for level in levels
-    ], "threshold")).assign_coords(threshold=("threshold", levels, cf_attributes(
-        "largest ratio of both reprojection errors that is kept", "1")))
+    table, *at_levels = aggregates(
+        results, pose_arrays(results, RATIO_INPUTS), kept, [counts, *map(_rates, levels)],
+        AmbiguousPoses, bins)
+    table = table.assign(stacked(at_levels, "threshold")).assign_coords(
+        threshold=("threshold", levels, cf_attributes(
+            "largest ratio of both reprojection errors that is kept", "1")))
     tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
     return _with_choice(table, flip_rate, min_kept, tail)
 

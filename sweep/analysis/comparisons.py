@@ -58,6 +58,7 @@ from sweep.analysis.estimator import (
     Sample,
     Statistic,
     aggregate,
+    aggregates,
     arranged,
     newcombe_and_mcnemar,
     quantile_intervals,
@@ -227,18 +228,18 @@ def compare(
     """
     kept = kept_dimensions(first, per)
     kept_dimensions(second, per)
-    return paired_table(first, second, kept, bins).drop_vars("drawn")
+    return paired_tables(first, second, kept, bins)[0].drop_vars("drawn")
 
 
-def paired_table(
+def paired_tables(
     first: xr.Dataset, second: xr.Dataset, kept: Sequence[str], bins: Bins | None,
-    quantities: Sequence[Quantity] = QUANTITIES, level: float = LEVEL,
+    quantities: Sequence[Quantity] = QUANTITIES, levels: Sequence[float] = (LEVEL,),
     more: Sequence[PairStatistic] = (),
-) -> xr.Dataset:
+) -> list[xr.Dataset]:
     """Return the table of `compare` of some kinds of error, and of ``more`` statistics.
 
-    Beside it there is whether any cell has two draws, ``drawn``. ``level`` is that of all
-    intervals.
+    Beside it there is whether any cell has two draws, ``drawn``. There is one for each of the
+    ``levels`` of the intervals.
     """
     stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
@@ -254,8 +255,8 @@ def paired_table(
         ((first[name] != second[name]).any("xyz").reset_coords(drop=True)
          for name in TRUTH if name in first and name in second), xr.DataArray(False))
     statistics: list[PairStatistic] = [
-        RateDifference("detection", "detected", lambda poses: poses.detected, level=level),
-        RateDifference("solved", "solved", lambda poses: poses.solved, level=level),
+        RateDifference("detection", "detected", lambda poses: poses.detected),
+        RateDifference("solved", "solved", lambda poses: poses.solved),
         Count("only_first_flipped", "poses solved in both, flipped in the first alone",
               lambda pair: pair.both_solved & pair.first.flipped & ~pair.second.flipped),
         Count("only_second_flipped", "poses solved in both, flipped in the second alone",
@@ -266,10 +267,11 @@ def paired_table(
               lambda pair: pair.first.run != pair.second.run),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
-        *(statistic for quantity in quantities for statistic in _differences(quantity, level)),
-        *more,
+        *(statistic for quantity in quantities for statistic in _differences(quantity)), *more,
     ]
-    return aggregate(first, inputs, kept, statistics, Pair, bins, stopped=stopped)
+    return aggregates(first, inputs, kept, [
+        [replace(each, level=level) for each in statistics] for level in levels],
+        Pair, bins, stopped=stopped)
 
 
 @dataclass(frozen=True)
@@ -310,19 +312,19 @@ def _both_squares(quantity: Quantity, pair: Pair) -> Floats:
     return np.concatenate([quantity.squares(pair.first), quantity.squares(pair.second)], axis=-1)
 
 
-def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
+def _differences(quantity: Quantity) -> list[PairStatistic]:
     """Return the mean difference and the ratio of a kind of error, of poses that both solved."""
     squares, words = functools.partial(_both_squares, quantity), quantity.words
 
     def ratio(ending: str, also: str, used: Callable[[Pair], Masks]) -> PairStatistic:
         return RootMeanSquareRatio(
             f"{quantity.name}_rmse{ending}_ratio", f"second RMS {words} over the first{also}",
-            squares, used, level=level)
+            squares, used)
 
     return [
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
              lambda pair: np.diff(np.sqrt(squares(pair))), lambda pair: pair.both_solved,
-             units=quantity.units, level=level),
+             units=quantity.units),
         ratio("", "", lambda pair: pair.both_solved),
         *([ratio("_unflipped", ", flipped in neither",
                  lambda pair: pair.first.unflipped & pair.second.unflipped)]
@@ -509,7 +511,7 @@ def regressions(
     means: list[PairStatistic] = [
         Mean(each.named("first"), "", functools.partial(_first_error, each),
              lambda pair: pair.both_solved) for each in quantities]
-    table = paired_table(old, new, kept, None, quantities, level, means)
+    table, = paired_tables(old, new, kept, None, quantities, [level], means)
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")

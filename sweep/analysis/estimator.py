@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
-from enum import Enum, IntEnum
+from enum import Enum
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -45,9 +45,6 @@ from sweep.typing import Floats, Integers, Masks
 
 #: Arrays of poses, (groups, cells, draws, settings, ...), by name.
 Arrays = dict[str, NDArray[Any]]
-
-#: Values of variables (groups,), by name.
-Variables = dict[str, NDArray[Any]]
 
 
 class DrawnPoses(Protocol):
@@ -471,12 +468,11 @@ class Output(NamedTuple):
     meaning: str
     units: str
     dtype: str = "f8"
-    flags: type[IntEnum] | None = None
     dims: tuple[str, ...] = ()
 
     def attributes(self) -> dict[str, Any]:
         """Return its attributes."""
-        return cf_attributes(self.meaning, self.units, self.flags)
+        return cf_attributes(self.meaning, self.units)
 
 
 #: Endings of names, of a value and of its interval's ends, with what meanings begin with.
@@ -1159,9 +1155,19 @@ def aggregate(
     ArgumentError
         For bins that cannot be.
     """
+    return aggregates(results, inputs, kept, [statistics], view, bins, stopped=stopped)[0]
+
+
+def aggregates(
+    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str],
+    sets: Sequence[Sequence[Statistic[ViewT]]], view: Callable[[Arrays], ViewT],
+    bins: Bins | None = None, *, stopped: bool | None = None,
+) -> list[xr.Dataset]:
+    """Return a table as `aggregate` for each of several sets of statistics, of poses read once."""
     edges = read_bins(results, kept, bins or {})
     binned = {f"{PREFIX}{name}": results[name] for name in edges}
     columns, design = arranged(results, {**inputs, **binned}, kept, stopped=stopped)
+    statistics = [*itertools.chain(*sets)]
     found: list[list[NDArray[Any]]] = []  # (bins, outputs, groups, ...)
     for part in in_bins(columns, edges):
         groups, *rest = next(iter(part.values())).shape[:4]
@@ -1173,15 +1179,16 @@ def aggregate(
             [array for statistic in statistics for array in statistic.arrays(block, design)]
             for block in blocks), strict=True)])
     shape = (*(results.sizes[name] for name in kept), *(len(each) - 1 for each in edges.values()))
-    outputs = [output for statistic in statistics for output in statistic.outputs()]
-    variables = {
-        output.name: (
-            (*kept, *edges, *output.dims), np.stack(arrays, axis=1).reshape(
-                (*shape, *arrays[0].shape[1:])).astype(output.dtype), output.attributes())
-        for output, arrays in zip(outputs, zip(*found, strict=True), strict=True)}
     coordinates = {name: value.variable for name, value in results.coords.items()
                    if set(value.dims) <= set(kept) and not is_fixed(value)}
-    return xr.Dataset(variables, coordinates).assign_coords(bin_coordinates(results, edges))
+    every = zip(*found, strict=True)
+    return [xr.Dataset({
+        output.name: (
+            (*kept, *edges, *output.dims), np.stack(arrays, axis=1).reshape(
+                (*shape, *arrays[0].shape[1:])).astype(output.dtype),
+            output.attributes())
+        for statistic in some for output, arrays in zip(statistic.outputs(), every, strict=False)
+    }, coordinates).assign_coords(bin_coordinates(results, edges)) for some in sets]
 
 
 # Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the

@@ -51,6 +51,7 @@ from sweep.analysis.estimator import (
     StandardDeviation,
     Statistic,
     aggregate,
+    aggregates,
     guarded,
 )
 from sweep.analysis.intervals import LEVEL
@@ -229,16 +230,14 @@ def failure_composition(
     [0.0, 0.625, 1.0]
     """
     kept = kept_dimensions(results, per)
-    inputs = {name: array.compute()
-              for name, array in pose_arrays(results, ESTIMATE_INPUTS).items()}
-    tables, shares = [], [f"share{end}" for end in INTERVAL]
-    for outcome in OUTCOMES:
-        ends = functools.partial(ends_as, outcome)
-        statistics: list[Statistic[Poses]] = [
-            Count("count", "poses that ended so", ends),
-            Rate("share", "share of the poses looked for", ends, lambda poses: poses.looked_for)]
-        table = aggregate(results, inputs, kept, statistics, Poses, bins)
-        tables.append(table.assign(table[shares].where(outcome in outcomes(counted=True))))
+    ends = [functools.partial(ends_as, outcome) for outcome in OUTCOMES]
+    tables = aggregates(results, pose_arrays(results, ESTIMATE_INPUTS), kept, [[
+        Count("count", "poses that ended so", end),
+        Rate("share", "share of the poses looked for", end, lambda poses: poses.looked_for),
+    ] for end in ends], Poses, bins)
+    shares = [f"share{end}" for end in INTERVAL]
+    tables = [table.assign(table[shares].where(outcome in outcomes(counted=True)))
+              for table, outcome in zip(tables, OUTCOMES, strict=True)]
     return stacked(tables, "outcome").assign_coords(
         outcome=("outcome", list(OUTCOMES), {"long_name": "what became of the pose"}))
 
@@ -646,14 +645,12 @@ def covariance_trust(
         raise ArgumentError("levels", levels, "expected numbers between 0 and 1")
     kept = kept_dimensions(results, per)
     limits = special.chdtri(len(POSE_PARAMETERS), 1.0 - nominal).tolist()
-    arrays = pose_arrays(results, ESTIMATE_INPUTS) | {
+    inputs = pose_arrays(results, ESTIMATE_INPUTS) | {
         "nees": results.get("nees", xr.DataArray(np.nan))}
-    inputs = {name: array.compute() for name, array in arrays.items()}
-    table = aggregate(results, inputs, kept, [NEES_MEAN], Poses)
-    at_levels = stacked([
-        aggregate(results, inputs, kept, _within(limit, len(limits)), Poses) for limit in limits],
-        "level").assign_coords(level=("level", nominal, {
-            "long_name": "nominal probability of the covariance's region", "units": "1"}))
+    table, *tables = aggregates(results, inputs, kept, [
+        [NEES_MEAN], *(_within(limit, len(limits)) for limit in limits)], Poses)
+    at_levels = stacked(tables, "level").assign_coords(level=("level", nominal, {
+        "long_name": "nominal probability of the covariance's region", "units": "1"}))
     level = at_levels["level"]
     right = ((at_levels["joint_low"] - TOLERANCE <= level)
              & (level <= at_levels["joint_high"] + TOLERANCE)).all("level")

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import compare
-from sweep.analysis.comparisons import paired_table
+from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES
 from sweep.analysis.intervals import LEVEL
 from sweep.report.report_data import CONFIGURATION, Configurations, ReportData, configurations
@@ -220,8 +219,8 @@ def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, .
 
     If few poses are flipped in one of the two alone, the rotation is compared without flips.
     """
-    shown = compare(first, second)
-    deciding = paired_table(first, second, (), None, QUANTITIES[:2], DECIDING_LEVEL)
+    shown, deciding = paired_tables(
+        first, second, (), None, QUANTITIES[:2], (LEVEL, DECIDING_LEVEL))
     flipped = int(shown["only_first_flipped"]) + int(shown["only_second_flipped"])
     rotation = UNFLIPPED if 0 < flipped < MIN_FLIPPED else ROTATION
     out = []

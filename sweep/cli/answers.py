@@ -506,7 +506,7 @@ def export(
     with library.progress.stage_display() as stage:
         result = library.export.export(
             read, folder, windowed=windowed, workers=workers, yes=yes,
-            progress=lambda done, count: stage(f"{count:,} scenes", done / count))
+            progress=lambda done, count: stage(f"rendering {count:,} scenes", done / count))
     without = f", {result.invisible:,} scenes without" if result.invisible else ""
     lines = [f"{result.folder}: {result.images:,} images, {byte_count(result.bytes)}{without}"]
     if result.kept:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import sweep
 from sweep.analysis import flip_rate
-from sweep.report.figure import COLOURS, MATPLOTLIB_STYLE, SHAPES
+from sweep.report.figure import COLOURS, SHAPES, STYLE
 
 SIDE_M = 0.08
 TARGETS: dict[str, dict[str, Any]] = {
@@ -64,7 +64,7 @@ def flips(name: str, number: int, poses: int) -> xr.Dataset:
 
 def main(output: str, poses: str = "60") -> None:
     """Run what is not run yet, print the rates, and draw the figure."""
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=(7.0, 3.8), layout="constrained")
         axes = figure.subplots()
         for number, name in enumerate(TARGETS):

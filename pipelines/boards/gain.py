@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import sweep
 from sweep.analysis import efficiency, error_statistics
-from sweep.report.figure import COLOURS, MATPLOTLIB_STYLE
+from sweep.report.figure import COLOURS, STYLE
 
 SIDE_M, SPAN_M, GAP_M = 0.016, 0.12, 0.0048
 SERIES: dict[str, dict[int, float]] = {
@@ -118,7 +118,7 @@ def draw(axes: Any, counts: list[int], each: xr.Dataset) -> None:
 def main(output: str, poses: str = "200") -> None:
     """Run what is not run yet, print the tables, and draw the figure."""
     table, first = computed(int(poses)), 0
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=(7.6, 5.2), layout="constrained")
         panels = figure.subplots(len(SERIES), len(REFINEMENTS), sharex="row", sharey=True)
         for row, (title, series) in zip(panels, SERIES.items(), strict=True):

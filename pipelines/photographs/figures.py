@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sweep.measure.flags import EstimateStatus
-from sweep.report.figure import COLOURS, FAINT, INK, MATPLOTLIB_STYLE
+from sweep.report.figure import COLOURS, FAINT, INK, STYLE
 
 WIDTH = 9.0
 """Inches; a point is 1.4 px where the figure is 900 px wide."""
@@ -49,7 +49,7 @@ def draw_errors(
     path: Path, sets: Mapping[str, Mapping[str, xr.Dataset]], refinements: Sequence[str]
 ) -> None:
     """Draw the distributions of errors: a pair of rows of each set, a column of each refinement."""
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=(WIDTH, 3.3 * len(sets)))
         panels = figure.subplots(2 * len(sets), len(refinements), squeeze=False, sharey=True)
         for row, (name, results) in enumerate(sets.items()):
@@ -96,7 +96,7 @@ def draw_residuals(path: Path, sets: Mapping[str, Mapping[str, NDArray[np.float6
         Name of a set -> source of `LINES` -> (n, n) mean; of photographs the mean level, of others
         the mean residual, both as shares of the contrast.
     """
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(fname=STYLE):
         figure = Figure(figsize=(WIDTH, 3.0 * len(sets)))
         panels = figure.subplots(len(sets), 3, squeeze=False)
         for row, (name, images) in zip(panels, sets.items(), strict=True):

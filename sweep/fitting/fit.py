@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -732,10 +732,7 @@ def _lines(photographs: int, terms: Sequence[Term]) -> list[str]:
         )
     size = next(each for each in terms if each.parameter == "marker_scale")
     if size.kept and math.isfinite(size.estimate.low):
-        low, value, high = (
-            100.0 * (each - 1.0)
-            for each in (size.estimate.low, size.estimate.value, size.estimate.high)
-        )
+        value, low, high = (100.0 * (each - 1.0) for each in astuple(size.estimate))
         lines.append(
             f"markers are larger than their file says by {value:.2f} % [{low:.2f}, {high:.2f}]: "
             "measure the print"

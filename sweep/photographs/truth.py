@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from sweep.errors import PipelineError
 from sweep.exchange.answers import Conventions, read_answers
@@ -37,10 +39,10 @@ from sweep.typing import Floats, Masks
 # Poses of M markers in P photographs are written into their record, which has none before.
 
 def put(
-    record: PhotographRecord, place: tuple[int, int], rotation: Floats, translation: Floats,
+    record: PhotographRecord, place: tuple[Any, Any], rotation: Floats, translation: Floats,
     source: TruthSource, std: Floats | float = np.nan,
 ) -> None:
-    """Write the pose of a photograph and a marker, by their numbers, into a record."""
+    """Write the poses of photographs and markers, by their numbers, into a record."""
     record.rotation[place], record.translation[place] = rotation, translation
     record.std[place], record.source[place] = std, source
 
@@ -79,10 +81,9 @@ def own_poses(
         rotation, translation = both_planar_solutions(
             quads, cameras_of(camera, len(quads)), sizes_m[marker]
         )
-        for k, number in enumerate(marker.tolist()):
-            if np.isfinite(rotation[k, 0]).all() and translation[k, 0, 2] > 0:
-                put(record, (photograph, number), rotation[k, 0], translation[k, 0],
-                    TruthSource.none)
+        good = np.isfinite(rotation[:, 0]).all(axis=(1, 2)) & (translation[:, 0, 2] > 0)
+        put(record, (photograph, marker[good]), rotation[good, 0], translation[good, 0],
+            TruthSource.none)
 
 
 def partner_poses(
@@ -179,19 +180,15 @@ def poses_of_file(
     except PipelineError as error:
         lines = [line.partition(", or pass --doubled")[0] for line in error.faults]
         raise PipelineError(lines) from None
-    number = {each: k for k, each in enumerate(record.marker_id.tolist())}
-    unknown = sorted(set(answers.marker_id.tolist()) - number.keys())
-    if unknown:
-        faults.append(f"marker {unknown[0]}: expected one of the board or the photographs")
+    marker = pd.Index(record.marker_id).get_indexer(answers.marker_id)
+    if (marker < 0).any():
+        unknown = answers.marker_id[marker < 0].min()
+        faults.append(f"marker {unknown}: expected one of the board or the photographs")
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
     if not faults:
-        for photograph, marker_id, rotation, translation in zip(
-            answers.image.tolist(), answers.marker_id.tolist(), answers.rotation,
-            answers.translation, strict=True,
-        ):
-            place = photograph, number[marker_id]
-            put(record, place, rotation, translation, TruthSource.poses_file)
+        put(record, (answers.image, marker), answers.rotation, answers.translation,
+            TruthSource.poses_file)
         faults += _faults(record, camera, sizes_m, seen)
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])

@@ -368,10 +368,9 @@ def _write_image(
     """Write the image of a cell as PNG, with what was found in its scene unless that is None."""
     import cv2  # noqa: PLC0415
 
-    if scene is not None:
-        image = library.scenes.draw_scene(scene, library.pipeline.coordinates_text(pipeline, cell))
-    library.output_file.write_output_file(
-        Path(output), cv2.imencode(".png", image)[1].tobytes())
+    content = cv2.imencode(".png", image)[1].tobytes() if scene is None else (
+        library.scenes.scene_png(scene, library.pipeline.coordinates_text(pipeline, cell)))
+    library.output_file.write_output_file(Path(output), content)
 
 
 # --------------------------------------------------------------------------------------------------

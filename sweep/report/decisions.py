@@ -250,7 +250,7 @@ def headline(choice: Choice) -> str:
     rule = choice.rule
     if choice.best is not None:
         best = choice.answers[choice.best]
-        name = _name(choice, best, best.value)
+        name = described(_chosen(choice, best, best.value))
         if not choice.is_undecided:
             wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
             return f"{name} is the {wish} choice"
@@ -260,16 +260,16 @@ def headline(choice: Choice) -> str:
     line = ("not decided: no choice is known to meet" if choice.is_undecided else
             "no choice meets") + f" everything{within}"
     near = [(answer.nearest, answer) for answer in choice.answers if answer.nearest is not None]
-    if not near:
+    if not near or any(answer.met for answer in choice.answers):
         return line
     one, answer = min(near, key=lambda each: each[0].excess)
-    return f"{line}; nearest is {_name(choice, answer, one.value)}: {reason(one.cause)}"
+    nearest_one = described(_chosen(choice, answer, one.value))
+    return f"{line}; nearest is {nearest_one}: {reason(one.cause)}"
 
 
-def _name(choice: Choice, answer: Answer, value: float | None) -> str:
-    """Return a choice as text."""
-    along = {} if value is None else {choice.rule.along: value}
-    return described({**along, **answer.alternative})
+def _chosen(choice: Choice, answer: Answer, value: float | None) -> dict[str, Any]:
+    """Return the values by axis of an alternative at a value of the axis that is searched."""
+    return ({} if value is None else {choice.rule.along: value}) | dict(answer.alternative)
 
 
 def reason(cause: Cause | None) -> str:
@@ -330,8 +330,7 @@ def as_json(choice: Choice) -> dict[str, Any]:
          "on_front": k in choice.front, "within_budget": choice.within_budget(k)}
         for k, (answer, cost) in enumerate(zip(choice.answers, choice.costs, strict=True))]
     best = None if choice.best is None else choice.answers[choice.best]
-    known = None if best is None else {**best.alternative, **(
-        {choice.rule.along: best.value} if choice.rule.along else {})}
+    known = None if best is None else _chosen(choice, best, best.value)
     return {
         "answer": known if choice.decision is Decision.met else None, "known": known,
         "decision": choice.decision, "sentences": [headline(choice)],

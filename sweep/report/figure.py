@@ -23,7 +23,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
 
 from sweep.report.output_file import write_output_file
-from sweep.report.table import Bin, Column, Coordinate, Table, Value, cell_text, coordinates
+from sweep.report.table import Bin, Column, Table, Value, cell_text, coordinates
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -211,9 +211,7 @@ def _named(heading: str, cell: Any) -> str:
 
 def position(cell: Any) -> float:
     """Return the place of a cell on a numeric axis: its value, or the middle of a bin."""
-    if isinstance(cell, Bin):
-        return cell.middle
-    return float(cell.value if isinstance(cell, Coordinate | Value) else cell)
+    return float(cell.middle if isinstance(cell, Bin) else getattr(cell, "value", cell))
 
 
 def value_of(cell: Any) -> Value:
@@ -313,11 +311,9 @@ class Panel:
             axes.set_title(self.title)
             return
         axes.legend(
-            title=self.title, alignment="left",
-            title_fontproperties={"weight": "bold", "size": 9.5}, loc="lower left",
-            bbox_to_anchor=(-0.02, 1.0), ncols=self.legend_columns, borderaxespad=0,
-            handlelength=2.2, columnspacing=1.1, handletextpad=0.5, labelspacing=0.25,
-            borderpad=0.2)
+            title=self.title, title_fontproperties={"weight": "bold", "size": 9.5},
+            alignment="left", loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+            ncols=self.legend_columns)
 
 
 def _draw_line(

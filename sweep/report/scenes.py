@@ -67,31 +67,18 @@ INSET = 0.36
 CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
 
 
-def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
-    """Return a scene enlarged, (H, W, 3), blue-green-red, with a caption below it.
-
-    A marker that is small in the picture is framed, and shown enlarged in the corner that is
-    farthest from it.
+def scene_png(scene: SceneInspection, title: str = "") -> bytes:
+    """Return a scene enlarged as a PNG.
 
     Parameters
     ----------
     scene
         Image, truth and detections.
     title
-        First line of the caption: the pose on its grid. Then come what was drawn at random, flags
-        and errors, and the legend.
+        First line of a caption below it: the pose on its grid. Then come what was drawn at random,
+        flags and errors, and the legend; and a marker that is small in the picture is framed, and
+        shown enlarged in the corner that is farthest from it.
     """
-    drawn = ", ".join(
-        f"{name} {float(value):.5g}" for name, value in scene.values.items()
-        if name not in VARIABLES and value.ndim == 0)
-    encoded = scene_png(scene, "\n".join(filter(
-        None, [title, f"drawn: {drawn}" * bool(drawn), result_text(scene)])))
-    return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR),
-                      dtype=np.uint8)
-
-
-def scene_png(scene: SceneInspection, caption: str = "") -> bytes:
-    """Return a scene enlarged as a PNG; with a caption also with a legend below it."""
     height, width = scene.image.shape
     scale = max(1, min(MAX_SIDE // max(height, width), MAX_ENLARGEMENT))
     dpi = max(MIN_DPI, scale * width / MAX_INCHES)
@@ -99,13 +86,17 @@ def scene_png(scene: SceneInspection, caption: str = "") -> bytes:
     axes = canvas.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
     _draw(axes, scene)
-    if caption:
+    if title:
         _enlarge_small(axes, scene)
+        drawn = ", ".join(
+            f"{name} {float(value):.5g}" for name, value in scene.values.items()
+            if name not in VARIABLES and value.ndim == 0)
         inches = scale * width / dpi
         chars = max(MIN_CHARS, round(CHARS_AN_INCH * inches))
         axes.legend(
-            title="\n".join(part for line in caption.split("\n")
-                            for part in textwrap.wrap(line, chars)),
+            title="\n".join(
+                part for line in (title, f"drawn: {drawn}" if drawn else "", result_text(scene))
+                for part in textwrap.wrap(line, chars)),
             alignment="left", frameon=False, loc="upper left", bbox_to_anchor=(0, 0),
             ncols=max(2, round(COLUMNS * inches / MAX_INCHES)))
     encoded = io.BytesIO()

@@ -6,7 +6,7 @@ import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report.scenes import TRUTH, draw_scene, scene_png
+from sweep.report.scenes import TRUTH, scene_png
 
 FRAME = {
     "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},
@@ -25,10 +25,11 @@ def share_of(picture, colour, box):
 def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(bearing, corner):
     pipeline = cell(Pipeline.from_dict(FRAME), f"bearing_x_deg={bearing},side_px=60")
     scene = inspect_scene(pipeline, whole_frame=True)
-    picture = draw_scene(scene, "title")
+    picture, plain = (
+        cv2.imdecode(np.frombuffer(scene_png(scene, title), np.uint8), cv2.IMREAD_COLOR)
+        for title in ("title", ""))
     left, right = (0, 0, 600, 1200), (1000, 0, 1600, 1200)
     assert share_of(picture, TRUTH, right if corner == "right" else left) > 0.0005
-    plain = cv2.imdecode(np.frombuffer(scene_png(scene), np.uint8), cv2.IMREAD_COLOR)
     assert plain.shape == (1200, 1600, 3)
     assert share_of(plain, TRUTH, right if corner == "right" else left) == 0
     assert picture.shape[0] > plain.shape[0]

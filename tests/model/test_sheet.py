@@ -182,6 +182,21 @@ def test_a_sheet_that_hides_a_part_of_itself_is_not_modelled(curvature, given, m
     assert not_modelled(scenes)[0] != modelled
 
 
+@pytest.mark.parametrize("bend_deg", [0.0, 45.0, 135.0])
+def test_a_sheet_begins_to_hide_itself_alike_from_opposite_sides(bend_deg):
+    def limit(azimuth_deg):
+        low, high = 1.0, 60.0
+        while high / low > 1.0001:
+            middle = (low * high) ** 0.5
+            _, scenes = scenes_of(curvature_per_m=middle, bend_deg=bend_deg, fx_px=6000.0,
+                                  tilt_deg=40.0, azimuth_deg=azimuth_deg)
+            low, high = (low, middle) if not_modelled(scenes)[0] else (middle, high)
+        return high
+
+    assert limit(45.0) == pytest.approx(limit(225.0), rel=1e-3)
+    assert limit(135.0) == pytest.approx(limit(315.0), rel=1e-3)
+
+
 # Shifts of the image.
 
 def shift_of(waves):

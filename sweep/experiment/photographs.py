@@ -154,18 +154,9 @@ class PhotographRecord:
         return np.array([self.width_px, self.height_px])
 
 
-def _made(arrays: Mapping[str, NDArray[Any]]) -> PhotographRecord:
-    width_px, height_px = arrays["size"].tolist()
-    return PhotographRecord(
-        tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
-        Part(str(arrays["part"])), width_px, height_px, arrays["marker_id"], arrays["rotation"],
-        arrays["translation"], arrays["std"], arrays["source"], str(arrays["board"]))
-
-
 #: Files of records.
-PHOTOGRAPH_RECORDS = ArrayFile("a record of photographs that `sweep photos` writes", 2, (
-    "paths", "digests", "part", "marker_id", "rotation", "translation", "std", "source", "board",
-    "size"), _made)
+PHOTOGRAPH_RECORDS = ArrayFile(
+    "a record of photographs that `sweep photos` writes", 3, PhotographRecord)
 
 
 #: Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing

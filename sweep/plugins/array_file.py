@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.errors import PluginError
 from sweep.messages import plain
@@ -29,22 +27,20 @@ class ArrayFile(Generic[Record]):
         Description of the file, in words that follow "expected".
     version
         The number in its array ``version``.
-    arrays
-        Names of the arrays, and of the record's attributes that they are written from.
-    made
-        A function from the arrays by name to the record.
+    record
+        The dataclass of a record, whose fields are arrays, tuples of texts, texts or numbers.
     """
 
     meaning: str
     version: int
-    arrays: tuple[str, ...]
-    made: Callable[[Mapping[str, NDArray[Any]]], Record]
+    record: type[Record]
 
     def content(self, record: Record) -> bytes:
         """Return the content of a record's file: the same bytes for the same attributes."""
         file = io.BytesIO()
-        arrays = {name: getattr(record, name) for name in self.arrays}
-        np.savez_compressed(file, version=self.version, **arrays)  # its members have a fixed date
+        values: dict[str, Any] = {
+            name: getattr(record, name) for name in get_type_hints(self.record)}
+        np.savez_compressed(file, version=self.version, **values)  # its members have a fixed date
         return file.getvalue()
 
     def read(self, path: str | Path) -> tuple[Record, str]:
@@ -74,7 +70,14 @@ def _read(
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = dict(archive)
         if arrays["version"] == kind.version:
-            return kind.made(arrays), hashlib.sha256(content).hexdigest()
+            values = {}
+            for name, hint in get_type_hints(kind.record).items():
+                array = values[name] = arrays[name]
+                if array.ndim == 0:
+                    values[name] = hint(array.item())
+                elif array.dtype.kind == "U":
+                    values[name] = tuple(array.tolist())
+            return kind.record(**values), hashlib.sha256(content).hexdigest()
     except Exception:
         raise ValueError("it is none") from None
     raise ValueError("of another version")

@@ -7,7 +7,6 @@ exported.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,13 +70,8 @@ class Recording:
         return slice(first, int(np.searchsorted(self.image, key, "right")))
 
 
-NAMES = tuple(field.name for field in dataclasses.fields(Recording))
-
 #: Files of recordings.
-RECORDINGS = ArrayFile(
-    "detections that `sweep score` recorded", 1, NAMES,
-    lambda arrays: Recording(*(arrays[name] for name in NAMES)),
-)
+RECORDINGS = ArrayFile("detections that `sweep score` recorded", 1, Recording)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

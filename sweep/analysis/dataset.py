@@ -309,7 +309,7 @@ def common_trials(
             continue
         # All configurations of a scene that is needed are computed.
         one = array.isel({dim: 0 for dim in array.dims if dim not in (*scene, DRAWS)}, drop=True)
-        one = one.fillna(0) if one.dtype.kind == "f" else one
+        one = one.fillna(0)
         counted = (~one.isin(NOT_LOOKED_FOR)).any(DRAWS)
         common = common & (~one.isin(NOT_AVAILABLE) | ~counted).all(
             [name for name in pooled if name in one.dims])
@@ -359,20 +359,16 @@ def image_sides(results: xr.Dataset) -> xr.DataArray:
         if name in results.coords and DRAWS in results[name].dims and not (
                 by_side and name == "distance_m"):
             raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid")
+    value = functools.partial(parameter_value, results)
     if by_side:
-        return _checked(results["side_px"])
-    distance = parameter_value(results, "distance_m")
-    if distance is None:
+        sides = results["side_px"]
+    elif (distance := value("distance_m")) is None:
         raise DatasetError(
             "distance_m: is no number of this store, whose poses are given in the world; a "
             "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
-    fx = xr.DataArray(intrinsics(*(
-        parameter_value(results, name) for name in VIEW_PARAMETERS))[0])
-    return _checked(fx * parameter_value(results, "size_m") / distance)
-
-
-def _checked(sides: xr.DataArray) -> xr.DataArray:
-    """Return sides without coordinates of fixed parameters, if all can be."""
+    else:
+        fx = xr.DataArray(intrinsics(*map(value, VIEW_PARAMETERS))[0])
+        sides = fx * value("size_m") / distance
     sides = sides.astype(np.float64)
     if not (np.isfinite(sides) & (sides > 0)).all():
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "

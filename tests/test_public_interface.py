@@ -39,6 +39,7 @@ def test_every_public_name_exists_and_is_listed():
     for name in sweep.__all__:
         assert getattr(sweep, name) is not None
         assert name in dir(sweep)
+    assert len(repr(sweep.Pipeline.from_dict(FEW)).splitlines()) == 3
     with pytest.raises(AttributeError, match="no attribute 'runs'"):
         sweep.runs  # noqa: B018
 

@@ -701,6 +701,14 @@ class Pipeline(Grid):
         """The title, or without one the name, as it can be printed."""
         return self.title.strip() or plain(self.name)
 
+    def __repr__(self) -> str:
+        """Return its heading, axes with their lengths, and what else its document gives."""
+        axes = " x ".join(f"{axis.name} ({len(axis):,})" for axis in self.axes)
+        given = {name: value for name, value in (self.fixed | self.distributions).items()
+                 if name in self.given}
+        values = ", ".join(f"{name} = {shown(value)}" for name, value in given.items())
+        return f"Pipeline: {self.heading}\n  axes: {axes}\n  given: {plain(values, 600)}"
+
     @staticmethod
     def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
         """Read a pipeline file.

@@ -753,9 +753,6 @@ MIN_POSES = 200
 #: Distances at which every model is given, although it may need fewer knots.
 SHOWN_DISTANCES = 6
 
-#: Models up to which they are made together.
-MAX_MODELS = 64
-
 
 class Use(Flag):
     """Whether an error model may be used in a cell."""
@@ -862,7 +859,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
             if name != DRAWS and (name == "dictionary" or not is_grid_axis(name, results))]
     kept_dimensions(results, kept)
     inputs = pose_arrays(results, SIGNED_INPUTS)
-    _check_drawn(results, kept)
+    _check_drawn(results)
     focal_size = focal_size_of(results)
     halves = (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS)
     columns = arranged(results, {**inputs, HALF: halves, FOCAL_SIZE: focal_size}, kept)[0]
@@ -961,12 +958,8 @@ def _at_knots(
     return np.stack(fits, axis=1)
 
 
-def _check_drawn(results: xr.Dataset, kept: Sequence[str]) -> None:
-    """Raise DatasetError unless there are two halves of draws, and not too many models."""
-    count = int(np.prod([results.sizes[name] for name in kept], dtype=np.int64))
-    if count > MAX_MODELS:
-        raise DatasetError(f"{count:,} models, one for each value of {', '.join(kept)}: "
-                           f"expected at most {MAX_MODELS}; choose values with results.sel")
+def _check_drawn(results: xr.Dataset) -> None:
+    """Raise DatasetError unless there are two halves of draws."""
     trials = results.sizes.get(DRAWS, 1)
     if trials < HALVES or len(set((np.asarray(results[DRAWS].values) % HALVES).tolist())) < HALVES:
         raise DatasetError(

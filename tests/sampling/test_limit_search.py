@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from support.searches import block_of, flags_of, searched, true_limits
+from support.searches import searched, true_limits
 from sweep.analysis.intervals import looks_factor
-from sweep.analysis.requirements import Decision, requirement_limits
-from sweep.experiment.pipeline import Pipeline
+from sweep.analysis.requirements import Decision
 from sweep.experiment.sampling import wave_ends
-from sweep.measure.flags import DetectionStatus
 from sweep.report.decisions import limit_table, limits_as_json
-from sweep.sampling.searches import (
-    BEYOND,
-    group_dataset,
-    wanted_values,
-)
+from sweep.sampling.searches import BEYOND, wanted_values
 
 SIDES = np.geomspace(60, 8, 20)
 
@@ -111,17 +105,3 @@ def test_a_limit_that_is_not_decided_is_never_told_as_met():
         assert met["value"] or "not decided" in row[1] or listed["decided"]
         assert met["met_to"] or not isinstance(listed["met_to"], float)
     assert told[False]
-
-
-def test_the_hard_end_of_an_axis_is_the_same_for_the_search_and_for_its_results():
-    """Of sizes at distances that are drawn no sides can be computed; the smaller ones are hard."""
-    pipeline = Pipeline.from_dict({
-        "pose": {"jitter_px": 0.5, "distance_m": {"uniform": [1, 2]}},
-        "axes": {"size_m": [0.1, 0.2], "trial": 50}})
-    detection = np.full((2, 50), DetectionStatus.detected, np.uint8)
-    detection[1] = DetectionStatus.rejected
-    values = flags_of(detection)
-    results = group_dataset(pipeline, block_of(values), values)
-    results.attrs["pipeline"] = pipeline.text
-    limits = requirement_limits(results, ["detection >= 0.9"], "size_m")
-    assert limits.attrs["harder"] == "downwards"

@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from unittest import mock
 
 import boto3
 from botocore.exceptions import BotoCoreError, ClientError
@@ -39,6 +40,7 @@ from support.stores import same
 INSTALL = "apt-get install swift-account swift-container swift-object swift-proxy memcached"
 
 SERVERS = ("account", "container", "object", "proxy")
+PROGRAMS = [f"swift-{server}-server" for server in SERVERS]
 
 # For Swift's own Python: make rings of one disk, or be a server; it ends with its parent.
 IN_FOLDER = """
@@ -96,13 +98,6 @@ axes = { side_px = [10, 40], solver = ["ippe_square", "iterative"], trial = 30 }
 """
 
 
-def missing():
-    """Return a line on programs that are not installed; empty if all are."""
-    programs = ("memcached", *(f"swift-{server}-server" for server in SERVERS))
-    absent = [name for name in programs if shutil.which(name) is None]
-    return f"not installed: {', '.join(absent)}; `{INSTALL}`" if absent else ""
-
-
 @contextlib.contextmanager
 def object_store(folder):
     """Start the servers in a folder, make a bucket, and yield the environment of clients."""
@@ -114,7 +109,7 @@ def object_store(folder):
     user, url = pwd.getpwuid(os.getuid()).pw_name, f"http://127.0.0.1:{ports[-1]}"
     (folder / "disk").mkdir()
     (folder / "swift.conf").write_text("[swift-hash]\nswift_hash_path_suffix = tests\n")
-    programs = [shutil.which(f"swift-{server}-server") for server in SERVERS]
+    programs = [shutil.which(name) for name in PROGRAMS]
     python = Path(programs[0]).read_text(encoding="utf-8").partition("\n")[0].lstrip("#! ")
     swift = [python, "-W", "ignore", "-c", IN_FOLDER, folder]
     subprocess.run([*swift, "rings", *map(str, ports[:-1])], check=True)
@@ -161,6 +156,9 @@ def sweeps(folder):
         return started(["-m", "sweep", "run", pipeline, "--store", url, "--workers", "1"])
 
     ends(0, "run", pipeline, "--store", local)
+    with mock.patch.dict(os.environ, {"AWS_SECRET_ACCESS_KEY": "wrong"}):
+        refused = ends(2, "status", url)
+    yield refused
     store = create_store(url, Pipeline.from_toml(pipeline), (1, 3))
     with writing(url, store.storage):
         refused = ends(2, "run", pipeline, "--store", url, "--overwrite")
@@ -186,8 +184,8 @@ def sweeps(folder):
 
 def main():
     """Print what passes; return 1 if something does not, or programs are missing."""
-    if lacking := missing():
-        print(lacking)
+    if not all(map(shutil.which, ["memcached", *PROGRAMS])):
+        print(f"not installed: `{INSTALL}`")
         return 1
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as servers, \
             object_store(Path(servers)) as login:

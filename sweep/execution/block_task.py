@@ -322,7 +322,7 @@ def other_here(pipeline: Pipeline, begun: Mapping[str, Any]) -> list[str]:
     images = pipeline.values_of("background")
     return [
         *(f"{name} is {own}, the run began with {value}" for name, value, own in changes(
-            {"builds": {}, **begun}, fingerprint(pipeline))),
+            begun, fingerprint(pipeline))),
         *lacking_plugins(pipeline.plugins, pipeline.folder),
         *(f"{path} is not in {pipeline.folder} as it was when the run began"
           for path, digest in begun["files"].items()

@@ -5,7 +5,7 @@ What takes something away (deleting the store, another rule, blocks that are dro
 while a process writes.
 
 A local store's lock is that of its folder (``flock``), which the kernel releases if a process
-dies; file systems without locks of folders exclude nobody. On an object store, each process that
+dies; where a file system has none, a line says so. On an object store, each process that
 writes or changes has a key, whose time it renews: one that is out of date is a dead process's.
 Everybody looks for others' keys after writing the own one, so that of two at least one sees the
 other.
@@ -14,6 +14,7 @@ other.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import threading
@@ -26,6 +27,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
+from sweep.messages import notice
 from sweep.store.files import RECEIPTS, delete_files, list_folder, read_files, write_files
 from sweep.store.locations import translate_errors
 
@@ -58,6 +60,10 @@ def held(url: str, storage: Store, *, alone: bool) -> Iterator[None]:
                 raise StoreError(
                     f"{url}: another process is writing it; wait for it, or choose another --store"
                 ) from None
+            except OSError as error:
+                if error.errno not in {errno.ENOLCK, errno.ENOTSUP}:
+                    raise
+                notice(f"{url}: its file system has no locks: keep others from deleting the store")
         yield
 
 
@@ -94,8 +100,6 @@ def _folder_locked(storage: Store, wait_s: float, *, alone: bool) -> Iterator[No
                 if time.monotonic() >= deadline:
                     raise
                 time.sleep(0.005)
-            except OSError:
-                break  # a file system without locks of folders
         yield
     finally:
         os.close(descriptor)

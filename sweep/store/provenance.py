@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import json
 import platform
 import runpy
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -22,16 +21,6 @@ from sweep.version import __version__
 
 #: Raised whenever the numbers change; a test with golden digests fails if it is not.
 NUMBERS_VERSION = 5
-
-
-def versions() -> dict[str, str]:
-    """Return the versions that the numbers of this process depend on."""
-    import cv2  # noqa: PLC0415  (slow to import)
-
-    return {
-        "opencv": cv2.__version__,
-        **{name: importlib.metadata.version(name) for name in ("numpy", "numba")},
-    }
 
 
 @cache
@@ -90,37 +79,30 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         # In the order in which they act.
         "effects": [each.name for each in pipeline.plugins if each.kind == "effect"],
     }
+    loaded = builds()
     return {
         "numbers": NUMBERS_VERSION,
-        **versions(),
-        "builds": dict(builds()),
+        **{name: loaded[name].partition(" ")[0] for name in ("opencv", "numpy", "numba")},
+        **{f"builds.{name}": build for name, build in loaded.items()},
         "seed": pipeline.seed,
         "files": dict(sorted(pipeline.files.items())),
         **{name: value for name, value in where_there_are.items() if value},
     }
 
 
-def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+def changes(stored: Mapping[str, Any], own: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield name, stored and own value of each entry in which two fingerprints differ.
 
-    Builds are compared one by one. Files are compared by their contents: a pipeline's values have
-    their paths, where these matter.
+    Files are compared by their contents: a pipeline's values have their paths, where these matter.
 
     Examples
     --------
-    >>> list(changes({"numba": "1", "builds": {"numpy": "a"}}, {"numba": "1", "builds": {}}))
+    >>> list(changes({"numba": "1", "builds.numpy": "a"}, {"numba": "1"}))
     [('builds.numpy', 'a', None)]
     """
     for key in sorted({*stored, *own}):
         theirs, mine = stored.get(key), own.get(key)
-        if key == "builds" and isinstance(theirs, dict) and isinstance(mine, dict):
-            yield from (
-                (f"{key}.{name}", theirs.get(name), mine.get(name))
-                for name in sorted({*theirs, *mine}) if theirs.get(name) != mine.get(name)
-            )
-        elif key == "files" and _contents(theirs) == _contents(mine):
-            continue
-        elif theirs != mine:
+        if theirs != mine and not (key == "files" and _contents(theirs) == _contents(mine)):
             yield key, theirs, mine
 
 

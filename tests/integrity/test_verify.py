@@ -4,13 +4,13 @@ import json
 import random
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sweep
+from support.commands import command, started
 from support.here import calls_here
 from support.poison import Poison, poisoned, raising
 from support.stores import by_hand, edit_receipt, edit_root, editable, files, same
@@ -246,16 +246,6 @@ ELSEWHERE = {
 }
 """Environment in which the libraries take the routines of an older processor."""
 
-VERIFY_EACH = """
-import json, sys
-from sweep.processor import processor
-from sweep.integrity.verification import repair, verify
-
-found = [verify(url, 40) for url in sys.argv[1:]]
-print(json.dumps([processor(), [[each.sampled, len(each.damage)] for each in found]]))
-"""
-
-
 @pytest.mark.evidence
 def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
     sound, copied, tmp_path
@@ -270,15 +260,16 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
         damage = verify(str(copied), 40).damage
     assert damage
     assert all(one.where.startswith("--at ") and name in one.what for one in damage)
-    ran = subprocess.run(
-        [sys.executable, "-c", VERIFY_EACH, sound, copied], check=True, capture_output=True,
-        text=True, timeout=120, env={**poisoned([FAILED], tmp_path / "notes.jsonl"), **ELSEWHERE},
-    )
-    processor, ((sampled, none), (again, some)) = json.loads(ran.stdout)
-    (_, receipt), = receipts(open_store(str(sound)), [0])
-    assert (processor,) != receipt.processors
-    assert min(sampled, again) >= 8
-    assert (none, some > 0) == (0, True)
+    elsewhere = {**poisoned([FAILED], tmp_path / "notes.jsonl"), **ELSEWHERE}
+    (_, receipt), = receipts(store, [0])
+    ran = started(["-c", "from sweep.processor import processor; print(processor())"],
+                  env=elsewhere, stdout=subprocess.PIPE, text=True)
+    with ran as process:
+        assert (process.communicate()[0].strip(),) != receipt.processors
+    for url, sound_there in ((sound, True), (copied, False)):
+        told = json.loads(command("verify", url, "--sample", "40", "--json", env=elsewhere).stdout)
+        assert told["sampled"] >= 8
+        assert (told["damage"] == []) is sound_there
 
 
 # Stores that fit no pipeline: refused in a line.

@@ -211,21 +211,6 @@ class ReportData:
         found: T = self.made[key]
         return found
 
-    def by(
-        self, axes: Mapping[str, list[int]], analysis: Analysis, groups: Groups | None = None
-    ) -> xr.Dataset:
-        """Return an analysis at some values of axes and by groups of poses, computed once.
-
-        Axes of settings that have a single value are no dimensions of it.
-        """
-        groups = groups or {}
-        per = [*axes, *(name for name, edges in groups.items() if edges is None)]
-        bins = {name: edges for name, edges in groups.items() if edges is not None}
-        table = self.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
-            self.results.isel(axes), per=per, bins=bins))
-        single = {axis.name: 0 for axis in self.pipeline.axes_of(*BOTH) if len(axis) == 1}
-        return table.isel(single, drop=True, missing_dims="ignore")
-
 
 def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
     """Return how requirements are followed over the conditions.
@@ -343,17 +328,6 @@ class Configurations:
         return len(self.names) > 1
 
 
-def stacked(
-    table: xr.Dataset, combinations: Sequence[Mapping[str, int]], names: Sequence[str]
-) -> xr.Dataset:
-    """Return a table by axes with the dimension ``configuration`` in their place."""
-    points = {axis: xr.DataArray([each[axis] for each in combinations], dims=CONFIGURATION)
-              for axis in combinations[0]}
-    flat = table.isel(points) if points else table.expand_dims(CONFIGURATION)
-    flat = flat.drop_vars([*points], errors="ignore")
-    return flat.assign_coords({CONFIGURATION: list(names)}).transpose(CONFIGURATION, ...)
-
-
 def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
     """Return the configurations of a store, by targets, too, or with them pooled.
 
@@ -377,13 +351,12 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
             for axis in several}
     every = [dict(zip(axes, index, strict=True))
              for index in itertools.product(*map(range, counts.values()))]
-    kept, labels = _labelled(data, axes, every)
-    table = data.by(axes, error_statistics)
-    summary = stacked(table, kept, labels)
+    kept, summary = _of_each(data, axes, every, error_statistics, {})
     flags = np.reshape(wrong_configurations(data.pipeline, settings), list(map(len, settings)))
     wrong = np.array([flags[tuple(axes[axis.name][each[axis.name]] for axis in settings)]
                       for each in kept])
-    names = [label + WRONG * bool(flag) for label, flag in zip(labels, wrong, strict=True)]
+    names = [str(label) + WRONG * bool(flag)
+             for label, flag in zip(summary[CONFIGURATION].values, wrong, strict=True)]
 
     def column(name: str, missing: float) -> NDArray[np.float64]:
         return np.asarray(summary[name].fillna(missing), dtype=np.float64)
@@ -396,15 +369,31 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
         summary.assign_coords({CONFIGURATION: names}).isel({CONFIGURATION: order}))
 
 
-def _labelled(
-    data: ReportData, axes: Mapping[str, list[int]], combinations: list[dict[str, int]]
-) -> tuple[list[dict[str, int]], list[str]]:
-    """Return the combinations that differ in settings that they use, and their labels."""
+def _of_each(
+    data: ReportData, axes: Mapping[str, list[int]], combinations: list[dict[str, int]],
+    analysis: Analysis, groups: Groups,
+) -> tuple[list[dict[str, int]], xr.Dataset]:
+    """Return the combinations that differ in settings that they use, and an analysis of each.
+
+    It has the dimension ``configuration``, by label, in place of the axes; it is computed once.
+    """
     values = {name: data.results[name].values[some].tolist() for name, some in axes.items()}
     every = [{name: values[name][k] for name, k in each.items()} for each in combinations]
     kept = distinct(data.pipeline, every)
-    return [combinations[k] for k in kept], [
-        configuration_label(used_settings(data.pipeline, every[k])) for k in kept]
+    labels = [configuration_label(used_settings(data.pipeline, every[k])) for k in kept]
+    per = [*axes, *(name for name, edges in groups.items() if edges is None)]
+    bins = {name: edges for name, edges in groups.items() if edges is not None}
+    table = data.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
+        data.results.isel(axes), per=per, bins=bins))
+    # Axes of settings with a single value tell nothing apart.
+    places: dict[str, Any] = {
+        axis.name: 0 for axis in data.pipeline.axes_of(*BOTH) if len(axis) == 1}
+    places |= {name: xr.DataArray([combinations[k][name] for k in kept], dims=CONFIGURATION)
+               for name in axes}
+    flat = table.isel(places, missing_dims="ignore").drop_vars([*places], errors="ignore")
+    flat = flat if axes else flat.expand_dims(CONFIGURATION)
+    return [combinations[k] for k in kept], flat.assign_coords(
+        {CONFIGURATION: labels}).transpose(CONFIGURATION, *groups, ...)
 
 
 def grouped(
@@ -434,9 +423,8 @@ def grouped(
         *data.pipeline.experiment.target_axes, *data.pipeline.axes_of(*stages))} - groups.keys()
     axes = {name: some for name, some in known.axes.items() if name in compared}
     places = dict.fromkeys(tuple(each[name] for name in axes) for each in known.combinations)
-    kept, labels = _labelled(data, axes, [dict(zip(axes, each, strict=True)) for each in places])
-    table = data.by(axes, analysis, groups)
-    return stacked(table, kept, labels).transpose(CONFIGURATION, *groups, ...)
+    combinations = [dict(zip(axes, each, strict=True)) for each in places]
+    return _of_each(data, axes, combinations, analysis, groups)[1]
 
 
 def notes_of(data: ReportData, groups: Groups) -> str:

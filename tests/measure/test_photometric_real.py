@@ -18,12 +18,12 @@ from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import state_of
 from sweep.measure.photograph import draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
-from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
+from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings, with_neighbours
 from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
-from sweep.model.marker import WHITE
+from sweep.model.marker import WHITE, module_count
 from sweep.model.pose import rotation_of_angles
 
 ALARM = 1e-7
@@ -129,6 +129,23 @@ def test_surroundings_are_what_opencv_draws_around_a_marker():
         left = x < points[:, :1]
         white = (inside & left) @ (jump * np.sign(stop - start))
         np.testing.assert_array_equal(white, expected)
+
+
+@pytest.mark.parametrize("board", [CHARUCO, GRID], ids=["charuco", "grid"])
+def test_a_marker_with_its_neighbours_looks_as_on_its_board(board):
+    pose, side = BoardPose(rotation(35, 20, 10), np.array([0.0, 0.0, 0.4])), 0.03
+    turn, position = pose_of(board, 4, pose)
+    alone = with_neighbours(BoardMarker(board, 4), 2.0)
+    whole, part = (
+        levels_of(board_scene(each, camera_of(VIEW, ()), at), 90.0, 20.0, 200.0)
+        for each, at in ((board, pose), (alone, BoardPose(turn, position / side))))
+    reach = 0.5 + 1.9 / module_count(board.dictionary)
+    corners = side * reach * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    at = corners @ turn.T + position
+    pixels = np.rint(at[:, :2] / at[:, 2:] * VIEW[:2] + VIEW[2:]).astype(np.int32)
+    inside = cv2.erode(cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), pixels, 1), None) > 0
+    assert inside.sum() > 1000
+    np.testing.assert_allclose(part[inside], whole[inside], atol=1e-6)
 
 
 def test_the_ring_around_a_marker_that_is_clear():

@@ -556,7 +556,7 @@ def score(
     scored = library.score.prepare(
         folder, files, names=names,
         conventions=library.answers.Conventions(pixel_center, corner_order, frame),
-        doubled=doubled, beside=beside, settings=settings)
+        doubled=doubled, beside=beside, settings=settings, overwrite=overwrite)
     summary = executed(
         scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
         overwrite=overwrite)

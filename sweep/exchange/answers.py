@@ -108,7 +108,7 @@ STEM = r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$"
 
 NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 
-#: Largest number of pixels, metres or radians.
+#: Largest number of pixels, metres or radians, and largest ID.
 MOST = 1e6
 
 MAX_TOLD_COLUMNS = 12
@@ -130,7 +130,8 @@ def _text(path: Path, source: str) -> str:
         return content.decode(
             "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise refusal([f"{source}: not text ({error.reason}); expected CSV"]) from None
+        line = content.count(b"\n", 0, error.start) + 1
+        raise _refused(source, {line: f"not text ({error.reason}); expected CSV"}) from None
     except OSError as error:
         raise StoreError(
             f"{source}: cannot be read: {reason_of(error)}{nearest_file(path)}") from None
@@ -165,6 +166,8 @@ def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
         faults[first] = (
             f"no column {', '.join(missing)}{poses}; the header has "
             f"{', '.join(plain(name, 40) for name in written[:MAX_TOLD_COLUMNS])}{hint}")
+    elif more := [name for name in written if re.fullmatch("[xy]_?[4-9]", name.lower())]:
+        faults[first] = f"the column {plain(more[0])}: expected four corners, x0, y0 to x3, y3"
     elif repeated := [name for name in expected if header.count(name) > 1]:
         faults[first] = f"the column {repeated[0]} is there twice"
     if faults:
@@ -242,7 +245,7 @@ def read_answers(
 
     stems = table["image"].str.replace(STEM, "", regex=True)
     judge(~stems.isin(images.keys()), "image {image} is not among the images; "
-          f"expected a name such as {next(iter(images), '')}")
+          "expected a name such as {known}", known=pd.Series(next(iter(images), ""), stems.index))
     # An image without an ID and without numbers was searched in vain.
     table = table[(table.iloc[:, 1:] != "").any(axis=1)]
     stems = stems[table.index]
@@ -252,15 +255,17 @@ def read_answers(
         texts, column = table[group.columns], group.isna().to_numpy().argmax(axis=1)
         judge(
             group.isna().any(axis=1) & (texts != "").any(axis=1),
-            "{name} = {value}: expected a finite number, as all of corners or pose have, or none",
+            f"{{name}} = {{value}}: expected a finite number of at most {MOST:g}, as all of "
+            "corners or pose have, or none",
             name=pd.Series(group.columns[column], group.index),
-            value=pd.Series(texts.to_numpy()[np.arange(len(texts)), column], group.index))
+            value=pd.Series(texts.to_numpy()[np.arange(len(texts)), column], group.index).replace(
+                "", "nothing"))
     has_corners, has_pose = (group.notna().all(axis=1) for group in (corners, poses))
     of_target = (table["id"] == "") & has_pose & ~has_corners
     marker_id = _numbers(table["id"]).where(~of_target, OF_TARGET)
     judge(~of_target & ~((marker_id % 1 == 0) & (marker_id >= REJECTED)),
-          "id {id}: expected a whole number, or -1 for a candidate that was not decoded; none "
-          "beside the pose of a board")
+          f"id {{id}}: expected a whole number up to {MOST:g}, or -1 for a candidate that was not "
+          "decoded; none beside the pose of a board")
     judge(~has_corners & ~has_pose, "an ID without corners and without a pose")
     turns, position = poses.iloc[:, :-3], poses.iloc[:, -3:]
     length = (turns**2).sum(axis=1) ** 0.5

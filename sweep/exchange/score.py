@@ -134,6 +134,8 @@ class _Images:
             table = pd.read_csv(
                 folder / "truth.csv", usecols=["image", "id", *origin, *CORNER_COLUMNS],
                 dtype=dict.fromkeys(CORNER_COLUMNS, np.float64))
+            if table.empty:
+                raise StoreError(f"{shown}: no image was exported: no scene shows its target")
             image, names = pd.factorize(table["image"])
             indices = pipeline.experiment.all_scenes.indices(
                 np.array([name.partition("-")[0] for name in names], dtype=np.intp))
@@ -172,6 +174,7 @@ def prepare(
     doubled: str = "refuse",
     beside: bool = False,
     settings: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> Scored:
     """Read answers, record them beside the export's pipeline, and return what scores them.
 
@@ -191,6 +194,8 @@ def prepare(
         Whether the experiment's own detector searches the same images beside them.
     settings
         "key=value" for the experiment: solvers, beliefs, bounds.
+    overwrite
+        Whether other detections of a name are replaced.
 
     Raises
     ------
@@ -210,10 +215,10 @@ def prepare(
                 _summary(each, len(images.index)),
                 *hints(each.corners, images.truth(each), conventions))]
             path, content = home / f"{label}{SUFFIX}", RECORDINGS.content(images.recording(each))
-            if path.exists() and path.read_bytes() != content:
+            if not overwrite and path.exists() and path.read_bytes() != content:
                 raise StoreError(
                     f"{plain(path, 300)}: holds other detections, which a store may refer to; "
-                    "choose another --name, or delete it"
+                    "choose another --name, or --overwrite"
                 )
             write_whole(path, content)
     posed = all(np.isfinite(each.translation).any() for each in answers)

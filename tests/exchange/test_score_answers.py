@@ -223,9 +223,10 @@ GOOD = "image,id,x0,y0,x1,y1,x2,y2,x3,y3\n{0},0,1,2,3,4,5,6,7,8\n"
 BAD = {
     "an unknown image": (GOOD.replace("{0}", "frame1.png"), ("line 2: image frame1.png is not "
                          "among the images; expected a name such as 000000-")),
-    "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", ("line 3: image {0} has ID 0 twice, here "
-                      "and in line 2")),
+    "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", "line 3: image {0} has ID 0 twice, here"),
     "a missing column": (GOOD.replace("y3", "yy3"), "line 1: no column y3; the header has "),
+    "a fifth corner": (GOOD.replace("y3", "y3,x4"), "line 1: the column x4: expected four corners"),
+    "a far corner": (GOOD.replace(",8", ",2e6"), "y3 = 2e6: expected a finite number of at most"),
     "NaN": (GOOD.replace(",8", ",nan"), "line 2: y3 = nan: expected a finite number"),
     "a quaternion of length 2": (
         "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),
@@ -261,8 +262,8 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
     other = write(tmp_path / "other.csv", rows_of(good)[:3])
     with pytest.raises(StoreError, match="holds other detections, which a store may refer to"):
         prepare(exported, [other], names=["held"])
-    for wrong in ((7.0, "TL TR BR BL", "right up out"), (0.0, "TL TL BR BL", "right up out"),
-                  (0.0, "TL TR BR BL", "right up in")):
+    prepare(exported, [other], names=["held"], overwrite=True)
+    for wrong in ((7.0,), (0.0, "TL TL BR BL"), (0.0, "TL TR BR BL", "right up in")):
         with pytest.raises(ArgumentError, match="expected"):
             Conventions(*wrong)
 

@@ -229,7 +229,6 @@ def test_files_and_names_of_the_architecture_exist():
     for name in re.findall(r"`([A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)`", text):
         assert re.search(rf"\b{name}\b", sources), name
 
-# What the README shows is what the project does.
 
 @pytest.mark.parametrize("path", sorted((TOP / "pipelines").glob("*.toml")), ids=lambda p: p.stem)
 def test_every_pipeline_is_sound(path):
@@ -246,7 +245,6 @@ def test_plan_says_what_a_run_takes(capsys):
     assert re.search(r"poses +240", told)
     assert re.search(r"time +(over )?\S+ (s|min|h)", told)
 
-# The notebooks run, show their figures, and are stored with the outputs of their sources.
 
 NOTEBOOKS = TOP / "notebooks"
 FIGURES = {"choosing_a_marker": 6, "paper_reproduced": 4, "first_analysis": 5}

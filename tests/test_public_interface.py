@@ -124,7 +124,6 @@ def test_every_module_that_mypy_sees_in_the_library_is_imported_on_use():
     assert len(seen) > 30
     assert {name: getattr(library, name).__name__ for name in seen} == seen
 
-# What strangers meet before the first run: workflow, package page, citation, issue forms.
 
 TOP = Path(__file__).parent.parent
 PROJECT = tomllib.loads((TOP / "pyproject.toml").read_text())["project"]

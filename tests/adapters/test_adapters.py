@@ -44,8 +44,6 @@ def detector(request):
     return request.param
 
 
-# Detectors.
-
 RUN = {
     "seed": 4, "camera": {"width_px": 320, "height_px": 240, "fx_px": 500.0},
     "marker": {"dictionary": "DICT_APRILTAG_36h11", "size_m": 0.1},
@@ -108,8 +106,6 @@ def test_a_missing_package_is_told_with_its_command(monkeypatch):
         assert f"pip install 'fiducial-sweep[{extra}]'" in told
 
 
-# Boards.
-
 GRID = {"kind": "grid", "rows": 3, "columns": 4, "gap_m": 0.02}
 CHARUCO = {"kind": "charuco", "squares_x": 5, "squares_y": 4, "square_m": 0.065,
            "legacy_pattern": True}
@@ -167,8 +163,6 @@ def test_boards_that_locus_lacks_are_failures_that_say_why(settings, expected):
     assert (results.columns["estimate"][0] == EstimateStatus.failed).all()
     assert expected in results.failures[0].text
 
-
-# Markers of AprilTag's and STag's own families.
 
 def family_document(dictionary, marker_id, **scene):
     detector = "stag-python" if dictionary.startswith("STAG") else "pyapriltags"

@@ -16,8 +16,6 @@ from support.small_datasets import holm, perfect, with_detected
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
 from sweep.measure.flags import Flipped
 
-# By simulation.
-
 
 def simulated(rng, sizes, vectors):
     """Return a dataset of regimes; rotation in 0.01 rad, z in percent of 1 m, x and y in cm."""
@@ -180,8 +178,6 @@ def test_limits_of_detection_are_covered_at_least_as_often_as_they_say(
     truth = sides[good][0] if good.any() else math.inf  # beyond the grid
     covered(answer, "side_px", truth, 0.95, 1.0)
 
-
-# Rankings.
 
 @lengths(60, 2000)
 @pytest.mark.parametrize(("ids", "rate"), [(10, 0.5), (50, 0.95), (10, 0.999)])

@@ -77,9 +77,6 @@ def mixed():
     return with_flags_of_every_kind(rng, measured(rng, SIZES))
 
 
-# Values.
-
-
 def test_every_value_lies_in_its_interval_and_is_described(mixed):
     for table in (error_statistics(mixed, ["distance_m"]), efficiency(mixed, ["solver"]),
                   covariance_trust(mixed, ["solver"]),
@@ -131,8 +128,6 @@ def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(mixed, mon
         error_statistics(mixed)
 
 
-# Efficiency.
-
 def test_efficiency_is_that_of_plain_loops(mixed):
     per = ["distance_m", "solver"]
     answer = efficiency(mixed, per)
@@ -144,8 +139,6 @@ def test_efficiency_is_that_of_plain_loops(mixed):
         assert_agrees(answer, dict(zip(per, index, strict=True)),
                       {"rotation_efficiency": rotation, "range_efficiency": depth})
 
-
-# Covariances.
 
 def test_true_covariances_are_trusted_and_others_are_not():
     rng = np.random.default_rng(14)
@@ -200,8 +193,6 @@ def test_flips_cost_the_trust_and_too_few_draws_give_none():
         assert (answer["nees_count"], answer["covariance_trusted"]) == (count, trusted)
     assert answer["nees_mean"] == np.inf
 
-
-# Renderers.
 
 def test_renderers_are_compared_pose_by_pose():
     rng = np.random.default_rng(16)

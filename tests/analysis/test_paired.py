@@ -31,7 +31,6 @@ from support.small_datasets import (
 from sweep.analysis import compare, marker_ranking
 from sweep.measure.flags import Flipped
 
-# Ranking of marker IDs.
 
 def hypergeometric_parts(aimed, marker):
     """Return an ID's hits and, of each cell that it was in, (looked for, its, hits) of all IDs.
@@ -98,8 +97,6 @@ def test_rates_and_p_values_of_ids_are_those_of_plain_loops(case):
         if kept == per:
             assert sorted(here["rank"].values.tolist()) == [m + 1 for m in markers]
 
-
-# Comparison of two configurations.
 
 def newcombe(both, first, second, neither):
     """Return the difference of two paired rates, second minus first, and its interval.

@@ -81,8 +81,6 @@ def order_statistics(values, of, share):
     return value, low, high
 
 
-# The functions.
-
 def expected_detection(found):
     aimed = found.where(looked_for(found))
     hits = int(is_detected(aimed).sum())
@@ -168,9 +166,6 @@ def ends_with_flips(value, solved, flips, parts, bound=180.0):
     return min(value, *low), max(value, *high)
 
 
-# Comparison.
-
-
 def assert_all_agree(answer, groups, names, expected):
     """Compare every kept combination; ``names`` are the kept dimensions."""
     arrays = {name: array.transpose(*names).values for name, array in answer.data_vars.items()}
@@ -244,8 +239,6 @@ def test_a_small_spread_about_a_large_bias_keeps_its_digits():
     assert_all_agree(
         error_statistics(results), poses(results, "estimate"), (), expected_errors)
 
-
-# What users do to datasets.
 
 def test_what_was_cut_away_was_not_run():
     whole = GRIDS["draws"]

@@ -89,8 +89,6 @@ def test_in_plane_error_is_what_is_left_of_the_rotation_after_the_shortest_one(s
     assert left.max() < 1e-9
 
 
-# The statistics.
-
 COLUMNS = {
     **{prefix + axis: (attribute, k) for prefix, attribute in (
         ("", "in_camera_m"), ("marker_frame_", "along_marker_m"),

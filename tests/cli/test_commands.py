@@ -33,9 +33,6 @@ def python(code):
         [sys.executable, "-c", code], cwd=TOP, capture_output=True, text=True, check=False)
 
 
-# Help and version.
-
-
 @pytest.mark.parametrize("named", COMMANDS, ids=lambda named: named.name)
 def test_each_help_has_two_examples_that_are_commands_and_a_text_for_each_argument(named):
     code, out, _ = command(named.name, "--help")
@@ -66,9 +63,6 @@ def test_help_and_version_import_nothing_heavy():
     assert done.stdout.endswith("imported:\n")
 
 
-# Messages.
-
-
 @pytest.mark.parametrize(
     ("error", "status"),
     [(ArgumentError("workers", 0, "expected at least 1"), 2), (PipelineError(["a", "b"]), 2),
@@ -80,8 +74,6 @@ def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
     assert err.count("\n") == len(getattr(error, "faults", ["one"]))
     assert "\x1b" not in err  # it would reach the terminal
 
-
-# Installations.
 
 def installed(monkeypatch, commands=(), **versions):
     """Have these versions of distributions be installed alone, each with commands."""
@@ -135,8 +127,6 @@ def test_python_3_10_is_refused_in_one_line():
     done = python(f"{old}sys.argv[0] = '/usr/bin/sweep'; import sweep")
     assert (done.returncode, done.stderr) == (1, f"{problem}\n")
 
-
-# Completion.
 
 @pytest.mark.system
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

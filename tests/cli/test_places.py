@@ -98,8 +98,6 @@ def test_a_worker_that_does_not_see_the_store_says_what_it_needs(folder):
     assert "by a worker; every machine needs the store under this path" in str(told.value)
 
 
-# What the system refuses, and where output goes.
-
 ERRORS = {
     OSError(24, "Too many open files", "chunk"):
         "chunk: Too many open files; allow more open files (ulimit -n)",

@@ -74,8 +74,6 @@ class Estimated:
             assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
 
 
-# 1. Size.
-
 ANYWHERE = {
     "seed": 1, "marker": {"size_m": 0.1},
     "camera": {"fx_px": 600, "fy_px": 550, "distortion": [-0.2, 0.05, 0.001, -0.002]},
@@ -105,8 +103,6 @@ def test_wrong_size_scales_the_translation_and_leaves_the_rotation_alone(count, 
         np.testing.assert_allclose(
             found.translation, right.translation * (size / 0.1), rtol=1e-15, atol=0)
 
-
-# 2. Camera and size, of a marker parallel to the image plane.
 
 PARALLEL = {
     "marker": {"size_m": 0.1}, "camera": {"fx_px": 600, "fy_px": 550}, "pose": {"azimuth_deg": 20},
@@ -146,8 +142,6 @@ def test_a_wrong_camera_moves_a_parallel_marker_as_the_law_says_and_does_not_tur
     estimated.assert_poses(parallel_law)
 
 
-# 3. Lenses.
-
 @pytest.mark.parametrize("lens", [
     [-0.25, 0.0, 0.0, 0.0], [-0.3, 0.1, 0.0, 0.0, 0.05],
     [0.2, 0.02, 0.0, 0.0, 0.01, 0.1, -0.03, 0.004],
@@ -163,8 +157,6 @@ def test_lens_that_is_not_believed_scales_the_distance_of_a_centred_marker(lens)
         "axes": {"roll_deg": [20, 30, 45, 100], "solver": list(GUARDED)},
     }).assert_poses(lambda *_: np.tile([0, 0, 0.2 / radial], (4, 1)))
 
-
-# What beliefs must not touch.
 
 EVERYTHING = {
     "seed": 13, "marker": {"size_m": 0.0731}, "scene": {"background": 90},
@@ -222,8 +214,6 @@ def test_beliefs_change_no_draw_no_image_and_no_detection(settings, unset):
         different, unset["translation_error_m"], equal_nan=True
     )
 
-
-# A calibration with its errors, drawn for each trial.
 
 VIEW = {"fx_px": 600.0, "fy_px": 601.0, "cx_px": 320.5, "cy_px": 238.25}
 LENS = [-0.2, 0.05, 0.001, -0.0005, 0.01]

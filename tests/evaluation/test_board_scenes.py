@@ -236,7 +236,6 @@ def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(besid
         scenes, flags, values["board"].listed(1), chosen.largest_board)
     assert (boards.flags == expected).all()
 
-# AprilGrids in scenes, and what detects them.
 
 APRIL_GRID = {"kind": "aprilgrid", "tagCols": 4, "tagRows": 3, "tagSpacing": 0.3}
 

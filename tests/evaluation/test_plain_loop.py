@@ -60,8 +60,6 @@ def mean_side(quads):
     return np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean()
 
 
-# Markers.
-
 MARKER_M = 0.05
 DICTIONARIES = {"DICT_4X4_50": cv2.aruco.DICT_4X4_50, "DICT_6X6_250": cv2.aruco.DICT_6X6_250}
 CAMERA = np.array([[4.0 / 4.8 * 640, 0, 319.5], [0, 4.0 / 3.6 * 480, 239.5], [0, 0, 1]])
@@ -232,8 +230,6 @@ def assert_poses_are(values, poses, true_rvec, true_tvec):
     assert clear.mean() > 0.9
     assert (expected[clear] == FLIPPED).any()
 
-
-# Boards.
 
 BOARD_CAMERA = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
 LENS = [-0.2, 0.05, 0.0, 0.0]

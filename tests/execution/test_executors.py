@@ -47,8 +47,6 @@ def undisturbed(tmp_path_factory):
     return url
 
 
-# A Dask cluster that a run starts for itself.
-
 def settings_of_the_caller():
     return {
         # Dask's scheduler notes in its own section that Bokeh is missing.
@@ -81,9 +79,6 @@ def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tm
     unnamed = {name for name in left if name.startswith("ThreadPoolExecutor-")}
     assert len(unnamed) <= 1
     assert left - unnamed <= {"zarr", "asyncio", "Dask-Offload", "Dask-Callback-Thread"}
-
-
-# Children.
 
 
 def test_processes_that_cannot_be_started_are_told_in_a_line(monkeypatch, capsys):
@@ -161,8 +156,6 @@ def test_children_end_with_their_client_whatever_ends_it(tmp_path):
         signal.signal(signal.SIGINT, before)
     assert line == "the scheduler went away; run it again to continue"
 
-
-# The caller's cluster.
 
 def elsewhere(pipeline, begun):
     """Return what a thread says, as if it were another process, of other versions."""

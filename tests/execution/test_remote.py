@@ -48,9 +48,6 @@ def small(tmp_path):
     return path
 
 
-# Stores on an S3 server.
-
-
 LOGIN = {"AWS_ACCESS_KEY_ID": "key-of-tests", "AWS_SECRET_ACCESS_KEY": "secret-of-tests"}
 
 

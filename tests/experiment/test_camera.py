@@ -33,8 +33,6 @@ def view(camera):
     return [float(number) for number in intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))]
 
 
-# 1. Ways to give a camera.
-
 @pytest.mark.parametrize("width", [640, 1921])
 @pytest.mark.parametrize("fov", [1e-3, 60.0, 179.0])
 @pytest.mark.parametrize(("name", "across", "along"), [
@@ -81,9 +79,6 @@ def test_choosing_one_way_to_give_a_camera_drops_the_others(camera, setting, lef
     assert cell(pipeline(camera), setting).fixed == chosen.fixed
 
 
-# 2. What is told.
-
-
 @pytest.mark.parametrize(("sections", "line"), [
     ({"camera": {"cx_px": 640, "cy_px": 360, "fx_px": 500}}, "cx_px = 640: outside the frame of"),
     ({"camera": {"width_px": 1280, "height_px": 720, "cx_px": 320, "fx_px": 500}},
@@ -106,8 +101,6 @@ def test_a_run_tells_notes_and_a_dataset_has_the_camera(tmp_path, capfd):
     assert attributes["camera_fx_px"] == attributes["camera_fy_px"] == pytest.approx(fx)
     assert attributes["nearest_side_px"] == pytest.approx(fx * 0.01)
 
-
-# 3. Files.
 
 MATRIX = [[612.34567890123456, 0, 321.123456789], [0, 611.98765432109876, 1 / 3 + 238],
           [0, 0, 1]]
@@ -371,8 +364,6 @@ def test_what_opencv_s_calibration_says_of_its_errors_is_believed(tmp_path, endi
     given = of_file(plain, ["believed=calibration"], calibration_sd=SD)
     assert given.fixed["calibration_sd"] == tuple(SD)
 
-
-# 4. Pipelines and stores with a camera file.
 
 def test_the_text_of_a_pipeline_has_the_values_of_its_camera_file(tmp_path):
     path = write(tmp_path / "c.yaml", GOOD)

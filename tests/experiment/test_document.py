@@ -29,8 +29,6 @@ from sweep.messages import nearest
 from sweep.model.renderers import bitmap_shape
 from sweep.store.lifecycle import open_store
 
-# Pipelines of nested dictionaries: the same document, checks and messages as a file's.
-
 CHARACTERS = st.characters(categories=["L", "N", "P"], include_characters='"\\\' ')
 MORE = {
     "axes": {"solver": ["ippe", "sqpnp"], "marker_id": {"range": [1, 9, 3]},
@@ -133,7 +131,6 @@ def test_values_that_toml_does_not_have_are_told_by_key(document, message):
     with pytest.raises(PipelineError, match=message):
         Pipeline.from_dict(document, source="cell")
 
-# Axes along which parameters go together.
 
 POSE = {"pose": {"distance_m": 0.5}}
 
@@ -223,7 +220,6 @@ def test_settings_make_and_replace_such_axes():
     with pytest.raises(PipelineError, match="unknown parameter"):
         parse_settings(["lens=[1, 2]"])
 
-# Values as OpenCV, Python and users spell them, and names that are nearly right.
 
 OPENCV = {
     "cornerRefinementMethod": {f"CORNER_REFINE_{name.upper()}": name for name in REFINEMENTS},
@@ -295,8 +291,6 @@ def test_of_a_misspelled_file_the_nearest_in_its_folder_is_named(
     with pytest.raises(StoreError, match=r"did you mean runs/smoke\.zarr"):
         open_store("smok.zarr")
 
-
-# Boards of several kinds in one pipeline, and the most that a board can be.
 
 KEYS = {"none": {}, "grid": {"rows": 2, "columns": 2, "gap_m": 0.01},
         "charuco": {"squares_x": 3, "squares_y": 3, "square_m": 0.06}}

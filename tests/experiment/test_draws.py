@@ -122,8 +122,6 @@ def test_draws_are_uniform_normal_and_independent(count):
         assert abs(score) < stats.norm.isf(0.5e-6), name
 
 
-# Draws that are Sobol' points, scrambled.
-
 def test_points_are_sobols_wherever_they_are_asked_for():
     # Of the first dimension they are van der Corput's, in the order of the Gray code.
     index = np.array([0, 1, 2, 3, 70_000, 70_001, 5, 3])
@@ -191,7 +189,6 @@ def test_sampling_is_part_of_what_stores_must_share():
     )
     assert (ours != others).all()
 
-# How much evenly spread draws gain on real scenes: variances of means against independent ones.
 
 VARIED = {
     "camera": {"fx_px": 600},

@@ -15,7 +15,6 @@ from sweep.experiment.schema import SCHEMA, short_name
 from sweep.store.files import RECEIPTS
 from sweep.store.lifecycle import planned_arrays
 
-# What may surprise of poses is told in a line, by `plan` and at the start of a run.
 
 @pytest.mark.parametrize(("pose", "axes", "named"), [
     ({"distance_m": 0.3}, {"tilt_deg": [0, 45, 80], "bearing_x_deg": [0, 4.9]}, []),
@@ -76,7 +75,6 @@ def test_parts_are_active_for_a_reason(document, name, reason):
     assert part.active == (reason is not None)
     assert (reason or "no setting needs it") in part.reason
 
-# Which settings a configuration uses, where an axis holds those of several detectors.
 
 PLUGINS = """
 from dataclasses import dataclass
@@ -135,7 +133,6 @@ def test_settings_of_a_fixed_detector_and_those_that_go_together(pipeline):
         "steps = [2, 3] } }\n")
     assert len(distinct(together, combinations(together))) == 2
 
-# Short names for the axes of charts, and whole meanings beside them.
 
 MAX_LINE = 30
 """Characters after which xarray breaks a label; three lines fit beside a chart."""

@@ -49,8 +49,6 @@ def test_yaw_pitch_and_roll_are_scipys(count, claim):
     assert worst < 1e-14
 
 
-# A share of the frame
-
 def outline(scenes, quiet_modules, points):
     """Return points (N, M, 3) along the sides of the quiet zone, in the marker's frame."""
     modules = module_count(scenes.dictionary[0])
@@ -126,8 +124,6 @@ def test_a_lens_that_folds_before_the_edges_keeps_left_and_right_alike():
     assert left.min() == pytest.approx(319.5 - 500 * 0.645 * 2 / 3, abs=1)
 
 
-# The world
-
 @lengths(1000, 100_000)
 def test_places_in_the_world_are_scipys(count, claim):
     wholes = [made({}, {
@@ -158,8 +154,6 @@ def test_places_in_the_world_are_scipys(count, claim):
     assert (worst < [1e-14, 1e-12]).all()
 
 
-# Any pose, to the ends of the ranges
-
 @lengths(20, 2000)
 def test_any_pose_has_a_truth_and_is_the_same_alone(count):
     rng = np.random.default_rng(0)
@@ -186,8 +180,6 @@ def test_any_pose_has_a_truth_and_is_the_same_alone(count):
         np.testing.assert_array_equal(alone.rotation[0], scenes.rotation[one])
 
 
-# Draws
-
 def key_draws(pose, axes=None, **sections):
     values, _ = made({"jitter_px": 0.5, **pose}, {**(axes or {}), "trial": 3}, **sections)
     return values["shift_u_px"].values
@@ -213,8 +205,6 @@ def test_a_fixed_pose_has_the_same_draws_in_whichever_way_it_is_given(given, sam
     np.testing.assert_array_equal(key_draws(place | given), key_draws(place | same))
     assert (key_draws(place | given) != key_draws({"distance_m": 0.6} | given)).all()
 
-
-# Rules and choices
 
 def test_places_in_metres_are_the_truth():
     values, scenes = made(

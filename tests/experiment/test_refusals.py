@@ -268,14 +268,16 @@ def test_a_broken_file_ends_a_command_and_nothing_is_written(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken.toml").write_text(
         "[pose]\ndistance_m = 1\nside_px = 3\nrol = 1\n[marker]\nmarker_id = 77\n"
-        "[detector]\nadaptiveThreshWinSizeMax = 2"
+        '[detector]\nadaptiveThreshWinSizeMax = 2\n'
+        '[require]\nall = ["range_error_p95_m <= 0.1"]'
     )
     assert main([command, "broken.toml"]) == 2
     told = capsys.readouterr()
     assert told.out == ""
     lines = told.err.splitlines()
     # Faults of single keys do not hide those across keys.
-    for part in ("pose.rol: unknown", "not both", "IDs from 0 to 49", "WinSizeMax = 2"):
+    for part in ("pose.rol: unknown", "not both", "IDs from 0 to 49", "WinSizeMax = 2",
+                 'require.all = "range_error_p95_m <= 0.1": its unit is %: write range_p95'):
         assert [line for line in lines if line.startswith("broken.toml: ") and part in line], part
     assert [path.name for path in tmp_path.iterdir()] == ["broken.toml"]
     assert main([command, "none.toml"]) == 2
@@ -288,18 +290,6 @@ def test_all_faults_of_a_table_come_at_once():
         "board.markers[0].X:", "board.markers[0].x_m:", "board.markers[1].size_m"
     ]
 
-
-def test_a_requirement_of_nothing_that_is_known_is_told_by_a_run(tmp_path, capsys):
-    """Beside other faults; which requirements are refused: tests/analysis/test_requirements.py."""
-    (tmp_path / "broken.toml").write_text(
-        '[pose]\ndistance = 1\n[require]\nall = ["range_error_p95_m <= 0.1"]')
-    assert main(["run", str(tmp_path / "broken.toml")]) == 2
-    told = capsys.readouterr().err
-    assert 'require.all = "range_error_p95_m <= 0.1": its unit is %: write range_p95' in told
-    assert "pose.distance: unknown key" in told
-
-
-# What means harm.
 
 @pytest.mark.parametrize(("setting", "expected", "at"), [
     ("tilt_deg=" + "[" * 50_000, "expected a TOML value", "expected a TOML value"),
@@ -340,8 +330,6 @@ def test_any_text_is_a_pipeline_or_is_refused(text):
             assert_told(told)
 
 
-# Files.
-
 def encoded(ending, image):
     return cv2.imencode(ending, image)[1].tobytes()
 
@@ -378,8 +366,6 @@ def test_special_files_are_refused_unread(tmp_path):
                       faults_of(Pipeline.from_text, FRAME % name, folder=tmp_path)):
             assert expected in line
 
-
-# Files of boards.
 
 FILES = {
     "charuco": """kind = "charuco"

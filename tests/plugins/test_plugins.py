@@ -110,8 +110,6 @@ def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):
     assert "expected its setting shift_px to be declared as" in told
 
 
-# Plug-ins of installed packages.
-
 ENTRY_POINTS = """[sweep.detectors]
 turned = fast_markers.detectors:TURNED
 broken = fast_markers.nowhere:TURNED
@@ -183,8 +181,6 @@ def test_an_installed_plug_in_that_cannot_be_used_is_one_line(name, told, site):
     assert line.startswith(f'pipeline: axes.detector = "{name}": expected ')
     assert told in line
 
-
-# Stores of runs with plug-ins.
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
@@ -259,8 +255,6 @@ def test_effects_and_their_order_make_another_experiment(tmp_path):
     assert not differences(first, store.pipeline, store.fingerprint)
 
 
-# The guide's.
-
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
 
 
@@ -274,8 +268,6 @@ def test_the_pipeline_runs_with_all_four():
     assert (np.array(cells.columns["detection"]) == DetectionStatus.detected).all()
     assert (np.array(cells.columns["estimate"]) == EstimateStatus.solved).all()
 
-
-# Plug-ins at fault.
 
 BAD_DETECTOR = """
 import os

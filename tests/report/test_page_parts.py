@@ -41,8 +41,6 @@ def test_all_text_of_a_store_is_escaped():
     assert html.unescape(text).count(HOSTILE) > 30
 
 
-# Tables.
-
 def test_a_long_table_is_cut_and_says_so():
     table = Table.of("Many", ["name", "value"], [[str(k), "1"] for k in range(MAX_ROWS + 5)])
     assert table.full_caption == f"Many (the first {MAX_ROWS} of {MAX_ROWS + 5} rows)"
@@ -75,8 +73,6 @@ def test_a_cell_is_the_same_number_in_text_and_json():
         "x, m": 0.5, "bin": {"low": 1.0, "high": 4.0}, "n": 1200, "yes": True, "none": None,
         "rate": {"value": 0.25, "low": 0.125, "high": np.inf}}]
 
-
-# Figures.
 
 RATE = Column("rate, %", "rate", 100)
 

@@ -153,8 +153,6 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
         ET.parse(folder / f"{name}.svg")  # noqa: S314  (our own file)
 
 
-# What cannot be.
-
 def test_a_report_is_never_written_into_a_store(tmp_path):
     url = made(tmp_path, ODD["single pose"], "one")
     link = tmp_path / "link"

@@ -87,8 +87,6 @@ def test_line_table_json_and_page_have_the_numbers_of_the_analysis(tmp_path):
             assert (each["value"] > equal) == ((each["verdict"] == "better") == (equal == 0))
 
 
-# What is required.
-
 SIZES = {"distance_m": 4, "tilt_deg": 2, "trial": 400, "cornerRefinementMethod": 2}
 
 

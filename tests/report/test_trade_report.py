@@ -48,8 +48,6 @@ VALUES = st.sampled_from([0.1, 0.12, 0.25, 0.5, 1.0, 2.0, 3.0, np.inf, np.nan]) 
 POINTS = st.lists(st.tuples(VALUES, VALUES), min_size=1, max_size=12)
 
 
-# The front.
-
 @given(POINTS)
 def test_the_front_is_what_no_other_point_beats(points):
     def beats(a, b):
@@ -60,8 +58,6 @@ def test_the_front_is_what_no_other_point_beats(points):
     ]
     assert pareto_front(*zip(*points, strict=True)).tolist() == expected
 
-
-# Tables, JSON and figures, for one, three and no regimes, and for one treatment.
 
 def spoilt():
     """Return a `trade` whose criterion is infinite or NaN throughout the first regime."""

@@ -65,15 +65,10 @@ def plane_of(value):
     return plane
 
 
-def lattice_of(value):
-    """Columns (or rows) of the lines between cells: quiet zone, modules, quiet zone."""
-    n, quiet = len(modules_of(value)) - 2, value["quiet_zone_modules"]
-    return [-quiet, *range(n + 1), n + quiet]
-
-
 def vertices_of(value):
     """Homogeneous pixels (u·z, v·z, z) of the cells' corners, (n + 3, n + 3, 3)."""
-    lines = np.array(lattice_of(value), dtype=EXTENDED)
+    n, quiet = len(modules_of(value)) - 2, value["quiet_zone_modules"]
+    lines = np.array([-quiet, *range(n + 1), n + quiet], dtype=EXTENDED)
     columns, rows = np.meshgrid(lines, lines)
     points = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ plane_of(value).T
     centre = [EXTENDED(value[name] - 1) / 2 for name in ("width_px", "height_px")]

@@ -59,17 +59,11 @@ def pipeline_text(sizes, seed=1):
     })
 
 
-def dims_of(sizes, stage):
-    """Return the axes of a stage, in order: of the scene, with detection, with estimation."""
-    left_out = {"scene": OF_DETECTION + OF_ESTIMATION, "detection": OF_ESTIMATION,
-                "estimation": ()}[stage]
-    return tuple(name for name in sizes if name not in left_out)
-
-
 def perfect(rng, sizes, *, rotation=None, position=None):
     """Return a dataset of poses that are all solved; errors (..., xyz) in radians and metres."""
     scene, detected, estimated = (
-        dims_of(sizes, stage) for stage in ("scene", "detection", "estimation")
+        tuple(name for name in sizes if name not in left_out)
+        for left_out in (OF_DETECTION + OF_ESTIMATION, OF_ESTIMATION, ())
     )
     shapes = {dims: tuple(sizes[name] for name in dims) for dims in (scene, detected, estimated)}
     depth = rng.uniform(0.5, 2.0, shapes[scene])

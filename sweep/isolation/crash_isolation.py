@@ -138,7 +138,8 @@ class _IsolatedCells:
                 self.cells.columns[variable.name][number, rows] = (
                     part.columns[variable.name][number])
         for name, seconds in part.seconds.items():
-            self.cells.seconds[name] = np.add(self.cells.seconds[name], seconds).tolist()
+            if stage in ("", name):
+                self.cells.seconds[name] = np.add(self.cells.seconds[name], seconds).tolist()
         self.cells.row_seconds[rows] += part.row_seconds
         self.cells.failures += [
             dataclasses.replace(each, scene=int(rows[each.scene])) for each in part.failures

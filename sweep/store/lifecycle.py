@@ -595,8 +595,9 @@ def write_groups(
 ) -> None:
     """Write groups of a complete store, and consolidate the metadata.
 
-    The store is closed by a record of its ``counts``. Files of earlier groups of these names go
-    first: with other dimensions, one's folder is the other's file.
+    The store is closed by a record of its ``counts``; what others wrote to its groups stays. Else
+    files of earlier groups of these names go first: with other dimensions, one's folder is the
+    other's file.
     """
     memory = MemoryStore()
     for name, content in groups.items():
@@ -614,7 +615,8 @@ def write_groups(
     if counts is not None:
         metadata |= {"finished": True, "finished_at": utc_now(), "counts": counts}
     listed = metadata["files"]
-    others = {key: crc for key, crc in listed.items() if not key.startswith(within)}
+    others = {key: crc for key, crc in listed.items()
+              if counts is not None or not key.startswith(within)}
     with locations.translate_errors(store.url, "written"):
         if len(others) < len(listed):
             write_root(store, {**metadata, "files": others})

@@ -40,6 +40,9 @@ WAIT_S = 2.0
 #: Seconds after which a key's process is taken for dead.
 SILENCE_S = 120.0
 
+#: What file systems without locks of folders answer.
+NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
+
 
 @contextlib.contextmanager
 def held(url: str, storage: Store, *, alone: bool) -> Iterator[None]:
@@ -61,7 +64,7 @@ def held(url: str, storage: Store, *, alone: bool) -> Iterator[None]:
                     f"{url}: another process is writing it; wait for it, or choose another --store"
                 ) from None
             except OSError as error:
-                if error.errno not in {errno.ENOLCK, errno.ENOTSUP}:
+                if error.errno not in NO_LOCKS:
                     raise
                 notice(f"{url}: its file system has no locks: keep others from deleting the store")
         yield

@@ -152,7 +152,8 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     ]
     lines = [
         f"{name}: the store has {_shown(other)}, this run {_shown(own)}"
-        for name, other, own in pairs if _values(other) != _values(own)
+        for name, other, own in pairs
+        if other != own and _values(other) != _values(own)
     ]
     if problem := not_continued(ours.stopping, theirs.stopping):
         lines.append(problem)

@@ -15,9 +15,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
+from sweep.errors import MachineFaultError, RunError
 
-from sweep.errors import MachineFaultError
+try:
+    import numba
+except (ValueError, TypeError) as error:
+    # Numba interprets its configuration while it is imported.
+    raise RunError(
+        f"Numba cannot be imported with its NUMBA_... variables: {type(error).__name__}: {error}"
+    ) from None
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

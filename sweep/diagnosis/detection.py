@@ -311,6 +311,8 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
     names = [*vectors, *numbers, "estimate"]
     if missing := [name for name in names if name not in results]:
         raise DatasetError(f"no variable {missing[0]}: expected a run that solves poses")
+    if results["true_tvec_m"].ndim == 1:
+        results = results.expand_dims("trial")
     scene, dims = results["true_tvec_m"].dims, results["estimate"].dims
     if several := [f"{name} ({results.sizes[name]})" for name in dims
                    if name not in scene and results.sizes[name] > 1]:

@@ -185,14 +185,16 @@ def _settings(record: Plugin) -> tuple[Declared, ...]:
     types = [name for name in TYPES if name != "str" or record.kind not in ("effect", "renderer")]
     declared: list[Declared] = []
     try:
-        declared += declared_fields(record.settings).values()
-        wrong = [each.name for each in declared if each.default is dataclasses.MISSING
-                 or each.reads or not {kind.__name__ for kind in each.types} <= set(types)]
+        wrong = [each.name for each in dataclasses.fields(record.settings)
+                 if "declaration" not in each.metadata]
+        declared += () if wrong else declared_fields(record.settings).values()
+        wrong += [each.name for each in declared if each.default is dataclasses.MISSING
+                  or each.reads or not {kind.__name__ for kind in each.types} <= set(types)]
     except Exception as error:
         wrong = [exception_line(error)]
     if wrong:
         raise PluginError(
-            f"settings of a {record.kind} as a dataclass with `name: type = parameter(default, "
+            f"settings of the {record.kind} as a dataclass with `name: type = parameter(default, "
             f"meaning)`, of the types {', '.join(types)}; not so: {', '.join(wrong)}")
     if record.kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")

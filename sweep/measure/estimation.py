@@ -117,7 +117,7 @@ class Detections:
         return np.sqrt(self.mean_of_each(squared))
 
     def take(self, rows: NDArray[np.intp]) -> Detections:
-        """Return the detections of the given targets."""
+        """Return copies of the detections of the given targets."""
         first = np.searchsorted(self.owner, rows)
         counts = np.searchsorted(self.owner, rows, side="right") - first
         squares = np.arange(counts.sum()) + np.repeat(first - np.cumsum(counts) + counts, counts)

@@ -640,10 +640,10 @@ def _least_of(
     """
     if ordered and ordered[0].error_px <= ASTRAY_SHARE * side_px:
         return ordered
-    methods = [cv2.SOLVEPNP_SQPNP]
+    poses = guard.poses(cv2.SOLVEPNP_SQPNP)
     if len(points.pixels) < _AMBIGUOUS_POINTS:
-        methods.insert(0, cv2.SOLVEPNP_IPPE)
-    starts = points.solutions([pose for method in methods for pose in guard.poses(method)])
+        poses = [*guard.poses(cv2.SOLVEPNP_IPPE), *poses]
+    starts = points.solutions(poses)
     if not starts:
         return ordered
     least = starts[0].error_px

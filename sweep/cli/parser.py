@@ -51,8 +51,9 @@ COMMANDS = sorted(DECLARED.values(), key=lambda each: (
 #: Title of the list that argparse makes of the commands.
 UNGROUPED = "all commands"
 
-#: Beginning of argparse's message for a command that does not exist.
-INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)'")
+#: What a flag expects, by the name of the function that reads it, which argparse tells.
+EXPECTED = {"int": "a whole number", "float": "a number",
+            "whole_numbers": "whole numbers between commas, such as 10,20"}
 
 #: Pages for all commands: a first answer; questions and the command that answers each;
 #: architecture, development and the glossary.
@@ -79,7 +80,9 @@ class Parser(argparse.ArgumentParser):
 
 def _hint(message: str) -> str:
     """Return a hint at words similar to the ones that argparse refuses; empty without any."""
-    if chosen := INVALID_COMMAND.match(message):
+    if wrong := re.search(r"invalid (\w+) value: ", message):
+        return f"; expected {EXPECTED[wrong[1]]}"
+    if chosen := re.match(r"argument COMMAND: invalid choice: '([^']*)'", message):
         if chosen[1] == "help":
             return "; `sweep --help` and `sweep COMMAND --help` print the help"
         return nearest(chosen[1], [each.name for each in COMMANDS])

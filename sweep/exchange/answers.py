@@ -113,6 +113,9 @@ MOST = 1e6
 
 MAX_TOLD_COLUMNS = 12
 
+#: What an ID counts that an image has twice.
+DOUBLED = ("refuse", "nearest")
+
 #: Line of the file -> its first fault.
 Faults = dict[int, str]
 
@@ -228,11 +231,15 @@ def read_answers(
 
     Raises
     ------
+    ArgumentError
+        If ``doubled`` is another word.
     PipelineError
         One line for each fault, with the line of the file.
     StoreError
         If the file cannot be read.
     """
+    if doubled not in DOUBLED:
+        raise ArgumentError("doubled", doubled, f"expected {' or '.join(DOUBLED)}")
     source, faults = plain(path, 300), Faults()
     table = _table(_text(path, source), source, faults)
 

@@ -17,6 +17,7 @@ import tomlkit
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange import export
 from sweep.exchange.answers import CORNER_COLUMNS, CORNERS, Answers, Conventions, read_answers
+from sweep.experiment.document import toml_item
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
@@ -260,7 +261,7 @@ def _pipeline(
     """Return the export's pipeline with recorded detections in the place of its detector."""
     detectors = [f"{label}{SUFFIX}" for label in labels]
     if beside:
-        detectors = [*map(str, exported.values_of("detector")), *detectors]
+        detectors = [*dict.fromkeys(exported.values_of("detector")), *detectors]
     ours = {"detector": detectors if len(detectors) > 1 else detectors[0]} | (
         {"solver": "recorded"} if posed and not beside else {})
     document = tomlkit.parse(exported.text)
@@ -270,6 +271,9 @@ def _pipeline(
     for axis in exported.axes:
         if ours.keys() & axis.columns.keys() or (axis.stage is Stage.detection and not beside):
             axes.pop(axis.name, None)
+            # Settings that went together with a detector beside which we search are axes.
+            axes.update({name: toml_item([*dict.fromkeys(values)])
+                         for name, values in axis.columns.items() if beside and name not in ours})
     chosen = [f"{name}={json.dumps(value)}" for name, value in ours.items()]
     return Pipeline.from_text(
         tomlkit.dumps(document), [*chosen, *settings], name=labels[0],

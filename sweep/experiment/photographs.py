@@ -156,7 +156,9 @@ class PhotographRecord:
 
 #: Files of records.
 PHOTOGRAPH_RECORDS = ArrayFile(
-    "a record of photographs that `sweep photos` writes", 3, PhotographRecord)
+    "a record of photographs that `sweep photos` writes", 3, PhotographRecord, {
+        "paths": ("P",), "digests": ("P",), "marker_id": ("M",), "rotation": ("P", "M", 3, 3),
+        "translation": ("P", "M", 3), "std": ("P", "M", 6), "source": ("P", "M")})
 
 
 #: Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing

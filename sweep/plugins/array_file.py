@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -29,11 +30,14 @@ class ArrayFile(Generic[Record]):
         The number in its array ``version``.
     record
         The dataclass of a record, whose fields are arrays, tuples of texts, texts or numbers.
+    shapes
+        Field -> shape of its array: lengths, or letters, each of which stands for one length.
     """
 
     meaning: str
     version: int
     record: type[Record]
+    shapes: Mapping[str, tuple[int | str, ...]]
 
     def content(self, record: Record) -> bytes:
         """Return the content of a record's file: the same bytes for the same attributes."""
@@ -69,15 +73,24 @@ def _read(
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = dict(archive)
+        values = {}
         if arrays["version"] == kind.version:
-            values = {}
             for name, hint in get_type_hints(kind.record).items():
                 array = values[name] = arrays[name]
                 if array.ndim == 0:
                     values[name] = hint(array.item())
                 elif array.dtype.kind == "U":
                     values[name] = tuple(array.tolist())
-            return kind.record(**values), hashlib.sha256(content).hexdigest()
     except Exception:
         raise ValueError("it is none") from None
-    raise ValueError("of another version")
+    if arrays["version"] != kind.version:
+        raise ValueError("of another version")
+    lengths: dict[int | str, int] = {}
+    for name, shape in kind.shapes.items():
+        found = arrays[name].shape
+        known = [lengths.setdefault(each, length) if isinstance(each, str) else each
+                 for each, length in zip(shape, found, strict=False)]
+        if len(found) != len(shape) or [*found] != known:
+            wanted = ", ".join(str(lengths.get(each, each)) for each in shape)
+            raise ValueError(f"{name}: expected the shape ({wanted}), not {found}")
+    return kind.record(**values), hashlib.sha256(content).hexdigest()

@@ -71,7 +71,10 @@ class Recording:
 
 
 #: Files of recordings.
-RECORDINGS = ArrayFile("detections that `sweep score` recorded", 1, Recording)
+RECORDINGS = ArrayFile(
+    "detections that `sweep score` recorded", 1, Recording, {
+        "exported": ("images",), "image": ("M",), "marker_id": ("M",), "corners": ("M", 4, 2),
+        "rotation": ("M", 3, 3), "translation": ("M", 3)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,6 +21,7 @@ from sweep.exchange.score import prepare
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plugins.recording import RECORDINGS, Recording
 from sweep.store.lifecycle import open_store
 
 DICTIONARIES = 'dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]'
@@ -115,9 +116,20 @@ def test_a_scored_store_is_a_store(exported, tmp_path, capsys):
     assert cli.main(["verify", store]) == 0
     assert re.search(r"not recomputed|mine\.npz", capsys.readouterr().out)
     assert sweep.open(store).detection.sum() > 0
-    (exported / "experiment/mine.npz").write_bytes(b"PK no archive")
-    with pytest.raises(PipelineError, match=r"mine\.npz"):
-        Pipeline.from_text(pipeline.text, folder=exported / "experiment")
+    none, two = np.zeros(0), np.zeros(2)
+    wrong = RECORDINGS.content(Recording(none, two, two, two, np.zeros((2, 3, 3)), none))
+    for content, line in ((b"PK no archive", r"mine\.npz"), (wrong, r"the shape \(2, 4, 2\), not")):
+        (exported / "experiment/mine.npz").write_bytes(content)
+        with pytest.raises(PipelineError, match=line):
+            Pipeline.from_text(pipeline.text, folder=exported / "experiment")
+
+
+def test_settings_that_go_together_with_the_detector_beside_stay(tmp_path):
+    chosen = '{ zip = { detector = ["opencv", "opencv"], useAruco3Detection = [false, true] } }'
+    export(Pipeline.from_text(f"{TEXT}search = {chosen}"), tmp_path / "out")
+    (tmp_path / "none.csv").touch()
+    scored = prepare(tmp_path / "out", [tmp_path / "none.csv"], beside=True).pipeline
+    assert scored.axis("useAruco3Detection").values == [False, True]
 
 
 def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
@@ -255,6 +267,7 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
         (tmp_path, [good], {}, StoreError, "not an export; make one with `sweep export"),
         (exported, [good, good], {}, ArgumentError, "another name for each file"),
         (exported, [good], {"names": ["../a"]}, ArgumentError, "letters, digits"),
+        (exported, [good], {"doubled": "none"}, ArgumentError, "none: expected refuse or nearest"),
     ):
         with pytest.raises(error, match=line):
             prepare(folder, files, **options)

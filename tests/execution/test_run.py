@@ -15,7 +15,7 @@ import sweep
 from support.commands import started
 from support.stores import GRID, by_hand, same
 from sweep.errors import ArgumentError, MachineFaultError, StoreError
-from sweep.execution.block_task import compute_block, match
+from sweep.execution.block_task import _opened, compute_block, match
 from sweep.execution.runner import execute
 from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
@@ -198,6 +198,7 @@ def test_another_build_of_the_same_version_is_refused_by_run_reuse_and_workers(
     here = f"{cv2.__version__} 000000000000"
     monkeypatch.setattr(provenance, "builds", lambda: {**there, "opencv": here})
     store = open_store(undisturbed)
+    _opened.cache_clear()
     line = f"builds.opencv: the store has .?{there['opencv']}.?, this run .?{here}"
     for refused in (lambda: execute(pipeline, undisturbed), lambda: match(pipeline, store)):
         with pytest.raises(StoreError, match=line):

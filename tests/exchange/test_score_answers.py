@@ -129,7 +129,7 @@ def test_settings_that_go_together_with_the_detector_beside_stay(tmp_path):
     export(Pipeline.from_text(f"{TEXT}search = {chosen}"), tmp_path / "out")
     (tmp_path / "none.csv").touch()
     scored = prepare(tmp_path / "out", [tmp_path / "none.csv"], beside=True).pipeline
-    assert scored.axis("useAruco3Detection").values == [False, True]
+    assert scored.axis("useAruco3Detection").values == (False, True)
 
 
 def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from sweep import library
+from sweep import experiment, library
 from sweep.execution import BLOCK_TASK
 from sweep.isolation.child_process import Child
 from sweep.messages import notice
@@ -81,6 +81,9 @@ class RunOptions(LocalOptions, total=False):
     reuse: Sequence[str | os.PathLike[str]]
     yes: bool
 
+
+experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported when it is used)
+    library.requirements.quantity_faults(texts, names))
 
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
@@ -278,8 +281,6 @@ def _pipeline(
             "pipeline", given,
             "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
         )
-    if pipeline.requirements:
-        library.requirements.check_required(pipeline.requirements, pipeline.source)
     return pipeline
 
 

@@ -59,12 +59,12 @@ from sweep.analysis.estimator import (
 )
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
 from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
-from sweep.errors import ArgumentError, DatasetError, PipelineError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.sampling import RequirementText, StoppingRule, read_requirement
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
+from sweep.messages import label, nearest, plain, shown
 from sweep.model.marker import module_count
 from sweep.typing import Floats, Masks
 
@@ -714,31 +714,15 @@ def _rounded(count: float) -> float:
 # --------------------------------------------------------------------------------------------------
 # The requirements in a pipeline's section [require], their names checked.
 
-def check_required(
-    texts: Iterable[str], source: str, others: PipelineError | None = None
-) -> None:
-    """Check the requirements of a pipeline, by what can be required (`requirables`).
-
-    Parameters
-    ----------
-    texts
-        The requirements, which have the form of such.
-    source
-        The name that lines begin with.
-    others
-        The faults that the pipeline has besides.
-
-    Raises
-    ------
-    PipelineError
-        One line for each fault.
-    """
-    known = () if others is None else others.faults
-    faults = [*known, *(
-        plain(line, MAX_LINE_LENGTH) for text, problem in read_requirements(texts)[1]
-        if (line := f"{source}: require.all = {shown(text)}: {problem}") not in known)]
-    if faults:
-        raise PipelineError(faults)
+def quantity_faults(texts: Iterable[str], names: Iterable[str]) -> list[str]:
+    """Return a line for each fault of a pipeline's requirements and of its precisions' names."""
+    lines = [f"require.all = {shown(text)}: {problem}"
+             for text, problem in read_requirements(texts)[1]]
+    try:
+        wanted_precisions(dict.fromkeys(names, 0.5))
+    except ValueError as error:
+        lines += [f"search.precision.{line}" for line in str(error).splitlines()]
+    return lines
 
 
 # --------------------------------------------------------------------------------------------------

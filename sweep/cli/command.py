@@ -247,14 +247,7 @@ def read_pipeline(
         If it is given as a folder that is no store.
     """
     settings = [*settings, *precision_settings(precision, max_trials)]
-    try:
-        pipeline = library.lifecycle.read_pipeline(source, settings)
-    except PipelineError as error:
-        if texts := library.lifecycle.texts_required(source, settings):
-            library.requirements.check_required(texts, plain(source), error)
-        raise
-    if pipeline.requirements:
-        library.requirements.check_required(pipeline.requirements, plain(source))
+    pipeline = library.lifecycle.read_pipeline(source, settings)
     if pipeline.stopping is not None:
         library.rules.make_rule(pipeline)
     return pipeline

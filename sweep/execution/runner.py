@@ -467,9 +467,4 @@ def _with_search(
         raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
     if "along" not in given:
         raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
-    pipeline = lifecycle.read_pipeline(source, [*settings, *chosen, *more])
-    if pipeline.requirements:
-        from sweep.analysis.requirements import check_required  # noqa: PLC0415  (slow to import)
-
-        check_required(pipeline.requirements, pipeline.source)
-    return pipeline
+    return lifecycle.read_pipeline(source, [*settings, *chosen, *more])

@@ -6,11 +6,12 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
+from sweep import experiment
 from sweep.declaration import Declared, TablesError, check_table
 from sweep.experiment.document import REQUIRE, SEARCH, Reading, toml_item
 from sweep.experiment.draws import SAMPLINGS
@@ -304,7 +305,7 @@ def read_required(reading: Reading) -> dict[str, Any]:
     The axes have been read.
     """
     table = _read_section(reading, REQUIRE, REQUIRE_KEYS)
-    budget_ms = None
+    budget_ms, named = None, []
     for text in table.get("all", ()):
         try:
             given = read_requirement(text)
@@ -317,14 +318,24 @@ def read_required(reading: Reading) -> dict[str, Any]:
             if given.name == BUDGET and budget_ms is not None:
                 raise ValueError("there is another budget; delete one")
             budget_ms = given.limit if given.name == BUDGET else budget_ms
+            named += [text] if given.name != BUDGET else []
         except ValueError as error:
             reading.note(f"{REQUIRE}.all = {shown(text)}", str(error))
+    _tell_of_quantities(reading, named, [])
     conditions = tuple(dict.fromkeys(table.get("per", ())))
     for name in conditions:
         if not _is_of_scene(reading, name):
             _axis_at(reading, f"{REQUIRE}.per", name)
     return {"requirements": tuple(texts_in(reading.document)), "require_per": conditions,
             "budget_ms": budget_ms}
+
+
+def _tell_of_quantities(
+    reading: Reading, texts: Sequence[str], names: Collection[str]
+) -> None:
+    """Note faults of requirements and of names of precisions; a store has none."""
+    if reading.recorded is None and (texts or names):
+        reading.tell(experiment.quantity_faults(texts, names))
 
 
 def texts_in(document: Mapping[str, Any]) -> list[str]:
@@ -362,6 +373,8 @@ def read_search(reading: Reading, required: Mapping[str, Any]) -> StoppingRule |
     faults, given = len(reading.faults), reading.table(SEARCH)
     table = _read_section(reading, SEARCH, SEARCH_KEYS)
     _make_trials(reading, table)
+    if isinstance(given.get("precision"), dict):
+        _tell_of_quantities(reading, [], given["precision"])
     kinds = [kind for kind in KINDS if given.get(kind, False) is not False]
     if len(kinds) != 1:
         others = f", not {' and '.join(kinds)}" if kinds else ""

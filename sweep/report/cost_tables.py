@@ -12,7 +12,6 @@ from os import PathLike
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError
 from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
@@ -87,7 +86,6 @@ def measure_tradeoff(
     store = os.fspath(store)
     if store.lower().endswith(".toml"):
         pipeline = read_pipeline(store)
-        check_required(pipeline.requirements, store)
         with progress_display() if progress else contextlib.nullcontext() as display:
             summary = execute(pipeline, None, progress=display)
         for line in summary.warnings:

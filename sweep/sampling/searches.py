@@ -17,7 +17,6 @@ from sweep.analysis.dataset import ERROR_INPUTS, ESTIMATE_INPUTS
 from sweep.analysis.estimator import draws_to_see
 from sweep.analysis.intervals import looks_factor
 from sweep.analysis.requirements import Decision, ErrorShares, Requirable, Requirement
-from sweep.errors import PipelineError
 from sweep.experiment.document import SEARCH
 from sweep.experiment.grid import TRIAL, Block
 from sweep.experiment.pipeline import Pipeline
@@ -162,7 +161,6 @@ def pooled_cells(pipeline: Pipeline, rule: StoppingRule) -> int:
 
 def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the values of the axis at which trials decide the limit."""
-    decisions.check_required(rule.requirements, pipeline.source)
     required = decisions.parse_requirements(rule.requirements)
     searched = (*rule.per, *rule.at_all, rule.along)
     shares = decisions.error_shares(
@@ -260,8 +258,8 @@ def _choice(pipeline: Pipeline, rule: StoppingRule) -> Search:
         _too_few(pipeline, rule, least, f"fewer cannot show {each.text} with "
                  f"{100 * decisions.CONFIDENCE:g} % confidence, even if all meet it")
         for each in required if (least := least_draws(each, shares.met))]
-    faults = PipelineError(lines) if (lines := list(filter(None, lines))) else None
-    decisions.check_required(rule.requirements, pipeline.source, faults)
+    if any(lines):
+        raise refusal(list(filter(None, lines)))
     return [each.requirable for each in required], lambda dataset: decisions.choice_cells(
         dataset, rule, shares).needed()
 
@@ -281,11 +279,7 @@ def store_cells(
 def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the conditions at which an interval is wider than was wanted."""
     widths = dict(rule.precision)
-    try:
-        wanted = decisions.wanted_precisions(widths)
-    except ValueError as error:
-        raise refusal([f"{pipeline.source}: search.precision.{line}"
-                       for line in str(error).splitlines()]) from None
+    wanted = decisions.wanted_precisions(widths)
     lines = [_too_few(pipeline, rule, each.fewest_draws, f"with fewer no interval of {each.name} "
                       f"has a half-width of {each.half_width:g}") for each in wanted]
     if any(lines):

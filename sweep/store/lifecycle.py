@@ -31,8 +31,7 @@ from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
-from sweep.experiment.sampling import texts_in
+from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import (
     LABELS,
     PHOTOGRAPH_SCHEMA,
@@ -720,20 +719,11 @@ def _pipeline_or_file(source: Pipeline | str | os.PathLike[str]) -> Pipeline | s
     return open_store(url).pipeline
 
 
-def document_of(
-    source: Pipeline | str | os.PathLike[str], settings: Sequence[str] = ()
-) -> dict[str, Any] | None:
+def document_of(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any] | None:
     """Return the document of a pipeline, its file or its store; None if it cannot be read."""
     try:
         found = _pipeline_or_file(source)
         text = read_regular(found, MAX_BYTES).decode() if isinstance(found, str) else found.text
-        document = read_document(text)
-        apply_settings(document, parse_settings(settings))
+        return read_document(text)
     except (OSError, ValueError, SweepError):
         return None
-    return document
-
-
-def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
-    """Return the requirements in a TOML file that has faults; none if it is no TOML."""
-    return texts_in(document_of(path, settings) or {})

@@ -92,6 +92,7 @@ BROKEN = [
      "pose.tilt_deg = {uniform = [0, 400]}: expected a number from -360 to 360"),
     ("pose = 3\n[axes]\ndistance_m = [1]\nfy_px = [1]\ntrial = 4",
      "pose = 3: expected a table: [pose]"),
+    (P + '[require]\nall = ["flips <= 0.1"]', 'all = "flips <= 0.1": nothing of this name has'),
     (P + '[require]\nall = ["detection"]', 'require.all = "detection": expected NAME >= NUMBER'),
     (P + '[require]\nall = ["detection >= 0.9"]\nper = ["solver"]',
      "require.per: solver: no such axis; expected one under [axes] of the scene: there is none"),

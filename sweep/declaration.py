@@ -168,9 +168,11 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
         declaration = field.metadata["declaration"]
         unit = declaration.unit or next(
             (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
+        kinds, default = plain_types(hints[field.name]), field.default
+        if kinds == (float,) and type(default) is int:
+            default = float(default)
         declared[field.name] = dataclasses.replace(
-            declaration, name=field.name, types=plain_types(hints[field.name]),
-            default=field.default, unit=unit)
+            declaration, name=field.name, types=kinds, default=default, unit=unit)
     return declared
 
 

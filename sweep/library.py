@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sweep.fitting import folders
     from sweep.integrity import verification
     from sweep.photographs import prepare, twins
-    from sweep.plugins import declared
+    from sweep.plugins import loading
     from sweep.report import (
         comparison_tables,
         decisions,

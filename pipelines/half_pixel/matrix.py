@@ -22,7 +22,7 @@ print("| --- | --- | --- | --- |")
 for name, setting in DETECTORS:
     offset = check_plugin(name, settings=[setting] if setting else []).numbers["offset_px"]
     declared = 0.0 if name == "opencv" else getattr(
-        load("detector", name, "."), "pixel_center", 0.0)
+        load("detector", name, ".")[0], "pixel_center", 0.0)
     x, y = (each + declared for each in offset)
     off = [max(abs(x - centre), abs(y - centre)) for centre in (0, 0.5)]
     verdict = ["consistent" if each < 0.02 else f"off by {each:.2f} px" for each in off]

@@ -26,7 +26,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncoun
 from sweep.messages import nearest, shown
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.pose import angle_between, rotation_of_vector
-from sweep.plugins.declared import recorded_plugins
+from sweep.plugins.loading import recorded_plugins
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -597,12 +597,12 @@ def plugins(
         raise ArgumentError(
             "settings" if settings else "dictionary", "", "expected `check` and a name")
     if name is None:
-        every = library.declared.installed()
+        every = library.loading.installed()
         lines = [f"{each['kind']:10} {each['name']:20} of {each['distribution']}"
                  for each in every]
         return findings(lines or ["no plug-in is installed"], {"plugins": every}, 0,
                         "sweep plugins NAME", "describes one, and says whether it can be used")
-    found = [plugin.to_json() for plugin in library.declared.described(name)]
+    found = [plugin.to_json() for plugin in library.loading.described(name)]
     return findings(
         [line for plugin in found for line in _plugin_lines(plugin)], {"plugins": found})
 

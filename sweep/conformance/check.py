@@ -25,7 +25,7 @@ from sweep.model.marker import dictionary_names, marker_count, missing_package
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.declared import DeclaredPlugin, PluginSetting, described
+from sweep.plugins.loading import DeclaredPlugin, PluginSetting, described
 from sweep.typing import Floats, Grey, Integers
 
 # --------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.polygon import side_lengths
-from sweep.plugins.recording import OF_TARGET, RECORDINGS, REJECTED, SUFFIX, Recording
+from sweep.plugins.recording import OF_TARGET, REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
 from sweep.typing import Floats, Integers
@@ -215,7 +215,7 @@ def prepare(
             lines += [f"{label}: {line}" for line in (
                 _summary(each, len(images.index)),
                 *hints(each.corners, images.truth(each), conventions))]
-            path, content = home / f"{label}{SUFFIX}", RECORDINGS.content(images.recording(each))
+            path, content = home / f"{label}{SUFFIX}", images.recording(each).content()
             if not overwrite and path.exists() and path.read_bytes() != content:
                 raise StoreError(
                     f"{plain(path, 300)}: holds other detections, which a store may refer to; "

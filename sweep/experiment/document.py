@@ -23,7 +23,7 @@ from sweep.experiment.grid import TRIAL, Axis, Grid
 from sweep.experiment.parameters import PARAMETERS, Parameter
 from sweep.messages import MAX_FAULTS, plain, refusal, shown, similar
 from sweep.model.image_file import read_regular
-from sweep.plugins.declared import DeclaredPlugin
+from sweep.plugins.loading import DeclaredPlugin
 
 # --------------------------------------------------------------------------------------------------
 # TOML: any text gives a document or a reason, and soon.

@@ -32,7 +32,7 @@ from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
 from sweep.plugins import EffectPlugin, RendererPlugin
-from sweep.plugins.declared import DeclaredPlugin, PluginSetting
+from sweep.plugins.loading import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats, Masks
 
 T = TypeVar("T")

@@ -19,7 +19,7 @@ from sweep.experiment.parameters import ONE_VALUE, PARAMETERS, Parameter, Stage,
 from sweep.messages import label, nearest, plain, shown
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.calibration import CalibrationError
-from sweep.plugins.declared import DeclaredPlugin
+from sweep.plugins.loading import DeclaredPlugin
 from sweep.typing import Floats
 
 #: The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ...

@@ -20,8 +20,7 @@ from sweep.model.effects import Effects
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose, WorldPose
 from sweep.model.scene import Scene
-from sweep.plugins.declared import DeclaredPlugin, declare
-from sweep.plugins.loading import offered
+from sweep.plugins.loading import DeclaredPlugin, declare, offered
 
 # --------------------------------------------------------------------------------------------------
 # Every parameter of every section, gathered from where it is declared.

@@ -27,7 +27,7 @@ from sweep.model.camera import Column
 from sweep.model.image_file import Part, reference
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
-from sweep.plugins.array_file import ArrayFile
+from sweep.plugins.recording import ArrayFile
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ POSE = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PhotographRecord:
+class PhotographRecord(ArrayFile):
     """P photographs of M markers, and their poses in the camera's frame.
 
     Attributes
@@ -123,6 +123,11 @@ class PhotographRecord:
         The document of the board's file as JSON; empty if the markers are single ones.
     """
 
+    meaning = "a record of photographs that `sweep photos` writes"
+    version = 3
+    shapes = {  # noqa: RUF012
+        "paths": ("P",), "digests": ("P",), "marker_id": ("M",), "rotation": ("P", "M", 3, 3),
+        "translation": ("P", "M", 3), "std": ("P", "M", 6), "source": ("P", "M")}
     paths: tuple[str, ...]
     digests: tuple[str, ...]
     part: Part
@@ -152,13 +157,6 @@ class PhotographRecord:
     def size(self) -> Integers:
         """Width and height in px, (2,)."""
         return np.array([self.width_px, self.height_px])
-
-
-#: Files of records.
-PHOTOGRAPH_RECORDS = ArrayFile(
-    "a record of photographs that `sweep photos` writes", 3, PhotographRecord, {
-        "paths": ("P",), "digests": ("P",), "marker_id": ("M",), "rotation": ("P", "M", 3, 3),
-        "translation": ("P", "M", 3), "std": ("P", "M", 6), "source": ("P", "M")})
 
 
 #: Modules beyond what a board leaves clear around a marker that a simulation of it shows: nothing
@@ -202,7 +200,7 @@ def recorded_poses(
     count = len(trials)
     names = values["photographs"].listed(count)
     records = {
-        name: PHOTOGRAPH_RECORDS.read(Path(folder) / name)[0] for name in dict.fromkeys(names)}
+        name: PhotographRecord.read(Path(folder) / name)[0] for name in dict.fromkeys(names)}
     ids = {name: record.marker_id.tolist() for name, record in records.items()}
     boards = {name: record.on_board(record.marker_id) for name, record in records.items()}
     places: list[tuple[str, int, int]] = []

@@ -24,7 +24,7 @@ from sweep.experiment.draws import REPLICATES
 from sweep.experiment.experiment import Experiment, Facts
 from sweep.experiment.grid import DISTRIBUTION_FORMS, TRIAL, Axis, Grid
 from sweep.experiment.parameters import PARAMETERS, STATED, WORLD, Parameter, Stage
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
+from sweep.experiment.photographs import PhotographRecord
 from sweep.experiment.sampling import MAX_TRIALS, StoppingRule, read_required, read_search
 from sweep.experiment.schema import LABELS, VARIABLES
 from sweep.measure.detectors import OPENCV
@@ -38,7 +38,7 @@ from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular
 from sweep.model.scene import RENDERERS, is_renderer
 from sweep.model.sensor import MAX_LEVEL
-from sweep.plugins.declared import DeclaredPlugin
+from sweep.plugins.loading import DeclaredPlugin
 from sweep.plugins.recording import is_recording
 
 # --------------------------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ def photographs_alone(reading: Reading) -> None:
     for name in dict.fromkeys(reading.values_of("photographs")):
         path = Path(reading.folder) / name
         try:
-            record, reading.files[name] = PHOTOGRAPH_RECORDS.read(path)
+            record, reading.files[name] = PhotographRecord.read(path)
         except PluginError as error:
             reading.refuse("photographs", str(error), name)
             continue

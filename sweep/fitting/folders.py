@@ -21,7 +21,7 @@ from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
 from sweep.experiment.document import document_text, read_document
 from sweep.experiment.parameters import PHOTOGRAPHS
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, SUFFIX, PhotographRecord
+from sweep.experiment.photographs import SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.fitting.fit import (
     MARKERS,
@@ -112,7 +112,7 @@ def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
         paths=tuple(str((Path(pipeline.folder) / record.paths[k]).resolve()) for k in numbers),
         digests=tuple(record.digests[k] for k in numbers),
     )
-    write_whole(folder / f"{name}{SUFFIX}", PHOTOGRAPH_RECORDS.content(chosen))
+    write_whole(folder / f"{name}{SUFFIX}", chosen.content())
     document = read_document(pipeline.to_toml())
     document["scene"][PHOTOGRAPHS] = f"{name}{SUFFIX}"
     axes = document["axes"]

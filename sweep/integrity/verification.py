@@ -27,7 +27,7 @@ from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest, plain, refusal
-from sweep.plugins.declared import PluginSetting
+from sweep.plugins.loading import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle, lock

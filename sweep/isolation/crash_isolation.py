@@ -26,7 +26,7 @@ from sweep.isolation.child_process import (
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plugins.declared import PluginSetting
+from sweep.plugins.loading import PluginSetting
 from sweep.store.blocks import selected
 from sweep.typing import Masks
 

@@ -18,8 +18,7 @@ from sweep.errors import PluginError
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.declared import PluginSetting
-from sweep.plugins.loading import call, made, real_numbers
+from sweep.plugins.loading import PluginSetting, call, made, real_numbers
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

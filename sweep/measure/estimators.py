@@ -17,8 +17,7 @@ from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.solver import OPENCV_SOLVERS, Solver
 from sweep.model.lens import COUNTS
 from sweep.plugins import EstimatorPlugin, Poses
-from sweep.plugins.declared import PluginSetting
-from sweep.plugins.loading import call, made, real_numbers
+from sweep.plugins.loading import PluginSetting, call, made, real_numbers
 
 # --------------------------------------------------------------------------------------------------
 # A plug-in's solver: what it returns is checked as our own solvers' poses are.

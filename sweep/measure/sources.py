@@ -15,7 +15,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
 from sweep.plugins import Poses
-from sweep.plugins.declared import PluginSetting
+from sweep.plugins.loading import PluginSetting
 from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers
 

@@ -14,7 +14,6 @@ import numpy as np
 from sweep.errors import ArgumentError, StoreError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.experiment.photographs import (
-    PHOTOGRAPH_RECORDS,
     SUFFIX,
     PhotographRecord,
     board_document,
@@ -351,7 +350,7 @@ def _write_records(
     with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
         for each, record in zip(names, records, strict=True):
-            path, content = home / each, PHOTOGRAPH_RECORDS.content(record)
+            path, content = home / each, record.content()
             used = (home / f"{name}.zarr").exists() and path.exists()
             if used and path.read_bytes() != content and not overwrite:
                 raise StoreError(

@@ -13,7 +13,7 @@ from sweep.errors import ArgumentError, PluginError
 from sweep.experiment.document import MAX_BYTES, read_document
 from sweep.experiment.grid import TRIAL, parse_distribution
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, PhotographRecord
+from sweep.experiment.photographs import PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import notice, plain
 from sweep.model.image_file import read_regular
@@ -93,7 +93,7 @@ def record_of(pipeline: Pipeline) -> PhotographRecord:
     """
     name = str(pipeline.values_of(PHOTOGRAPHS)[0])
     try:
-        return PHOTOGRAPH_RECORDS.read(Path(pipeline.folder) / name)[0]
+        return PhotographRecord.read(Path(pipeline.folder) / name)[0]
     except PluginError as error:
         raise ArgumentError(PHOTOGRAPHS, plain(name), f"expected {error}") from None
 

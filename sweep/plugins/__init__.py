@@ -14,8 +14,8 @@ from typing import Any, ClassVar, NamedTuple
 from sweep.declaration import parameter
 
 __all__ = [
-    "DetectorPlugin", "EffectPlugin", "EstimatorPlugin", "Markers", "Plugin", "Poses",
-    "RendererPlugin", "parameter",
+    "DetectorPlugin", "EffectPlugin", "EstimatorPlugin", "Markers", "Poses", "RendererPlugin",
+    "parameter",
 ]
 
 
@@ -89,13 +89,6 @@ class Plugin:
         """Refuse what cannot be called."""
         if not callable(getattr(self, self.function)):
             raise TypeError(f"{self.function}: expected a class or function")
-
-    @property
-    def distributions(self) -> tuple[str, ...]:
-        """The distributions that results depend on."""
-        if isinstance(self.distribution, str):
-            return (self.distribution,) if self.distribution else ()
-        return tuple(self.distribution)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,13 +192,10 @@ class EffectPlugin(Plugin):
     def __post_init__(self) -> None:
         """Refuse what no effect has."""
         super().__post_init__()
-        for name, choices in (
-            ("step", ("light", "signal")), ("widens", ("nothing", "noise", "uneven light")),
-        ):
-            if getattr(self, name) not in choices:
-                raise ValueError(
-                    f"{name} = {getattr(self, name)!r}: expected one of {', '.join(choices)}"
-                )
+        if self.step not in ("light", "signal"):
+            raise ValueError(f"step = {self.step!r}: expected light or signal")
+        if self.widens not in ("nothing", "noise", "uneven light"):
+            raise ValueError(f"widens = {self.widens!r}: expected nothing, noise or uneven light")
         if self.settings is None:
             raise TypeError("expected settings, of which the first is the switch")
 
@@ -229,6 +219,4 @@ class RendererPlugin(Plugin):
 
 #: Kind of plug-in -> its record.
 RECORDS: dict[str, type[Plugin]] = {
-    record.kind: record
-    for record in (DetectorPlugin, EstimatorPlugin, EffectPlugin, RendererPlugin)
-}
+    each.kind: each for each in (DetectorPlugin, EstimatorPlugin, EffectPlugin, RendererPlugin)}

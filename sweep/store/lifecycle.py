@@ -43,7 +43,7 @@ from sweep.experiment.schema import (
 )
 from sweep.messages import plain, refusal
 from sweep.model.image_file import IMAGE_SUFFIXES, read_regular
-from sweep.plugins.declared import RECORDED, recorded_plugins
+from sweep.plugins.loading import RECORDED, recorded_plugins
 from sweep.store import blocks, files, locations
 from sweep.store.blocks import RunStore
 from sweep.store.lock import changing, is_written

@@ -21,7 +21,7 @@ from sweep.exchange.score import prepare
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plugins.recording import RECORDINGS, Recording
+from sweep.plugins.recording import Recording
 from sweep.store.lifecycle import open_store
 
 DICTIONARIES = 'dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]'
@@ -117,7 +117,7 @@ def test_a_scored_store_is_a_store(exported, tmp_path, capsys):
     assert re.search(r"not recomputed|mine\.npz", capsys.readouterr().out)
     assert sweep.open(store).detection.sum() > 0
     none, two = np.zeros(0), np.zeros(2)
-    wrong = RECORDINGS.content(Recording(none, two, two, two, np.zeros((2, 3, 3)), none))
+    wrong = Recording(none, two, two, two, np.zeros((2, 3, 3)), none).content()
     for content, line in ((b"PK no archive", r"mine\.npz"), (wrong, r"the shape \(2, 4, 2\), not")):
         (exported / "experiment/mine.npz").write_bytes(content)
         with pytest.raises(PipelineError, match=line):

@@ -21,7 +21,7 @@ from support.board_photographs import (
     write_set,
 )
 from sweep.errors import ArgumentError, PipelineError, SweepError
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS, board_of
+from sweep.experiment.photographs import PhotographRecord, board_of
 from sweep.measure.flags import TruthSource
 from sweep.photographs.prepare import prepare
 
@@ -50,7 +50,7 @@ def faulty(tmp_path_factory):
 
 def record_of(prepared, name=None):
     name = name or prepared.pipeline.name
-    return PHOTOGRAPH_RECORDS.read(f"{prepared.pipeline.folder}/{name}.photographs.npz")[0]
+    return PhotographRecord.read(f"{prepared.pipeline.folder}/{name}.photographs.npz")[0]
 
 
 def write_poses(path, scale=1.0, suffix="", sign=1.0):

@@ -20,7 +20,7 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.analysis import error_statistics
 from sweep.errors import ArgumentError, SweepError
 from sweep.evaluation.inspection import scene_image
-from sweep.experiment.photographs import PHOTOGRAPH_RECORDS
+from sweep.experiment.photographs import PhotographRecord
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
@@ -178,7 +178,7 @@ def prepared(tmp_path_factory):
 
 
 def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
-    record, _ = PHOTOGRAPH_RECORDS.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record, _ = PhotographRecord.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
     twins = twin_pipeline(prepared, SCENE, repeats=2)
     columns = run_cells(twins, whole(twins).indices()).columns
     shown = record.shown
@@ -215,7 +215,7 @@ def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared)
 def test_a_twin_has_the_prints_of_its_board_around_the_marker(prepared, marker_id):
     scene = {"black": 35, "white": 210, "background": 120, "blur_px": 0.6}
     twin = cell(twin_pipeline(prepared, scene), f"trial=0,marker_id={marker_id}")
-    record, _ = PHOTOGRAPH_RECORDS.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    record, _ = PhotographRecord.read(f"{prepared.folder}/{prepared.name}.photographs.npz")
     turn = record.rotation[0, marker_id]
     corners = board().corners_m[marker_id]
     # The whole board at a pose that has the marker where the twin has it.

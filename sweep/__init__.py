@@ -14,21 +14,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from sweep import experiment, library
-from sweep.execution import BLOCK_TASK
-from sweep.isolation.child_process import Child
-from sweep.messages import notice
-
-if sys.version_info < (3, 11):  # noqa: UP036  (a copy of the sources, which pip did not check)
-    _PROBLEM = "sweep needs Python 3.11 or newer; this is Python {}.{}".format(*sys.version_info)
-    if os.path.basename(sys.argv[0]) in ("sweep", "-m"):  # noqa: PTH119
-        raise SystemExit(_PROBLEM)  # the command: one line, no traceback
-    raise ImportError(_PROBLEM)
-
 from sweep.errors import (
     ArgumentError,
     DatasetError,
@@ -37,6 +26,9 @@ from sweep.errors import (
     StoreError,
     SweepError,
 )
+from sweep.execution import BLOCK_TASK
+from sweep.isolation.child_process import Child
+from sweep.messages import notice
 from sweep.version import __version__
 
 if TYPE_CHECKING:

@@ -38,13 +38,14 @@ def compiled(function: Function, *, forceinline: bool = False) -> Function:
     dispatcher: Any = njit(
         function, nogil=True, error_model="numpy", forceinline=forceinline, no_cfunc_wrapper=True
     )
-    if not hasattr(dispatcher, "enable_caching"):
-        return cast("Function", dispatcher)  # compilation is switched off
-    # As `cache=True`, but where no folder can be written to each process compiles for itself.
-    with contextlib.suppress(RuntimeError):
+    # Compilation may be switched off (AttributeError); where no folder can be written to
+    # (RuntimeError), each process compiles for itself.
+    with contextlib.suppress(AttributeError, RuntimeError):
+        dispatcher.compile = partial(_compile, dispatcher, dispatcher.compile)
         dispatcher.enable_caching()
-        _drop_code_of_other_sources(dispatcher.stats.cache_path)
-    dispatcher.compile = partial(_compile, dispatcher, dispatcher.compile)
+        # Numba compares a function's own file only. It would go on using code in which a function
+        # of another file is inlined as that was.
+        dispatcher._cache._cache_file._source_stamp = _sources()  # noqa: SLF001
     return cast("Function", dispatcher)
 
 
@@ -58,12 +59,11 @@ def compiled_inline(function: Function) -> Function:
 
 
 def is_cached(module: str, name: str) -> bool:
-    """Return whether a compiled function of a module is in the cache."""
-    stats = getattr(getattr(importlib.import_module(module), name), "stats", None)
-    if stats is None:
-        return True  # compilation is switched off
-    pattern = f"{module.rpartition('.')[2]}.{name}-*.nbi"
-    return stats.cache_path is not None and any(Path(stats.cache_path).glob(pattern))
+    """Return whether a function of a module is in the cache, or compilation is switched off."""
+    function = getattr(importlib.import_module(module), name)
+    with contextlib.suppress(Exception):  # there is no cache, or its use says that it is damaged
+        return bool(function._cache._cache_file._load_index())  # noqa: SLF001
+    return not hasattr(function, "_cache")
 
 
 def _compile(dispatcher: Any, compile_signature: Callable[[Any], Any], signature: Any) -> Any:
@@ -93,16 +93,9 @@ def compiled_sources() -> tuple[Path, ...]:
 
 
 @cache
-def _drop_code_of_other_sources(folder: str) -> None:
-    """Delete code that was compiled from other sources: Numba compares a function's own file only.
+def _sources() -> str:
+    """Return a digest of all files with compiled functions.
 
-    It would go on using code in which a function of another file is inlined as that was. A constant
-    that compiled code uses must be declared in one of :func:`compiled_sources`, too.
+    A constant that compiled code uses must be declared in one of :func:`compiled_sources`, too.
     """
-    digest = sha256(b"".join(path.read_bytes() for path in compiled_sources())).hexdigest()[:16]
-    stamp = Path(folder) / f"sources-{digest}"
-    with contextlib.suppress(OSError):
-        if not stamp.exists():
-            for stale in (*Path(folder).glob("*.nbi"), *Path(folder).glob("sources-*")):
-                stale.unlink(missing_ok=True)
-            stamp.touch()
+    return sha256(b"".join(path.read_bytes() for path in compiled_sources())).hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from functools import cache
-from importlib.metadata import Distribution, distributions
+from importlib.metadata import distributions
 
 from sweep.errors import StoreError
 from sweep.messages import notice, plain
@@ -18,32 +18,12 @@ OTHER_OPENCV = ("opencv-contrib-python", "opencv-python", "opencv-python-headles
 REMEDY = f"`pip install --force-reinstall {OPENCV}`"
 
 
+@cache
 def check_installation() -> None:
-    """Refuse an installation that lacks ArUco or whose files are another project's.
-
-    Another distribution of OpenCV is warned of, once: which OpenCV is loaded is recorded in every
-    store (`sweep.store.provenance.fingerprint`).
-
-    Raises
-    ------
-    StoreError
-        In one line, with the command that mends it.
-    """
-    namesake = _installed("sweep")  # so was this one's distribution named up to 0.5
-    if namesake is not None and all(
-            each.value != "sweep.cli:main" for each in namesake.entry_points):
-        raise StoreError(
-            f"another project's package `sweep` ({namesake.version}) is installed, and its files "
-            "overwrite those of fiducial-sweep: `pip uninstall sweep`, then "
-            "`pip install --force-reinstall fiducial-sweep`"
-        )
-    check_opencv()
-    if multiprocessing.parent_process() is None:  # a worker's client has said it
-        _warn_of_other_opencv()
-
-
-def check_opencv() -> None:
     """Refuse an OpenCV that cannot be imported, or that has no ArUco.
+
+    Another distribution of OpenCV is warned of in a line on stderr, once: which OpenCV is loaded
+    is recorded in every store (`sweep.store.provenance.fingerprint`).
 
     Raises
     ------
@@ -59,22 +39,11 @@ def check_opencv() -> None:
         raise StoreError(
             f"OpenCV {version} is loaded, which has no cv2.aruco.ArucoDetector: {REMEDY}"
         )
-
-
-@cache
-def _warn_of_other_opencv() -> None:
-    """Write a line to stderr if OpenCV is installed in another way than this project asks for."""
     found = {name: package.version for name in (OPENCV, *OTHER_OPENCV)
-             if (package := _installed(name)) is not None}
-    if [*found] != [OPENCV]:
-        import cv2  # noqa: PLC0415  (slow to import)
-
+             for package in distributions(name=name)}
+    if [*found] != [OPENCV] and multiprocessing.parent_process() is None:  # else its client says it
         listed = " and ".join(f"{name} {version}" for name, version in found.items())
         notice(
             f"warning: {listed or 'an unknown distribution'} installed OpenCV, not {OPENCV} alone; "
             f"OpenCV {cv2.__version__} is loaded and recorded in stores"
         )
-
-
-def _installed(name: str) -> Distribution | None:
-    return next(iter(distributions(name=name)), None)

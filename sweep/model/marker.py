@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.errors import MissingPackageError
-from sweep.installation import check_opencv
+from sweep.installation import check_installation
 from sweep.model.coverage import MarkerEdges, joined
 from sweep.typing import Floats
 
@@ -222,7 +222,7 @@ def dot_centres() -> Floats:
 # --------------------------------------------------------------------------------------------------
 # The marker: its bitmap, and the straight edges between its modules.
 
-check_opencv()  # the dictionaries below are those of the OpenCV that is loaded
+check_installation()  # the dictionaries below are those of the OpenCV that is loaded
 
 #: Of markers that OpenCV lacks: AprilTag's and STag's.
 FAMILIES = {**TAG_FAMILIES, **STAG_LIBRARIES}

@@ -16,7 +16,6 @@ from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.grid import Axis
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import not_continued
-from sweep.installation import check_installation
 from sweep.version import __version__
 
 #: Raised whenever the numbers change; a test with golden digests fails if it is not.
@@ -25,14 +24,7 @@ NUMBERS_VERSION = 5
 
 @cache
 def builds() -> dict[str, str]:
-    """Return which builds of libraries are loaded in this process, whatever their metadata say.
-
-    Raises
-    ------
-    StoreError
-        If OpenCV cannot be used.
-    """
-    check_installation()
+    """Return which builds of libraries are loaded in this process, whatever their metadata say."""
     import cv2  # noqa: PLC0415  (slow to import)
     import llvmlite  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
@@ -65,13 +57,7 @@ def _numba_version() -> str:
 
 
 def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the values that two stores must share for one to reuse cells of the other.
-
-    Raises
-    ------
-    StoreError
-        If OpenCV cannot be used.
-    """
+    """Return the values that two stores must share for one to reuse cells of the other."""
     where_there_are = {
         "sampling": "" if pipeline.sampling == SAMPLINGS[0] else pipeline.sampling,
         # Of distributions that plug-ins depend on; a file is in ``files``.

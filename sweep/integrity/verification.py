@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,21 +158,22 @@ def check_blocks(
 ) -> dict[int, Receipt]:
     """Check every file of blocks; return the receipts of those without damage, by number."""
     sound: dict[int, Receipt] = {}
-    for number, receipt, fault in blocks.receipts_or_faults(store, numbers):
-        faults = {blocks.receipt_key(number): fault} if fault else {}
-        checksums = {} if receipt is None else receipt.checksums
-        names = {store.chunks.key(variable.name, number): variable.name
+    for number, receipt in blocks.receipts_or_faults(store, numbers):
+        names = {store.chunk_key(variable.name, number): variable.name
                  for variable in store.variables}
+        faults = {}
+        if isinstance(receipt, str):
+            faults[blocks.receipt_key(number)] = receipt
         for key, content in zip(names, files.read_files(store.storage, list(names)), strict=True):
             if content is None:
                 faults[key] = "missing"
-            elif not files.is_sound(content) or files.checksum_of(content) != checksums.get(
-                    names[key], files.checksum_of(content)):
+            elif not files.is_sound(content) or (not isinstance(receipt, str) and (
+                    files.checksum_of(content) != receipt.checksums.get(names[key]))):
                 faults[key] = lifecycle.CHANGED
             report.bytes += len(content or b"")
         report.files += 1 + len(names)
         report.damage += [Damage(key, what, number) for key, what in faults.items()]
-        if receipt is not None and not faults:
+        if not isinstance(receipt, str) and not faults:
             sound[number] = receipt
     report.processors = dict(Counter(
         name for receipt in sound.values() for name in receipt.processors))
@@ -208,8 +210,7 @@ MIN_OUTSIDE = 2
 REPEATED = 128
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(NamedTuple):
     """A stored scene: its block, its indices along the scene axes, its values.
 
     Every bit has to agree (``exact``) if a processor with the features of this one computed it.
@@ -248,8 +249,8 @@ def check_scenes(
         if not scenes:
             report.not_sampled = "every scene that was drawn had crashed"
             return
-        computed = _recomputed(pipeline, scenes)
-        damage = _compared(store, pipeline, scenes, computed)
+        computed = _recomputed(pipeline, [scene.cell for scene in scenes])
+        damage = _compared(store, scenes, computed)
         if damage and (part := _changing(pipeline, scenes, computed)):
             report.unstable = part
             damage = [Damage(part, f"not deterministic: {part}: scenes that were recomputed twice "
@@ -267,12 +268,12 @@ def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Sc
     everything = count >= sizes.sum()
     numbers = list(sound) if everything else generator.choice(
         np.array(list(sound)), size=count, p=sizes / sizes.sum()).tolist()
-    drawn = {
-        (number, store.blocks[number].cell(int(row)))
-        for number in numbers
-        for needed in [np.flatnonzero(scenes_needed(store, store.blocks[number]))]
-        for row in (needed if everything else [generator.choice(needed)])
-    }
+    drawn = set()
+    for number in numbers:
+        block = store.blocks[number]
+        needed = np.flatnonzero(scenes_needed(store, block))
+        rows = needed if everything else [generator.choice(needed)]
+        drawn |= {(number, block.cell(int(row))) for row in rows}
     names = [axis.name for axis in store.pipeline.experiment.scene_axes]
     scenes = [
         Scene(number, cell, stored_values(
@@ -285,27 +286,30 @@ def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Sc
             and EstimateStatus.crashed not in scene.stored["estimate"]]
 
 
-def _recomputed(pipeline: Pipeline, scenes: Sequence[Scene]) -> CellsResult:
-    """Recompute scenes in child processes."""
-    indices = list(np.array([scene.cell for scene in scenes], dtype=np.intp).T)
-    shape = (len(scenes), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
-    return run_cells_isolated(pipeline, indices, np.ones(shape, dtype=bool), TIME_LIMIT_S)
+def _recomputed(
+    pipeline: Pipeline, cells: Sequence[Sequence[int]], limit_s: float = TIME_LIMIT_S,
+    only: tuple[int, int] | None = None,
+) -> CellsResult:
+    """Recompute scenes in child processes, all configurations or ``only`` setting and estimator."""
+    shape = (len(cells), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    need = np.full(shape, only is None)
+    if only is not None:
+        need[:, *only] = True
+    return run_cells_isolated(pipeline, list(np.array(cells, dtype=np.intp).T), need, limit_s)
 
 
-def _compared(
-    store: RunStore, pipeline: Pipeline, scenes: Sequence[Scene], computed: CellsResult
-) -> list[Damage]:
+def _compared(store: RunStore, scenes: Sequence[Scene], computed: CellsResult) -> list[Damage]:
     """Return the recomputed scenes that differ from the stored ones.
 
     On another processor few of them may.
     """
-    names = [axis.name for axis in pipeline.experiment.scene_axes]
+    names = [axis.name for axis in store.pipeline.experiment.scene_axes]
     one = Block((0,) * len(names), (1,) * len(names))
     found: list[tuple[bool, Damage]] = []
     for row, scene in enumerate(scenes):
         values = {
             variable.name: to_dataset_layout(
-                variable, pipeline, one, computed.columns[variable.name][:, row : row + 1])
+                variable, store.pipeline, one, computed.columns[variable.name][:, row : row + 1])
             for variable in store.variables
         }
         if difference := compare(
@@ -325,7 +329,7 @@ def _changing(pipeline: Pipeline, scenes: Sequence[Scene], computed: CellsResult
     comes after it changes, too.
     """
     rows = np.resize(np.arange(len(scenes)), REPEATED)
-    again = _recomputed(pipeline, [scenes[row] for row in rows.tolist()])
+    again = _recomputed(pipeline, [scenes[row].cell for row in rows.tolist()])
     experiment = pipeline.experiment
     for variable in sorted(experiment.variables, key=lambda variable: variable.stage):
         first, second = computed.columns[variable.name][:, rows], again.columns[variable.name]
@@ -531,16 +535,11 @@ def reproduce(
         if axes else 0
         for axes in map(pipeline.axes_of, (Stage.detection, Stage.estimation))
     )
-    need = np.zeros(
-        (1, pipeline.size(Stage.detection), pipeline.size(Stage.estimation)), dtype=bool
-    )
-    need[0, setting, estimator] = True
     configuration = {
         Stage.scene: 0, Stage.detection: setting,
-        Stage.estimation: setting * need.shape[2] + estimator,
+        Stage.estimation: setting * pipeline.size(Stage.estimation) + estimator,
     }
-    scene = [np.array([k], dtype=np.intp) for k in corner]
-    cells = run_cells_isolated(pipeline, scene, need, time_limit_s)
+    cells = _recomputed(pipeline, [corner], time_limit_s, (setting, estimator))
     recomputed = {
         v.name: cells.columns[v.name][configuration[v.stage]][0].astype(v.dtype)
         for v in store.variables
@@ -606,12 +605,8 @@ def _inspected(
 ) -> tuple[SceneInspection | None, NDArray[np.uint8] | None]:
     """Return the inspected scene and its image; None for one that raises or ends its process."""
     for function in (inspect_scene, scene_image):
-        try:
-            with Child() as child:
-                result: Any = child.call(
-                    partial(function, cell_pipeline, whole_frame=whole_frame), limit_s=limit_s
-                )
-        except (ChildError, RunError):
-            continue
-        return (result, result.image) if function is inspect_scene else (None, result)
+        with contextlib.suppress(ChildError, RunError), Child() as child:
+            found: Any = child.call(
+                partial(function, cell_pipeline, whole_frame=whole_frame), limit_s=limit_s)
+            return (found, found.image) if function is inspect_scene else (None, found)
     return None, None

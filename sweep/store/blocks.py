@@ -68,11 +68,6 @@ class RunStore:
         """The variables of the pipeline."""
         return self.pipeline.experiment.variables
 
-    @cached_property
-    def chunks(self) -> Chunks:
-        """The chunks of the variables."""
-        return Chunks(self.pipeline, self.blocks)
-
     @property
     def data_url(self) -> str:
         """The URL that a user opens with ``xarray.open_zarr``."""
@@ -83,6 +78,36 @@ class RunStore:
         if name not in self._arrays:
             self._arrays[name] = cast("zarr.Array[Any]", self.group[name])
         return self._arrays[name]
+
+    def chunk_key(self, name: str, number: int) -> str:
+        """Return the key of a variable's chunk of a block."""
+        template, _ = self._chunks[name]
+        return template.format(*map(floordiv, self.blocks[number].starts, self.blocks.extents))
+
+    def chunk(self, name: str, values: NDArray[Any]) -> bytes:
+        """Return the content of a variable's chunk of a block, as Zarr writes it.
+
+        ``values`` are in the variable's dimensions. Beyond the grid's end, a chunk has fill values.
+        """
+        whole = self._chunks[name][1].copy()
+        whole[tuple(map(slice, np.shape(values)))] = values
+        return files.packed(whole.tobytes())
+
+    @cached_property
+    def _chunks(self) -> dict[str, tuple[str, NDArray[Any]]]:
+        """Variable -> key of its chunks, to be filled in with indices along axes; an empty one."""
+        axes = [axis.name for axis in self.pipeline.experiment.scene_axes]
+        extents = dict(zip(axes, self.blocks.extents, strict=True))
+        chunks = {}
+        for variable in self.variables:
+            names = variable.dimensions(self.pipeline)
+            index = (f"{{{axes.index(name)}}}" if name in axes else "0" for name in names)
+            shape = (extents.get(name, length) for name, length in zip(
+                names, variable.shape(self.pipeline), strict=True))
+            fill = np.array(variable.fill, dtype=np.dtype(variable.dtype).newbyteorder("<"))
+            chunks[variable.name] = (
+                "/".join([variable.name, "c", *index]), np.broadcast_to(fill, tuple(shape)))
+        return chunks
 
     @property
     def finished(self) -> bool:
@@ -110,53 +135,6 @@ def run_metadata_in(attributes: Mapping[str, Any]) -> dict[str, Any]:
         If there are none.
     """
     return dict(json.loads(attributes["sweep"]))
-
-
-# --------------------------------------------------------------------------------------------------
-# Chunks of a store's variables: a block has one of each. Their keys, shapes and contents.
-
-class Chunks:
-    """Chunks of the variables of a pipeline whose grid is cut into blocks; there may be millions.
-
-    Parameters
-    ----------
-    pipeline
-        The pipeline.
-    blocks
-        The blocks of its grid.
-    """
-
-    def __init__(self, pipeline: Pipeline, blocks: Blocks) -> None:
-        self._blocks = blocks
-        axes = [axis.name for axis in pipeline.experiment.scene_axes]
-        extents = dict(zip(axes, blocks.extents, strict=True))
-        # The key of a variable's chunk, to be filled in with a block's index along each axis.
-        self._templates: dict[str, str] = {}
-        self._empty: dict[str, NDArray[Any]] = {}
-        for variable in pipeline.experiment.variables:
-            names = variable.dimensions(pipeline)
-            index = (f"{{{axes.index(name)}}}" if name in axes else "0" for name in names)
-            self._templates[variable.name] = "/".join([variable.name, "c", *index])
-            self._empty[variable.name] = np.broadcast_to(
-                np.array(variable.fill, dtype=np.dtype(variable.dtype).newbyteorder("<")),
-                tuple(extents.get(name, length) for name, length in zip(
-                    names, variable.shape(pipeline), strict=True)),
-            )
-
-    def key(self, name: str, number: int) -> str:
-        """Return the key of a variable's chunk of a block."""
-        starts = self._blocks[number].starts
-        return self._templates[name].format(*map(floordiv, starts, self._blocks.extents))
-
-    def encoded(self, name: str, values: NDArray[Any]) -> bytes:
-        """Return the content of a variable's chunk, as Zarr writes it.
-
-        ``values`` are the block's, in the variable's dimensions. Beyond the grid's end, a chunk has
-        fill values.
-        """
-        whole = self._empty[name].copy()
-        whole[tuple(map(slice, np.shape(values)))] = values
-        return files.packed(whole.tobytes())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -381,8 +359,8 @@ def write_block(
         for together in in_writing_order(store.variables):
             contents = {}
             for name in together:
-                content = store.chunks.encoded(name, values[name])
-                contents[store.chunks.key(name, number)] = content
+                content = store.chunk(name, values[name])
+                contents[store.chunk_key(name, number)] = content
                 checksums[name] = files.checksum_of(content)
             files.write_files(store.storage, contents)
         receipt = dataclasses.replace(receipt, checksums=checksums, block=number)
@@ -407,7 +385,7 @@ def drop_block(store: RunStore, block: Block) -> None:
     """Delete a block's receipt and its chunks, so that it is computed again."""
     number = store.blocks.number(block)
     names = itertools.chain(*in_writing_order(store.variables))
-    keys = [store.chunks.key(name, number) for name in names]
+    keys = [store.chunk_key(name, number) for name in names]
     with translate_errors(store.url, "written"):
         files.delete_files(store.storage, [receipt_key(number), *reversed(keys)])
 
@@ -440,10 +418,10 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Rec
     StoreError
         If one is missing or damaged.
     """
-    for number, receipt, fault in receipts_or_faults(store, numbers):
-        if receipt is None:
+    for number, receipt in receipts_or_faults(store, numbers):
+        if isinstance(receipt, str):
             raise StoreError(
-                f"{store.url}: the receipt of block {number} is damaged ({fault}); "
+                f"{store.url}: the receipt of block {number} is damaged ({receipt}); "
                 "`sweep verify --repair` repairs it"
             )
         yield number, receipt
@@ -451,14 +429,14 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterator[tuple[int, Rec
 
 def receipt_of(store: RunStore, block: Block) -> Receipt | None:
     """Return a block's receipt; None if it is not committed, or its receipt is damaged."""
-    ((_, receipt, _),) = receipts_or_faults(store, [store.blocks.number(block)])
-    return receipt
+    ((_, receipt),) = receipts_or_faults(store, [store.blocks.number(block)])
+    return None if isinstance(receipt, str) else receipt
 
 
 def receipts_or_faults(
     store: RunStore, numbers: Iterable[int]
-) -> Iterator[tuple[int, Receipt | None, str]]:
-    """Yield blocks' numbers in order, each with its receipt, or None and the receipt's fault.
+) -> Iterator[tuple[int, Receipt | str]]:
+    """Yield blocks' numbers in order, each with its receipt, or the receipt's fault.
 
     A receipt of another block or run commits nothing.
     """
@@ -471,9 +449,9 @@ def receipts_or_faults(
                 receipt = Receipt.from_bytes(content)
                 if (receipt.run_id, receipt.block) != (store.run_id, number):
                     raise ValueError(f"of block {receipt.block} of run {receipt.run_id}")
-                yield number, receipt, ""
+                yield number, receipt
             except ValueError as error:
-                yield number, None, str(error)
+                yield number, str(error)
 
 
 def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
@@ -483,7 +461,7 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     """
     missing: dict[int, str] = {}
     for variable in store.variables:
-        keys = {store.chunks.key(variable.name, number): number for number in numbers}
+        keys = {store.chunk_key(variable.name, number): number for number in numbers}
         for key in files.absent_files(store.storage, keys, f"{variable.name}/c"):
             missing.setdefault(keys[key], key)
     return missing

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import glob
 import json
 import math
@@ -11,7 +10,7 @@ import shutil
 import time
 import uuid
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -36,7 +35,6 @@ from sweep.experiment.schema import (
     LABELS,
     PHOTOGRAPH_SCHEMA,
     VARIABLES,
-    Variable,
     fixed_values,
     with_description,
     with_descriptions,
@@ -116,117 +114,92 @@ def _dtype(name: str) -> Any:
 
 def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
-    variables = pipeline.experiment.variables
-    names = (axis.name for axis in pipeline.experiment.scene_axes)
-    scene_extent = dict(zip(names, extents, strict=True))
-    planned = [each for axis in pipeline.axes for each in _axis(axis)]
-    used = {
-        name: length for variable in variables
-        for name, length in zip(variable.inner, variable.inner_shape, strict=True)
-    }
-    planned += [
-        _coordinate(name, (name,), LABELS[name] or np.arange(used[name], dtype=np.int64), {})
-        for name in sorted(used)
-    ]
-    planned += _distance(pipeline)
-    planned += _photographs(pipeline)
-    planned += [
-        _coordinate(name, (), value, attributes)
-        for name, (value, attributes) in fixed_values(pipeline).items() if name not in VARIABLES
-    ]
-    planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
-    planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
-               for each in planned]
-    lengths = tuple(len(axis) for axis in pipeline.experiment.scene_axes)
-    planned.append(
-        PlannedArray(files.RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
-    )
+    axes = pipeline.experiment.scene_axes
+    scene_extent = dict(zip((axis.name for axis in axes), extents, strict=True))
+    planned = []
+    for name, dimensions, values, attributes in _coordinates(pipeline):
+        array = np.asarray(values)
+        if array.dtype.kind in "TU":
+            array = array.astype(object)
+        planned.append(PlannedArray(
+            name, array.shape, tuple(min(length, COORDINATE_CHUNK) for length in array.shape),
+            "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
+            with_description(name, attributes), array, coordinate=dimensions != (name,),
+        ))
+    for variable in pipeline.experiment.variables:
+        names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
+        chunks = tuple(
+            scene_extent.get(name, length) for name, length in zip(names, shape, strict=True))
+        planned.append(PlannedArray(
+            variable.name, shape, chunks, variable.dtype, names, variable.fill,
+            with_description(variable.name, variable.attributes()),
+            coordinate=bool(variable.drawn_as),
+        ))
+    count = len(Blocks(tuple(map(len, axes)), extents))
+    planned.append(PlannedArray(files.RECEIPTS, (count,), (1,), "string", ("block",)))
     return planned
 
 
-def _variable(
-    variable: Variable, pipeline: Pipeline, scene_extent: dict[str, int]
-) -> PlannedArray:
-    names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
-    chunks = tuple(
-        scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
-    )
-    return PlannedArray(
-        variable.name, shape, chunks, variable.dtype, names, variable.fill, variable.attributes(),
-        coordinate=bool(variable.drawn_as),
-    )
+def _coordinates(
+    pipeline: Pipeline,
+) -> Iterator[tuple[str, tuple[str, ...], Any, Mapping[str, Any]]]:
+    """Yield name, dimensions, values and attributes of each coordinate that nothing is drawn for.
+
+    Values are numbers, truth values or texts.
+    """
+    for axis in pipeline.axes:
+        together = [Axis(each.name, {each.name: axis.columns[each.name]}, (each,))
+                    for each in axis.parameters if axis.zipped]
+        for each in (axis, *together):
+            yield each.name, (axis.name,), each.coordinates(), {
+                "long_name": each.meaning,
+                **({"zip": " ".join(each.columns)} if each.zipped else {}),
+                **({"units": each.unit} if each.unit else {}),
+            }
+    inner = {
+        name: length for variable in pipeline.experiment.variables
+        for name, length in zip(variable.inner, variable.inner_shape, strict=True)
+    }
+    for name in sorted(inner):
+        yield name, (name,), LABELS[name] or np.arange(inner[name], dtype=np.int64), {}
+    if any(side is not None for side in pipeline.values_of("side_px")[:1]):
+        # It follows from the side: each axis' values along a dimension of their own.
+        wanted = {*DISTANCE_PARAMETERS}
+        axes = [axis for axis in pipeline.experiment.scene_axes if axis.columns.keys() & wanted]
+        values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
+        for axis, index in zip(axes, np.ix_(*(range(len(axis)) for axis in axes)), strict=True):
+            for name in axis.columns.keys() & wanted:
+                values[name] = np.array(axis.columns[name], dtype=np.float64)[index]
+        distance = np.asarray(distance_of_side(values), dtype=np.float64)
+        yield "distance_m", tuple(axis.name for axis in axes), np.broadcast_to(
+            distance, [len(axis) for axis in axes]), {
+            "long_name": "depth of the marker's centre along the optical axis", "units": "m"}
+    yield from _photographs(pipeline)
+    for name, (value, attributes) in fixed_values(pipeline).items():
+        if name not in VARIABLES:
+            yield name, (), value, attributes
 
 
-def _coordinate(
-    path: str, dimensions: tuple[str, ...], values: Any, attributes: Mapping[str, Any]
-) -> PlannedArray:
-    """Return a coordinate of numbers, truth values or texts along dimensions."""
-    array = np.asarray(values)
-    if array.dtype.kind in "TU":
-        array = array.astype(object)
-    return PlannedArray(
-        path, array.shape, tuple(min(length, COORDINATE_CHUNK) for length in array.shape),
-        "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
-        dict(attributes), array, coordinate=dimensions != (path,),
-    )
-
-
-def _axis(axis: Axis) -> list[PlannedArray]:
-    """Return the coordinates of a dimension, and of the parameters that go together there."""
-    together = [Axis(each.name, {each.name: axis.columns[each.name]}, (each,))
-                for each in axis.parameters if axis.zipped]
-    return [
-        _coordinate(each.name, (axis.name,), each.coordinates(), {
-            "long_name": each.meaning,
-            **({"zip": " ".join(each.columns)} if each.zipped else {}),
-            **({"units": each.unit} if each.unit else {}),
-        })
-        for each in (axis, *together)
-    ]
-
-
-def _distance(pipeline: Pipeline) -> list[PlannedArray]:
-    """Return ``distance_m`` as a coordinate if it follows from ``side_px``."""
-    sides = pipeline.values_of("side_px")
-    if not sides or sides[0] is None:
-        return []
-    axes = [axis for axis in pipeline.experiment.scene_axes
-            if axis.columns.keys() & set(DISTANCE_PARAMETERS)]
-    values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
-    # Each axis' values along a dimension of their own.
-    for axis, index in zip(axes, np.ix_(*(range(len(axis)) for axis in axes)), strict=True):
-        for name in axis.columns.keys() & set(DISTANCE_PARAMETERS):
-            values[name] = np.array(axis.columns[name], dtype=np.float64)[index]
-    distance = np.broadcast_to(
-        np.asarray(distance_of_side(values), dtype=np.float64), [len(axis) for axis in axes])
-    return [_coordinate(
-        "distance_m", tuple(axis.name for axis in axes), distance,
-        {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
-    )]
-
-
-def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
-    """Return names and digests of photographs as coordinates along their numbers."""
+def _photographs(
+    pipeline: Pipeline,
+) -> Iterator[tuple[str, tuple[str, ...], Any, Mapping[str, Any]]]:
+    """Yield names and digests of photographs, coordinates along their numbers."""
     trials = pipeline.axis(TRIAL)
     if PHOTOGRAPHS not in pipeline.given or trials is None:
-        return []
+        return
     # Photographs of a record are in the order of their names.
-    files = sorted(
+    taken = sorted(
         (name, digest) for name, digest in pipeline.files.items()
         if name.lower().endswith(IMAGE_SUFFIXES)
     )
     if pipeline.is_simulated:  # two cameras' photographs have the same names
-        files = files[: len({name.rpartition("/")[2] for name, _ in files})]
-        files *= -(-len(trials) // max(len(files), 1))
-    if len(files) < len(trials):
-        return []
-    names, digests = zip(*files[: len(trials)], strict=True)
-    return [
-        _coordinate("photograph", (TRIAL,), [name.rpartition("/")[2] for name in names],
-                    {"long_name": "file of the photograph"}),
-        _coordinate("sha256", (TRIAL,), digests,
-                    {"long_name": "SHA-256 of the photograph's file"}),
-    ]
+        taken = taken[: len({name.rpartition("/")[2] for name, _ in taken})]
+        taken *= -(-len(trials) // max(len(taken), 1))
+    if len(taken) >= len(trials):
+        names, digests = zip(*taken[: len(trials)], strict=True)
+        yield ("photograph", (TRIAL,), [name.rpartition("/")[2] for name in names],
+               {"long_name": "file of the photograph"})
+        yield "sha256", (TRIAL,), digests, {"long_name": "SHA-256 of the photograph's file"}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -363,8 +336,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         "finished": False,
         "files": checksums(contents),
     }
-    root = _sealed(_group_document(root_attributes(pipeline, planned, metadata)))
-    contents["zarr.json"] = files.encoded(root)
+    contents["zarr.json"] = files.encoded(root_document(pipeline, planned, metadata))
     remote = locations.is_remote(url)
     with locations.translate_errors(url, "written"):
         path = Path(url).resolve()  # a link may lead there
@@ -388,7 +360,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             raise
         if remote:  # the URL points to it once it is complete
             files.write_document(locations.storage_at(url, read_only=False), "zarr.json",
-                                 _group_document({locations.POINTER: run_id}))
+                                 GROUP | {"attributes": {locations.POINTER: run_id}})
     return open_store(url, "r+")
 
 
@@ -411,10 +383,20 @@ def _beside(path: Path, ending: str) -> Path:
 CHECKSUM, SEAL = "checksum", "seal"
 
 
-def root_attributes(
-    pipeline: Pipeline, planned: Iterable[PlannedArray], metadata: Mapping[str, Any]
+#: The document of a group, without its attributes.
+GROUP = {"zarr_format": 3, "node_type": "group"}
+
+
+def root_document(
+    pipeline: Pipeline, planned: Iterable[PlannedArray], metadata: Mapping[str, Any],
+    members: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the attributes of a store's root: texts and numbers, which netCDF can hold."""
+    """Return the document of a store's root, sealed.
+
+    Its attributes are texts and numbers, which netCDF can hold. ``members``: documents of arrays
+    and groups by path, of which a finished store's root has a copy. That is not part of the Zarr 3
+    specification; xarray reads it, and warns if it is missing.
+    """
     coordinates = [array.path for array in planned if array.coordinate]
     surprising = [*pipeline.facts.camera_notes]
     attributes = {
@@ -425,15 +407,14 @@ def root_attributes(
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": json.dumps(metadata),
     }
-    return {**attributes, CHECKSUM: _checksum(attributes)}
+    attributes[CHECKSUM] = _checksum(attributes)
+    return _sealed(GROUP | {"attributes": attributes} | ({} if members is None else {
+        "consolidated_metadata": {
+            "kind": "inline", "must_understand": False, "metadata": members}}))
 
 
 def _checksum(attributes: Mapping[str, Any]) -> str:
     return f"{crc32(attributes['pipeline'].encode() + attributes['sweep'].encode()):08x}"
-
-
-def _group_document(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 
 def _sealed(root: Mapping[str, Any]) -> dict[str, Any]:
@@ -522,18 +503,19 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
                 store.storage, chunks=None if small else _together(store), consolidated=False,
                 zarr_format=3)
             dataset = dataset.load() if small else dataset
-            # Short, and asked for one by one.
-            together = [
-                name for axis in store.pipeline.axes if axis.zipped for name in axis.columns]
-            dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})
-        # Much of xarray and pandas does not support NumPy's strings of variable length.
-        texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
-                 for name, value in dataset.coords.items() if value.dtype.kind == "T"}
+        # Columns of an axis are short and asked for one by one; much of xarray and pandas does not
+        # support NumPy's strings of variable length.
+        columns = {name for axis in store.pipeline.axes if axis.zipped for name in axis.columns}
+        loaded = {
+            name: (value.dims, value.to_numpy().astype(object) if value.dtype.kind == "T"
+                   else value.to_numpy(), value.attrs)
+            for name, value in dataset.coords.items() if value.dtype.kind == "T" or name in columns
+        }
     except (*UNREADABLE, RuntimeError) as error:
         reason = locations.reason_of(error)
         raise StoreError(
             f"{store.url}: damaged ({reason}); `sweep verify --repair` repairs it") from None
-    dataset = dataset.assign_coords(texts)
+    dataset = dataset.assign_coords(loaded)
     if not finished:
         dataset = _only_committed(store, dataset, done)
     ordered = [
@@ -629,25 +611,19 @@ def write_groups(
 def write_root(
     store: RunStore, metadata: Mapping[str, Any], pipeline: Pipeline | None = None
 ) -> None:
-    """Write the root's document, with a copy of the others' metadata if the store is finished.
-
-    Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and warns if it
-    is missing.
-    """
+    """Write the root's document, with a copy of the others' if the store is finished."""
+    members = None
+    if metadata["finished"]:
+        keys = [key for key in metadata["files"] if key.endswith("/zarr.json")]
+        members = {
+            key.removesuffix("/zarr.json"): json.loads(content)
+            for key, content in zip(keys, files.read_files(store.storage, keys), strict=True)
+            if content
+        }
     pipeline = pipeline or store.pipeline
     planned = planned_arrays(pipeline, store.blocks.extents)
-    root: Mapping[str, Any] = _group_document(root_attributes(pipeline, planned, metadata))
-    if metadata["finished"]:
-        memory = MemoryStore()
-        keys = [key for key in metadata["files"] if key.endswith("zarr.json")]
-        documents = zip(keys, files.read_files(store.storage, keys), strict=True)
-        files.write_files(memory, {key: content for key, content in documents if content}
-                          | {"zarr.json": files.encoded(root)})
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-            zarr.consolidate_metadata(memory, zarr_format=3)
-        root = files.read_json(memory, "zarr.json") or root
-    files.write_document(store.storage, "zarr.json", _sealed(root))
+    files.write_document(
+        store.storage, "zarr.json", root_document(pipeline, planned, metadata, members))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -6,12 +6,10 @@ import contextlib
 import json
 import os
 import re
-import sys
 import tempfile
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
 from urllib.parse import unquote, urlsplit
 
 import zarr
@@ -82,13 +80,8 @@ def checked_url(url: str) -> str:
     """
     scheme, colon, _ = url.lower().partition(":")
     problem = ""
-    if sys.flags.optimize:
-        problem = ("Zarr cannot read groups where Python leaves out assertions; unset "
-                   "PYTHONOPTIMIZE, and run Python without -O")
-    elif not url.strip():
+    if not url.strip():
         problem = "expected the path or URL of a store"
-    elif "\0" in url:
-        problem = "a path cannot hold a null character; choose another one"
     elif colon and scheme in ("file", "local"):
         problem = f"a store on this machine is named by its path: {unquote(urlsplit(url).path)}"
     elif colon and scheme == "memory":
@@ -122,8 +115,6 @@ def storage_at(url: str, *, read_only: bool) -> Store:
         return FsspecStore.from_url(
             url, storage_options={"use_listings_cache": False}, read_only=read_only
         )
-    except ImportError as error:
-        raise StoreError(f"{url}: {error}") from None
     except Exception as error:
         # Each protocol's library raises its own: of github:// a TypeError without a repository.
         raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
@@ -131,19 +122,17 @@ def storage_at(url: str, *, read_only: bool) -> Store:
 
 def remote_run_id(url: str) -> str | None:
     """Return the id of the run that a remote store's URL points to; None if there is no store."""
-    with translate_errors(url, "reached"):
-        try:
-            content = read_files(storage_at(url, read_only=True), ["zarr.json"])[0]
-        except (TypeError, ValueError, AttributeError, NotImplementedError) as error:
-            raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
+    storage = storage_at(url, read_only=True)
+    try:
+        content = read_files(storage, ["zarr.json"])[0]
+    except Exception as error:
+        raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
     if content is None:
         return None
-    try:
+    with contextlib.suppress(ValueError, KeyError, TypeError):
         run_id = json.loads(content)["attributes"][POINTER]
         if re.fullmatch("[0-9a-f]{32}", run_id):
             return str(run_id)
-    except (ValueError, KeyError, TypeError):
-        pass
     raise StoreError(not_a_store(url))
 
 
@@ -187,7 +176,13 @@ def open_storage(url: str, mode: str = "r") -> Store:
     with translate_errors(url, "read"):
         if not Path(url).is_dir():
             raise StoreError(not_a_store(url))
-        return storage_at(url, read_only=True) if mode == "r" else _HeldStore(_HeldFolder(url))
+        if mode == "r":
+            return storage_at(url, read_only=True)
+        # The folder is held open as long as the storage lives.
+        descriptor = os.open(url, os.O_RDONLY | os.O_DIRECTORY)
+        storage = LocalStore(f"/proc/self/fd/{descriptor}")
+        weakref.finalize(storage, os.close, descriptor)
+        return storage
 
 
 def _similar(url: str) -> str:
@@ -199,26 +194,6 @@ def _similar(url: str) -> str:
         if similar := nearest_file(url) or nearest_file(Path("runs") / Path(url).name):
             return similar
     return "; create one with `sweep run`"
-
-
-class _HeldFolder:
-    """A folder that is held open as long as this object lives."""
-
-    def __init__(self, path: str) -> None:
-        self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        weakref.finalize(self, os.close, self.descriptor)
-
-
-class _HeldStore(LocalStore):
-    """A local storage that holds its folder."""
-
-    def __init__(self, folder: _HeldFolder, *, read_only: bool = False) -> None:
-        super().__init__(f"/proc/self/fd/{folder.descriptor}", read_only=read_only)
-        self._folder = folder
-
-    def with_read_only(self, read_only: bool = False) -> Self:
-        """Return the same folder's storage, to be read only."""
-        return type(self)(self._folder, read_only=read_only)
 
 
 def enclosing_store(path: Path) -> Path | None:

@@ -30,6 +30,7 @@ def builds() -> dict[str, str]:
     import numpy as np  # noqa: PLC0415
 
     config: dict[str, Any] = {**np.show_config(mode="dicts")}
+    # Paths are other ones for each Python that NumPy was built for.
     for dependency in config["Build Dependencies"].values():
         for path in ("include directory", "lib directory", "pc file directory"):
             dependency.pop(path, None)

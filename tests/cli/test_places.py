@@ -4,17 +4,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from unittest import mock
 
 import pytest
 
 from support.reports import command
 from sweep import cli
-from sweep.errors import MachineFaultError, StoreError
+from sweep.errors import MachineFaultError
 from sweep.execution.block_task import compute_block
 from sweep.experiment.grid import Block
-from sweep.store.locations import check_writable
 
 PIPELINE = """
 [pose]
@@ -145,9 +143,3 @@ def test_characters_that_a_terminal_lacks_are_printed_as_escapes(tmp_path):
     assert done.returncode == 0
     assert done.stdout.endswith("\\u2013 \\xe9\n")
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_without_assertions_no_store_is_touched(monkeypatch, tmp_path):
-    monkeypatch.setattr("sweep.store.locations.sys.flags", SimpleNamespace(optimize=1))
-    with pytest.raises(StoreError, match="unset PYTHONOPTIMIZE"):
-        check_writable(str(tmp_path / "x.zarr"))

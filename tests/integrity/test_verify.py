@@ -253,7 +253,7 @@ def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
     name, store = "rotation_error_rad", open_store(str(copied))
     edit_values(copied, name, lambda values: 1.01 * values)
     for number in range(6):  # the receipts tell of it
-        changed = checksum_of((copied / store.chunks.key(name, number)).read_bytes())
+        changed = checksum_of((copied / store.chunk_key(name, number)).read_bytes())
         edit_receipt(copied, number, lambda told, to=changed: told["checksums"].update({name: to}))
     assert verify(str(copied), 0).damage == []
     with calls_here(), raising([FAILED], tmp_path / "notes.jsonl"):

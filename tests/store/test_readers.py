@@ -139,7 +139,7 @@ def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
     store = open_store(str(copied), "r+")
     assert missing_chunks(store, range(4)) == {}
     # Receipts that were copied after chunks: one chunk was not there, and one was being written.
-    lost = {1: store.chunks.key("nees", 1), 3: store.chunks.key("true_rvec", 3)}
+    lost = {1: store.chunk_key("nees", 1), 3: store.chunk_key("true_rvec", 3)}
     (copied / lost[1]).unlink()
     (copied / lost[3]).write_bytes(b"")
     assert missing_chunks(store, committed(store)) == lost

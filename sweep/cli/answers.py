@@ -68,7 +68,7 @@ def report(
         Also write the error models as JSON, as `sweep error-model` does.
     """
     quiet_matplotlib()
-    if SESSION.form == "json" and library.output_file.is_standard_stream(Path(output or "")):
+    if SESSION.form == "json" and library.output_file.standard_stream(Path(output or "")):
         raise ArgumentError("json", "", "and the report both go to standard output; choose -o FILE")
     return sweep.write_report(
         store, output, require=requirements, per=per, form=form, figures=figures,

@@ -20,9 +20,20 @@ from sweep.errors import ArgumentError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, quoted
-from sweep.report import table as tables
 from sweep.report.figure import Figure
-from sweep.report.table import UNDECIDED, Column, Findings, Table, coordinate, interval_text, number
+from sweep.report.table import (
+    UNDECIDED,
+    Column,
+    Findings,
+    Table,
+    Value,
+    axis_label,
+    coordinate,
+    coordinates,
+    interval_text,
+    number,
+    table_of,
+)
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.typing import Masks
 
@@ -35,6 +46,10 @@ WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "
          Decision.not_applicable: "nothing to judge"}
 
 UNITS = {"": "", "1": "", "percent": " %", "degree": "\u00b0"}
+
+#: Decision -> exit status of a command.
+STATUS = {Decision.met: 0, Decision.not_met: 1, Decision.undecided: UNDECIDED,
+          Decision.not_applicable: UNDECIDED}
 
 #: Conditions that JSON lists.
 MAX_ROWS = 500
@@ -99,9 +114,8 @@ def require(
     found = [] if table is None else judged.verdicts(table)
     worse = [] if against is None else regressions(
         selected_store(against, at)[0], results, [each.variable for each in required], axes)
-    decision = judged.combined(found) if found else Decision.met
-    if any(each.worse for each in worse):
-        decision = Decision.not_met
+    decision = Decision.not_met if any(each.worse for each in worse) else (
+        judged.combined(found) if found else Decision.met)
     named = {*axes, DRAWS, *configuration_axes(results)}
     pooled = [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
     parts: list[Table | str] = [decision_table(found), Table.of(
@@ -118,13 +132,11 @@ def require(
         parts.append(f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions")
     return Findings(
         parts, {
-            "decision": decision, "per": axes, "pooled": pooled,
+            "decision": decision, "per": axes, "pooled": pooled, "against": worse,
             "requirements": [
                 {**dataclasses.asdict(each), "failing": [] if table is None else
-                 conditions_of(each, table)[:MAX_ROWS]} for each in found],
-            "against": worse},
-        table, {Decision.met: 0, Decision.not_met: 1}.get(decision, UNDECIDED),
-        (more_draws(found, results, os.fspath(store)), ""))
+                 conditions_of(each, table)[:MAX_ROWS]} for each in found]},
+        table, STATUS[decision], (more_draws(found, results, os.fspath(store)), ""))
 
 
 def selected_store(
@@ -150,18 +162,13 @@ def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.D
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
                                 f"there are {', '.join(axes)}")
         values = axis.columns[name]
-        kept[axis.name] = [k for k in kept.get(axis.name, range(len(axis)))
-                           if _is_same(values[k], value)]
+        kept[axis.name] = [
+            k for k in kept.get(axis.name, range(len(axis))) if values[k] == value or (
+                isinstance(values[k], float) and math.isclose(values[k], value, rel_tol=1e-9))]
         if not kept[axis.name]:
             shown = ", ".join(map(label, values[:20]))
             raise ArgumentError("at", f"{name}={label(value)}", f"no such value; there are {shown}")
     return results.isel(kept)
-
-
-def _is_same(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, numbers but for rounding."""
-    numbers = isinstance(one, int | float) and isinstance(other, int | float)
-    return math.isclose(one, other, rel_tol=1e-9) if numbers else bool(one == other)
 
 
 def conditions_of(
@@ -246,29 +253,30 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
 
 def headline(choice: Choice) -> str:
     """Return the decision on a choice in a line: the choice, or what comes nearest to one."""
-    rule = choice.rule
-    if choice.best is not None:
-        best = choice.answers[choice.best]
-        name = described(_chosen(choice, best, best.value))
+    rule, best = choice.rule, choice.best
+    if best is not None:
+        name = described(_chosen(choice, choice.answers[best]))
         if not choice.is_undecided:
             wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
             return f"{name} is the {wish} choice"
         bound = f"{'at least' if rule.largest else 'at most'} " if rule.along else ""
         return f"not decided: {bound}{name}; a better choice may meet everything, too"
-    within = "" if choice.budget_ms is None else f" within {choice.budget_ms:g} ms a frame"
     line = ("not decided: no choice is known to meet" if choice.is_undecided else
-            "no choice meets") + f" everything{within}"
+            "no choice meets") + " everything"
+    if choice.budget_ms is not None:
+        line += f" within {choice.budget_ms:g} ms a frame"
     near = [(answer.nearest, answer) for answer in choice.answers if answer.nearest is not None]
     if not near or any(answer.met for answer in choice.answers):
         return line
     one, answer = min(near, key=lambda each: each[0].excess)
-    nearest_one = described(_chosen(choice, answer, one.value))
-    return f"{line}; nearest is {nearest_one}: {reason(one.cause)}"
+    chosen = _chosen(choice, dataclasses.replace(answer, value=one.value))
+    return f"{line}; nearest is {described(chosen)}: {reason(one.cause)}"
 
 
-def _chosen(choice: Choice, answer: Answer, value: float | None) -> dict[str, Any]:
-    """Return the values by axis of an alternative at a value of the axis that is searched."""
-    return ({} if value is None else {choice.rule.along: value}) | dict(answer.alternative)
+def _chosen(choice: Choice, answer: Answer) -> dict[str, Any]:
+    """Return the values by axis of an alternative, the axis that is searched first."""
+    searched = {} if answer.value is None else {choice.rule.along: answer.value}
+    return searched | dict(answer.alternative)
 
 
 def reason(cause: Cause | None) -> str:
@@ -294,7 +302,7 @@ def alternatives(choice: Choice) -> Table:
             *map(str, answer.alternative.values()),
             *(["none" if each is None else coordinate(each) for each in (answer.value, answer.next)]
               if along else [answer.met]),
-            cost and tables.Value(cost.ms, cost.low, cost.high), within,
+            cost and Value(cost.ms, cost.low, cost.high), within,
             None if cost is None else k in choice.front,
             reason(answer.next_cause), ", ".join(map(coordinate, answer.passing))])
     return Table.of(
@@ -314,7 +322,7 @@ def choice_findings(choice: Choice) -> Findings:
         [alternatives(choice),
          (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the hardest "
           f"one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")],
-        as_json(choice), None, {Decision.met: 0, Decision.undecided: 3}.get(choice.decision, 1),
+        as_json(choice), None, STATUS[choice.decision],
         (f"sweep report {quoted(choice.store)}", ""))
 
 
@@ -329,7 +337,7 @@ def as_json(choice: Choice) -> dict[str, Any]:
          "on_front": k in choice.front, "within_budget": choice.within_budget(k)}
         for k, (answer, cost) in enumerate(zip(choice.answers, choice.costs, strict=True))]
     best = None if choice.best is None else choice.answers[choice.best]
-    known = None if best is None else _chosen(choice, best, best.value)
+    known = None if best is None else _chosen(choice, best)
     return {
         "answer": known if choice.decision is Decision.met else None, "known": known,
         "decision": choice.decision, "sentences": [headline(choice)],
@@ -370,9 +378,8 @@ def limit_table(limits: xr.Dataset) -> Table:
 
 def dimensions(limits: xr.Dataset) -> list[str]:
     """Return the dimensions of the limits: conditions, then configurations."""
-    configurations = limits.attrs["configuration_dims"]
-    return [*(name for name in limits["value"].dims if name not in configurations),
-            *configurations]
+    settings = limits.attrs["configuration_dims"]
+    return [*(name for name in limits["value"].dims if name not in settings), *settings]
 
 
 def limit_text(one: xr.Dataset) -> str:
@@ -380,18 +387,16 @@ def limit_text(one: xr.Dataset) -> str:
 
     An undecided limit is called so, whatever the estimates are.
     """
-    reach, start, value = Reach(int(one["reach"])), float(one["start"]), float(one["value"])
-    if reach is Reach.not_run:
-        return "nothing to judge"
-    text = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
-    if reach is Reach.always:
-        text = f"at all values, {text}"
-    elif reach is Reach.never:
-        text = "at no value"
-    elif reach is Reach.within:
-        low, high = sorted((start, value))
-        text = f"{_place(one, low, unit=False)} to {_place(one, high)}"
-    return text if are_decided(one) else f"not decided: {text}"
+    start, value = float(one["start"]), float(one["value"])
+    end = f"{'up to' if one.attrs['harder'] == 'upwards' else 'down to'} {_place(one, value)}"
+    low, high = sorted((start, value))
+    text = {
+        Reach.not_run: "nothing to judge", Reach.never: "at no value",
+        Reach.always: f"at all values, {end}",
+        Reach.within: f"{_place(one, low, unit=False)} to {_place(one, high)}",
+    }.get(Reach(int(one["reach"])), end)
+    judged_here = one["reach"] != Reach.not_run
+    return f"not decided: {text}" if judged_here and not are_decided(one) else text
 
 
 def met_to(limits: xr.Dataset) -> xr.DataArray:
@@ -415,7 +420,7 @@ def _place(one: xr.Dataset, value: float, *, unit: bool = True) -> str:
     """Return a value of the axis with its unit."""
     axis = one[one.attrs["along"]]
     values: list[float] = axis.values.astype(float).tolist()
-    texts = dict(zip(values, tables.coordinates(values), strict=True))
+    texts = dict(zip(values, coordinates(values), strict=True))
     units = str(axis.attrs.get("units", ""))
     return texts.get(value, coordinate(value)) + (UNITS.get(units, f" {units}") if unit else "")
 
@@ -474,18 +479,15 @@ def limit_figure(limits: xr.Dataset) -> Figure:
 
     They are drawn against the first axis of conditions that has numbers.
     """
-    along, dims = str(limits.attrs["along"]), dimensions(limits)
-    varying = [name for name in dims if limits.sizes[name] > 1]
-    limits = limits.isel({name: 0 for name in dims if name not in varying})
-    axis = next((name for name in varying if limits[name].dtype.kind in "fiu"), None)
-    ordered = [*(name for name in varying if name != axis), *([axis] if axis else [])]
+    along, names = str(limits.attrs["along"]), dimensions(limits)
+    dims = sorted((name for name in names if limits.sizes[name] > 1),
+                  key=lambda name: limits[name].dtype.kind in "fiu")
+    limits = limits.isel({name: 0 for name in names if name not in dims})
     # At no value there is no limit, and no interval is drawn.
-    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never)
-    drawn = drawn.rename({"low": "value_low", "high": "value_high"}).assign_coords(limits.coords)
-    column = Column(f"limit of {tables.axis_label(limits, along)}", "value")
+    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never).drop_vars(along)
+    drawn = drawn.rename({"low": "value_low", "high": "value_high"})
+    column = Column(f"limit of {axis_label(limits, along)}", "value")
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
-    return Figure(
-        "limit", title, "",
-        tables.table_of(drawn.drop_vars(along), title, ordered, [column], limits),
-        [column], tables.axis_label(limits, axis) if axis else "",
-        tables.axis_label(limits, ordered[-2]) if axis and len(ordered) > 1 else "")
+    *others, x = [axis_label(limits, name) for name in dims] or [""]
+    return Figure("limit", title, "", table_of(drawn, title, dims, [column], limits), [column], x,
+                  others[-1] if others else "")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -14,17 +13,14 @@ from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Reached
 from sweep.analysis.summaries import ERROR_HEADINGS
-from sweep.experiment.experiment import used_settings
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.report import report_data
 from sweep.report.comparison import trade_lines
 from sweep.report.cost_tables import trade_figure
-from sweep.report.figure import MAX_LINES, Figure, caption_of, sentences
+from sweep.report.figure import MAX_DOTS, MAX_LINES, Figure, caption_of, sentences
 from sweep.report.report_data import AREA, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.table import Column, Table, table_of
-from sweep.tradeoff.pareto import configuration_label
 
 # --------------------------------------------------------------------------------------------------
 # Columns that several figures share.
@@ -57,42 +53,22 @@ SIGNED_COLUMNS = (SOLVED_COUNT, RANGE_BIAS, *(
                                        (("yaw", "pitch", "roll"), "deg", "deg", 1.0))
     for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))))
 
-SIGNED_CURVES = tuple(
-    column for column in SIGNED_COLUMNS
-    if column.level == 0 and not column.heading.startswith(("pitch", "roll")))
-BOUND_CURVES = tuple(
-    Column(f"{quantity} RMSE over the bound", f"{quantity}_over_bound", level=1.0)
+EFFICIENCIES = tuple(
+    Column(f"{quantity} efficiency", f"{quantity}_efficiency", level=1.0)
     for quantity in ("rotation", "range"))
-
-#: Groups of a numeric axis.
-MAX_BINS = 40
 
 #: Angles that are lines of one configuration, and panels of several.
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
 
 
 # --------------------------------------------------------------------------------------------------
-# Tables and figures of an analysis by configuration and groups of poses.
-
-
-def configuration_table(
-    data: ReportData, summary: xr.Dataset, dims: Iterable[str], caption: str,
-    columns: Sequence[Column], counted: str = "looked_for",
-) -> Table:
-    """Return the table of an analysis (configuration, *dims), with 95 % intervals."""
-    dims = list(dims)
-    if summary.sizes[CONFIGURATION] > 1 or not dims:
-        dims = [CONFIGURATION, *dims]
-    else:
-        summary = summary.isel({CONFIGURATION: 0})
-    return table_of(summary, f"{caption}, with 95 % intervals", dims, columns, data.results,
-                    counted=counted)
+# A figure, or a table alone, of an analysis by configuration and groups of poses.
 
 
 def figure(
     data: ReportData, summary: xr.Dataset, groups: Groups, name: str, title: str, text: str,
-    caption: str, columns: Sequence[Column], curves: Sequence[Column], *,
-    counted: str = "looked_for", by: str = "", covers: Sequence[str] = (),
+    columns: Sequence[Column], curves: Sequence[Column], *, by: str = "",
+    covers: Sequence[str] = (),
 ) -> Figure:
     """Return a figure of `grouped`, the last of whose groups are along x.
 
@@ -108,8 +84,21 @@ def figure(
             if dims and count > MAX_LINES else "",
             report_data.notes_of(data, groups),
             data.pooled(*dims, *report_data.configurations(data).axes)),
-        configuration_table(data, summary, dims, caption, columns, counted), curves,
+        configuration_table(data, summary, dims, title, columns), curves,
         data.label(dims[-1]) if dims else "", by, covers=covers)
+
+
+def configuration_table(
+    data: ReportData, summary: xr.Dataset, dims: Sequence[str], caption: str,
+    columns: Sequence[Column], counted: str = "looked_for",
+) -> Table:
+    """Return the table of an analysis (configuration, *dims), with 95 % intervals."""
+    if summary.sizes[CONFIGURATION] > 1 or not dims:
+        dims = [CONFIGURATION, *dims]
+    else:
+        summary = summary.isel({CONFIGURATION: 0})
+    return table_of(summary, f"{caption}, with 95 % intervals", dims, columns, data.results,
+                    counted=counted)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -124,7 +113,7 @@ def _along(data: ReportData, name: str) -> Figure:
     axis = data.pipeline.axis(name)
     meaning = axis.meaning if axis is not None else (
         "in the image" if name == AREA else data.pipeline.parameters[name].meaning)
-    groups = data.along(name, MAX_BINS)
+    groups = data.along(name)
     if data.angle_axis and name == data.size:
         several = data.setting_axes or data.pipeline.experiment.target_axes
         most = MAX_ANGLE_PANELS if several else MAX_ANGLES
@@ -133,30 +122,7 @@ def _along(data: ReportData, name: str) -> Figure:
         data, grouped(data, analysis.error_statistics, groups), groups, f"by-{name}",
         f"Rates and errors by {data.words(name)}",
         caption_of("along", target=data.pipeline.target_word, axis=name, meaning=meaning),
-        f"Errors by {data.words(name)}", (*RATES, *ERRORS),
-        [DETECTED, *ERROR_CURVES, FLIPS, RANGE_BIAS], covers=tuple(groups))
-
-
-def signed_error_statistics(
-    results: xr.Dataset, per: Sequence[str], bins: Bins
-) -> xr.Dataset:
-    """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
-    return analysis.error_statistics(results, per, bins, SIGNED_GROUPS)
-
-
-def _bias(data: ReportData) -> Figure | None:
-    """Return the figure of bias along sizes, other numbers, or angles."""
-    along = report_data.course_of(data)[0]
-    if along in (None, data.angle_axis):
-        along = data.size or data.angle_axis
-    if along is None:
-        return None
-    groups = data.along(along, MAX_BINS)
-    return figure(
-        data, grouped(data, signed_error_statistics, groups), groups, "bias",
-        f"Bias by {data.words(along)}",
-        caption_of("bias", target=data.pipeline.target_word), "Bias and standard deviation",
-        SIGNED_COLUMNS, SIGNED_CURVES, counted="solved")
+        (*RATES, *ERRORS), [DETECTED, *ERROR_CURVES, FLIPS, RANGE_BIAS], covers=tuple(groups))
 
 
 #: From this many values on, an axis of numbers has a figure along it beside its configurations.
@@ -174,9 +140,8 @@ def _configurations(data: ReportData) -> Figure | None:
     return figure(
         data, known.summary, {}, "configurations",
         f"Configurations compared: {', '.join(known.axes)}",
-        caption_of("configurations"), "Configurations", (LOOKED_FOR, *ERRORS),
-        (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS),
-        covers=covers)
+        caption_of("configurations"), (LOOKED_FOR, *ERRORS),
+        (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS), covers=covers)
 
 
 def _trade(data: ReportData) -> Figure | None:
@@ -186,14 +151,11 @@ def _trade(data: ReportData) -> Figure | None:
     return trade_figure(data.trade, lines=trade_lines(data, data.trade, budget))
 
 
-MAX_BARS = 24
-
-
 def _outcomes(data: ReportData) -> Figure:
     names = [name for name in (data.size_axis, *data.scene_axes, data.size)
              if name is not None and name != IDS
              and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
-    groups = data.along(names[0], MAX_BARS) if names else {}
+    groups = data.along(names[0]) if names else {}
     summary = grouped(data, analysis.failure_composition, groups)
     counts = summary["count"].sum(
         [name for name in summary["count"].dims if name != "outcome"]).to_series()
@@ -207,84 +169,31 @@ def _outcomes(data: ReportData) -> Figure:
         data, happened.assign(looked_for=total),
         {"outcome": None, **groups}, "failures", "Outcomes of the poses",
         caption_of("outcomes", by=data.words(names[0]) if names else "", left_out=left_out),
-        "Outcomes", (LOOKED_FOR, share), [share], by="outcome")
+        (LOOKED_FOR, share), [share], by="outcome")
 
 
-# The place in the frame.
-
-ACROSS, DOWN = "frame_u_percent", "frame_v_percent"
-#: Parts of the frame along each of the two, in percent of its sides.
-PARTS = {DOWN: 4, ACROSS: 8}
-
-
-def _frame(data: ReportData) -> Figure | None:
-    """Return the figure of the detection rate over the frame of a single camera without a lens."""
-    pipeline, fixed = data.pipeline, data.pipeline.fixed
-    moved = any(pipeline.axis_of(name) or name in pipeline.distributions
-                for name in ("bearing_x_deg", "bearing_y_deg"))
-    if not moved or fixed.get("distortion") or any(name not in fixed for name in VIEW_PARAMETERS):
-        return None
-    fx, fy, cx, cy = map(float, intrinsics(*(fixed[name] for name in VIEW_PARAMETERS)))
-    x, y, z = (data.results["true_tvec_m"].isel(xyz=k, drop=True) for k in range(3))
-    ahead = z.where(z > 0)
-    place = {ACROSS: 100 * (fx * x / ahead + cx + 0.5) / fixed["width_px"],
-             DOWN: 100 * (fy * y / ahead + cy + 0.5) / fixed["height_px"]}
-
-    def over_frame(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-        return analysis.detection_rate(results.assign(place), per, bins)
-
-    cells = {name: (*np.linspace(0, 100, count + 1)[:-1].tolist(), float(np.nextafter(100, 101)))
-             for name, count in PARTS.items()}
-    return figure(
-        data, grouped(data, over_frame, cells, (Stage.detection,)), dict.fromkeys(cells), "frame",
-        "Detection by place in the frame",
-        caption_of("frame", target=pipeline.target_word), "Detection rate by place", RATES,
-        [DETECTED], by=data.label(DOWN))
-
-
-#: Marker IDs that have a row of their own in the figure.
-WEAKEST = 24
+def marker_ranking(results: xr.Dataset, per: Sequence[str], **_: Bins) -> xr.Dataset:
+    """Return the ranking of marker IDs, which are kept apart anyway."""
+    return analysis.marker_ranking(results, [name for name in per if name != IDS])
 
 
 def _ranking(data: ReportData) -> Figure | None:
-    """Return the weakest marker IDs of the first configuration's detector."""
+    """Return the detection rates of marker IDs, the weak ones first."""
     if data.results.sizes.get(IDS, 1) < 2:
         return None
-    known = report_data.configurations(data)
-    settings = {axis.name for axis in data.pipeline.axes_of(Stage.detection)} & known.axes.keys()
-    index = {name: known.axes[name][k] for name, k in known.combinations[0].items()
-             if name in settings}
-    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
-    whose = f": {configuration_label(used_settings(data.pipeline, values))}" if index else ""
-    summary = data.once(
-        "marker_ranking", lambda: analysis.marker_ranking(data.results.isel(index)))
-    dims = [name for name in ("dictionary", IDS) if name in summary["detection_rate"].dims]
-    table = table_of(summary, "IDs by detection rate, with 95 % intervals", dims, (
-        *RATES, Column("expected, %", "expected_rate", 100), Column("p, adjusted", "p_adjusted"),
-        Column("weak", "weak")), data.results, counted="looked_for")
+    table = configuration_table(
+        data, grouped(data, marker_ranking, {IDS: None}, [Stage.detection]), [IDS],
+        "IDs by detection rate", (
+            *RATES, Column("expected, %", "expected_rate", 100),
+            Column("p, adjusted", "p_adjusted"), Column("weak", "weak")))
     rates, weak = (table.frame[name].tolist() for name in (DETECTED.heading, "weak"))
-    order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k].value))
+    order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k]))
     return Figure(
-        "ranking", f"Marker IDs, the weakest first{whose}", sentences(
-            caption_of("ranking", shown=min(WEAKEST, len(weak)), weak=sum(weak), count=len(weak)),
-            data.pooled(*dims)),
+        "ranking", "Marker IDs, the weakest first", sentences(
+            caption_of("ranking", shown=min(MAX_DOTS, len(weak)), weak=sum(weak), count=len(weak)),
+            data.pooled(IDS, *report_data.configurations(data).axes)),
         dataclasses.replace(table, frame=table.frame.iloc[order]), [DETECTED], by="weak",
-        rows=WEAKEST, covers=(IDS,))
-
-
-SIZE_COLUMNS = 12
-
-
-def error_over_bound(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-    """Return RMSE over bound, the inverse of the efficiency, with the ends of its intervals."""
-    # Computed first: of a store without errors the efficiency is 0, and the ratio infinite.
-    summary = analysis.efficiency(results, per, bins).compute()
-    with np.errstate(divide="ignore"):
-        ratios: dict[str, Any] = {
-            f"{quantity}_over_bound{end}": 1 / summary[f"{quantity}_efficiency{other}"]
-            for quantity in ("rotation", "range")
-            for end, other in (("", ""), ("_low", "_high"), ("_high", "_low"))}
-    return xr.Dataset(ratios, summary.coords)
+        covers=[IDS])
 
 
 def _bound(data: ReportData) -> Figure | None:
@@ -292,76 +201,10 @@ def _bound(data: ReportData) -> Figure | None:
             data.results["bound"].isin(present_values(BoundStatus)).any())):
         return None
     along = data.size_axis or data.angle_axis
-    groups = data.along(along, SIZE_COLUMNS) if along else {}
+    groups = data.along(along) if along else {}
     return figure(
-        data, grouped(data, error_over_bound, groups), groups, "bound",
-        "Errors relative to the accuracy bound",
-        caption_of("bound"), "RMSE over the bound", BOUND_CURVES, BOUND_CURVES)
-
-
-# Thresholds on the ambiguity: what they keep of the poses, and of the flips.
-
-#: The threshold that many programs use.
-USUAL = 0.2
-
-#: Viewing angle up to which a pose hardly differs from its mirror.
-FRONTAL_DEG = 5.0
-
-#: The most sizes, or angles, that are told apart.
-CONDITIONS = 8
-
-KEPT = (Column("poses kept, % of the solved", "kept_rate", 100),
-        Column("flips kept, % of the flips", "flips_kept_rate", 100))
-KEPT_AT_USUAL = (
-    Column("solved", "solved"), Column("flips", "flipped"),
-    Column(f"kept at {USUAL:g}, %", "kept_rate", 100),
-    Column(f"flips kept at {USUAL:g}", "kept_flipped"),
-    Column(f"right of the rejected at {USUAL:g}, %", "rejected_right_rate", 100),
-    Column("threshold found?", "choice"), Column("threshold", "chosen_threshold"),
-    Column("kept there, %", "chosen_kept_rate", 100),
-    Column("flips there, %", "chosen_flip_rate", 100),
-    Column("right poses rejected there, %", "chosen_right_rejected_rate", 100))
-
-
-def _ambiguity(data: ReportData) -> Figure | None:
-    """Return the figure if any pose has another solution, any is a flip, not all are frontal."""
-    if not all(name in data.results for name in (
-            "reprojection_error_px", "alternative_reprojection_error_px")):
-        return None
-    angles = data.results.get("viewing_angle_deg")
-    if angles is not None and not data.once(
-            "largest angle", lambda: float(angles.max())) > FRONTAL_DEG:
-        return None
-    pooled = grouped(data, analysis.ambiguity)
-    curved = np.flatnonzero((pooled["without_alternative"] < pooled["solved"]).values
-                            & (pooled["flipped"] > 0).values)
-    if not curved.size:
-        return None
-    table = pooled.isel({CONFIGURATION: curved})
-    wanted = 100 * float(pooled.attrs["flip_rate"])
-    return Figure(
-        "ambiguity", "A threshold on the ambiguity: flips and poses that it keeps", sentences(
-            caption_of("ambiguity", wanted=f"{wanted:g}"), data.pooled()),
-        dataclasses.replace(
-            table_of(table, "What thresholds on the ambiguity keep", [CONFIGURATION, "threshold"],
-                     KEPT), stub=1),  # the points of a line, not panels
-        KEPT[1:], KEPT[0].heading, CONFIGURATION)
-
-
-def threshold_tables(data: ReportData) -> list[Table]:
-    """Return the poses that the usual threshold keeps at each size, and the threshold to take."""
-    if _ambiguity(data) is None:
-        return []
-    along = data.size or data.angle_axis
-    groups = data.along(along, CONDITIONS) if along else {}
-    table = grouped(data, analysis.ambiguity, groups)
-    words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
-    choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
-    wanted = 100 * float(table.attrs["flip_rate"])
-    return [table_of(
-        table.sel(threshold=USUAL, drop=True).assign(choice=choice),
-        f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
-        [CONFIGURATION, *groups], KEPT_AT_USUAL, data.results)]
+        data, grouped(data, analysis.efficiency, groups), groups, "bound",
+        "Errors relative to the accuracy bound", caption_of("bound"), EFFICIENCIES, EFFICIENCIES)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -369,8 +212,8 @@ def threshold_tables(data: ReportData) -> list[Table]:
 
 #: Makers of figures, None for a store that a figure does not fit; add one here.
 FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
-    lambda data: None if data.size is None else _along(data, data.size), _bias, _configurations,
-    _trade, _ambiguity, _outcomes, _frame, _ranking, _bound,
+    lambda data: None if data.size is None else _along(data, data.size), _configurations, _trade,
+    _outcomes, _ranking, _bound,
 )
 
 
@@ -390,6 +233,21 @@ def figures_of(data: ReportData) -> list[Figure]:
 #: Quantity in the names of errors -> its name in words, and its unit in those names.
 QUANTITIES = {"rotation": ("rotation, deg", "deg"), "range": ("range (depth), %", "percent"),
               "position": ("position, m", "m")}
+
+#: The threshold on the ambiguity that many programs use, and what it keeps.
+USUAL = 0.2
+KEPT_AT_USUAL = (
+    Column("solved", "solved"), Column("flips", "flipped"),
+    Column(f"kept at {USUAL:g}, %", "kept_rate", 100),
+    Column(f"flips kept at {USUAL:g}", "kept_flipped"),
+    Column(f"right of the rejected at {USUAL:g}, %", "rejected_right_rate", 100),
+    Column("threshold found?", "choice"), Column("threshold", "chosen_threshold"),
+    Column("kept there, %", "chosen_kept_rate", 100),
+    Column("flips there, %", "chosen_flip_rate", 100),
+    Column("right poses rejected there, %", "chosen_right_rejected_rate", 100))
+
+#: The most sizes, or angles, that a table of thresholds tells apart.
+MAX_SIZES = 8
 
 
 def tables_of(data: ReportData, errors: xr.Dataset, name: str) -> list[Table]:
@@ -437,6 +295,35 @@ def errors_table(errors: xr.Dataset, name: str) -> Table:
     whose = f", with {name}" if name else ""
     return Table.of(f"Errors over the whole grid{whose}, with 95 % intervals",
                     ["statistic", *(words for words, _ in QUANTITIES.values())], rows)
+
+
+def signed_error_statistics(
+    results: xr.Dataset, per: Sequence[str], bins: Bins
+) -> xr.Dataset:
+    """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
+    return analysis.error_statistics(results, per, bins, SIGNED_GROUPS)
+
+
+def threshold_tables(data: ReportData) -> list[Table]:
+    """Return what thresholds on the ambiguity keep, where poses have a mirror and some are flips.
+
+    At each size: the poses that the usual threshold keeps, and the largest that is shown to keep
+    few flips.
+    """
+    if "alternative_reprojection_error_px" not in data.results:
+        return []
+    along = data.size or data.angle_axis
+    groups = data.along(along, MAX_SIZES) if along else {}
+    table = grouped(data, analysis.ambiguity, groups)
+    if not ((table["without_alternative"] < table["solved"]) & (table["flipped"] > 0)).any():
+        return []
+    words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
+    choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
+    wanted = 100 * float(table.attrs["flip_rate"])
+    return [table_of(
+        table.sel(threshold=USUAL, drop=True).assign(choice=choice),
+        f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
+        [CONFIGURATION, *groups], KEPT_AT_USUAL, data.results)]
 
 
 def precision_table(table: xr.Dataset) -> Table:

@@ -15,7 +15,7 @@ from pathlib import Path
 from sweep.errors import StoreError
 from sweep.messages import plain
 from sweep.store.files import check_folder_writable, write_whole
-from sweep.store.locations import reason_of
+from sweep.store.locations import enclosing_store, reason_of
 
 FIGURE_SUFFIXES = (".png", ".svg")
 
@@ -43,10 +43,12 @@ def check_output_file(path: Path) -> None:
     Raises
     ------
     StoreError
-        If it is a folder, or if it cannot be written.
+        If it is a folder, if it cannot be written, or if it would be inside a store.
     """
     with write_errors_explained(path):
-        target = _target(path)
+        around, target = enclosing_store(path), _target(path)
+        if around is not None:
+            raise StoreError(f"{path}: cannot be written: it is inside the store {around}")
         if target is not None:
             check_folder_writable(target.parent)
 
@@ -64,18 +66,13 @@ def write_output_file(path: Path, content: bytes) -> None:
         if target is not None:
             write_whole(target, content)
             return
-        descriptor = _standard_stream(path)
+        descriptor = standard_stream(path)
         with open(path if descriptor is None else os.dup(descriptor), "wb") as file:  # noqa: PTH123
             file.write(content)
 
 
-def is_standard_stream(path: Path) -> bool:
-    """Return whether a path is where this process prints, such as ``/dev/stdout``."""
-    return _standard_stream(path) is not None
-
-
-def _standard_stream(path: Path) -> int | None:
-    """Return the descriptor of standard output or error if a path names it."""
+def standard_stream(path: Path) -> int | None:
+    """Return the descriptor of this process' output if a path names it, such as ``/dev/stdout``."""
     for file in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, OSError, ValueError):
             if os.path.samestat(path.stat(), os.fstat(file.fileno())):
@@ -102,7 +99,7 @@ def _target(path: Path) -> Path | None:
         path.stat()  # of a link in a circle, or a name that is too long, it raises
         if path.is_dir():
             raise StoreError(f"{path}: cannot be written: it is a folder; choose a file in it")
-        if not path.is_file() or is_standard_stream(path):
+        if not path.is_file() or standard_stream(path):
             return None
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     if not target.parent.is_dir():

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
-import shlex
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,9 +21,10 @@ from numpy.typing import NDArray
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.evaluation.results import compare
-from sweep.experiment.pipeline import Pipeline, cell, coordinates_text, selection_text
+from sweep.experiment.pipeline import cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
+from sweep.messages import exception_line, quoted
 from sweep.report.report_data import AREA, ReportData, store_errors
 from sweep.report.table import Table, coordinate, number, plural
 
@@ -34,7 +33,6 @@ from sweep.report.table import Table, coordinate, number, plural
 
 # Of the palette of Okabe and Ito, distinguishable by the colour-blind.
 TRUTH, DETECTED, OTHER, REJECTED, CHESSBOARD = "#009e73", "#d55e00", "#cc79a7", "#f0e442", "#0072b2"
-FRAME = "#e69f00"
 AXES = {"estimated x": "#e60000", "y": "#00aa00", "z": "#0050e6"}
 
 #: Labels and their colours.
@@ -57,12 +55,6 @@ MARGIN = 0.35
 
 MIN_CUT_PX = 4
 
-#: Share of a picture's larger side below which a marker is shown enlarged in a corner, too.
-SMALL = 0.08
-
-#: Share of a picture's sides that this takes.
-INSET = 0.36
-
 #: Characters of a caption's line, and entries of its legend side by side.
 CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
 
@@ -76,8 +68,7 @@ def scene_png(scene: SceneInspection, title: str = "") -> bytes:
         Image, truth and detections.
     title
         First line of a caption below it: the pose on its grid. Then come what was drawn at random,
-        flags and errors, and the legend; and a marker that is small in the picture is framed, and
-        shown enlarged in the corner that is farthest from it.
+        flags and errors, and the legend.
     """
     height, width = scene.image.shape
     scale = max(1, min(MAX_SIDE // max(height, width), MAX_ENLARGEMENT))
@@ -87,7 +78,6 @@ def scene_png(scene: SceneInspection, title: str = "") -> bytes:
     axes.set_axis_off()
     _draw(axes, scene)
     if title:
-        _enlarge_small(axes, scene)
         drawn = ", ".join(
             f"{name} {float(value):.5g}" for name, value in scene.values.items()
             if name not in VARIABLES and value.ndim == 0)
@@ -136,24 +126,6 @@ def _draw(axes: Axes, scene: SceneInspection) -> None:
         for (label, colour), end in zip(AXES.items(), scene.axes_px[1:], strict=True):
             axes.plot(*np.stack([scene.axes_px[0], end]).T, color=colour, linewidth=2, label=label)
     axes.set(xlim=extent[:2], ylim=extent[2:])
-
-
-def _enlarge_small(axes: Axes, scene: SceneInspection) -> None:
-    """Frame a small marker, and show it enlarged in the corner that is farthest from it."""
-    cut = cut_to_marker(scene)
-    shown, part = np.reshape(scene.window, (2, 2)), np.reshape(cut.window, (2, 2))
-    size = shown[1] - shown[0]
-    if cut is scene or (part[1] - part[0]).max() > 2 * SMALL * size.max():
-        return
-    # Axes begin at the lower left corner, images at the upper left one.
-    near = part.mean(axis=0) < shown.mean(axis=0)
-    inset = axes.inset_axes((
-        0.98 - INSET if near[0] else 0.02, 0.02 if near[1] else 0.98 - INSET, INSET, INSET))
-    inset.set(xticks=[], yticks=[])
-    inset.spines[:].set(color=FRAME, linewidth=2)
-    _draw(inset, cut)
-    (x0, y0), (x1, y1) = part - 0.5
-    axes.indicate_inset((x0, y0, x1 - x0, y1 - y0), inset, edgecolor=FRAME, alpha=1.0)
 
 
 def cut_to_marker(scene: SceneInspection) -> SceneInspection:
@@ -265,8 +237,7 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
 # --------------------------------------------------------------------------------------------------
 # Example scenes of a store, rendered and searched again, and compared with the stored values.
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(NamedTuple):
     """One scene of the gallery.
 
     Attributes
@@ -278,85 +249,61 @@ class Scene:
     command
         Command line that draws it.
     result
-        Flags and errors, as text.
-    alt
-        The picture in words.
+        Flags and errors, as text; and how they differ from the stored ones.
     picture
-        A PNG; None if ``problem`` says why there is none.
-    problem
-        Why there is no picture, or how it differs from the stored values; empty otherwise.
+        A PNG; None if ``result`` says why there is none.
     """
 
-    titles: tuple[str, ...]
+    titles: Sequence[str]
     coordinates: str
     command: str
     result: str
-    alt: str
     picture: bytes | None
-    problem: str = ""
 
 
-def scenes_of(data: ReportData) -> Iterator[Scene]:
-    """Yield the scenes of a store's gallery; kinds with the same scene share it."""
+def scenes_of(data: ReportData) -> list[Scene]:
+    """Return the scenes of a store's gallery; kinds with the same scene share it."""
     chosen: dict[tuple[tuple[str, int], ...], list[str]] = {}
     with store_errors(data.store):
-        selected = list(select_scenes(data.results))
-    for title, index in selected:
-        chosen.setdefault(tuple(sorted(index.items())), []).append(title)
-    for key, titles in chosen.items():
-        yield _scene(data, dict(key), tuple(titles))
+        for title, index in select_scenes(data.results):
+            chosen.setdefault(tuple(index.items()), []).append(title)
+        return [_scene(data, dict(key), titles) for key, titles in chosen.items()]
 
 
-def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
-    names = [variable.name for variable in data.pipeline.experiment.variables
-             if variable.name in data.results.variables]
-    with store_errors(data.store):
-        single_cell = data.results[names].isel(index)
-        stored = {name: np.asarray(single_cell[name].values) for name in names}
+def _scene(data: ReportData, index: Index, titles: Sequence[str]) -> Scene:
+    variables = data.pipeline.experiment.variables
+    single_cell = data.results.isel(index)
+    stored = {each.name: np.asarray(single_cell[each.name].values) for each in variables
+              if each.name in single_cell}
     at = selection_text(data.pipeline, index)
-    command = f"sweep show {pipeline_file(data.pipeline)}"
-    command += f" --at {shlex.quote(at)}" if at else ""
-    detection = DetectionStatus(int(stored["detection"]))
-    estimate = EstimateStatus(int(stored["estimate"]))
-    scene = Scene(
-        titles, at.replace(",", ", "), command, _flags_text(detection, estimate), "", None)
-    if DetectionStatus.crashed is detection or EstimateStatus.crashed is estimate:
-        return dataclasses.replace(
-            scene, problem="Not drawn: its process died; `sweep repro` computes it in a process "
-            "of its own.")
+    command = quoted("sweep", "show", f"{data.pipeline.name}.toml", *(["--at", at] if at else []))
+    shown = Scene(titles, at.replace(",", ", "), command, "", None)
+    if "crashed" in (DetectionStatus(int(stored["detection"])).name,
+                     EstimateStatus(int(stored["estimate"])).name):
+        return shown._replace(result="crashed: not drawn, its process died; `sweep repro` computes "
+                              "it in a process of its own.")
     try:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
         picture = scene_png(cut_to_marker(inspected))  # the page has a caption of its own
-        # The store may be another machine's: as `sweep verify`, within the tolerances for those.
-        difference = compare(inspected.values, stored, data.pipeline.experiment.variables,
-                             same_processor=False)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
-    result = result_text(inspected)
-    return Scene(
-        titles, coordinates_text(data.pipeline, single), command, result,
-        f"Rendered {data.pipeline.target_word} with its true outline and the detections: {result}",
-        picture, f"Differs from the store: {difference}." if difference else "")
-
-
-def pipeline_file(pipeline: Pipeline) -> str:
-    """Return the name of the file with a pipeline's text, quoted for a shell."""
-    return shlex.quote(f"{pipeline.name}.toml")
-
-
-def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:
-    """Return the flags in words, without an estimate that follows from the detection."""
-    names = [detection.name]
-    if estimate.counted and estimate.ends and estimate is not EstimateStatus.solved:
-        names.append(estimate.name)
-    return ", ".join(name.replace("_", " ") for name in dict.fromkeys(names))
+        return shown._replace(result=f"Cannot be drawn on this machine: {exception_line(error)}")
+    # The store may be another machine's: as `sweep verify`, within the tolerances for those.
+    difference = compare(inspected.values, stored, variables, same_processor=False)
+    return shown._replace(
+        coordinates=coordinates_text(data.pipeline, single), picture=picture,
+        result=result_text(inspected) + (
+            f"; differs from the store: {difference}" if difference else ""))
 
 
 def result_text(scene: SceneInspection) -> str:
     """Return the flags and the errors of the pose, in words."""
-    parts = [_flags_text(scene.detection, scene.estimate),
+    names = [scene.detection.name]
+    # An estimate that follows from the detection has no words of its own.
+    if scene.estimate.counted and scene.estimate.ends and (
+            scene.estimate is not EstimateStatus.solved):
+        names.append(scene.estimate.name)
+    parts = [", ".join(name.replace("_", " ") for name in dict.fromkeys(names)),
              f"area {number(scene.area_px)} px\u00b2"]
     if "marker_detection" in scene.values:
         flags = scene.values["marker_detection"]

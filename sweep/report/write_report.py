@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import os
 import re
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -25,24 +24,18 @@ from sweep.report.figure import Figure, Panel, panels_file
 from sweep.report.figures import figures_of
 from sweep.report.output_file import (
     check_output_file,
-    is_standard_stream,
+    standard_stream,
     write_errors_explained,
     write_output_file,
 )
 from sweep.report.report_data import ReportData, read_report_data
-from sweep.report.scenes import LEGEND, Scene, pipeline_file, scenes_of
+from sweep.report.scenes import LEGEND, Scene, scenes_of
 from sweep.report.table import Findings, Table, coordinates, markdown_text, plural
-from sweep.store.files import check_folder_writable, write_whole
-from sweep.store.locations import enclosing_store
+from sweep.store.files import write_whole
 
-FORMS = ("html", "md")
+#: Suffix of a report -> its form; of a stream, which has none, it is a page.
+FORMS = {".html": "html", ".htm": "html", ".md": "md", "": "html"}
 PICTURES = (".svg", ".png")
-
-#: Suffixes of files that neither HTML nor Markdown would be taken for.
-NO_REPORTS = {
-    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
-}
-
 
 def write_report(
     store: str | PathLike[str], output: str | PathLike[str] | None = None, *,
@@ -86,27 +79,26 @@ def write_report(
     >>> found.numbers["figures"], (folder / "report.html").exists()
     (4, True)
     """
-    output, figures = (None if each is None else os.fspath(each) for each in (output, figures))
     for name, value in (("output", output), ("figures", figures)):
-        if value is not None and not value.strip():
+        if value is not None and not os.fspath(value).strip():
             raise ArgumentError(name, repr(value), "expected a name")
     for path in error_model:
         check_error_model_file(path)
-    if Path(output or "").suffix.lower() in NO_REPORTS:
-        raise ArgumentError("output", output, "expected a file that ends in .html or .md")
-    form = form or ("md" if str(output).lower().endswith(".md") else "html")
-    if form not in FORMS:
-        raise ArgumentError("form", form, f"expected one of {', '.join(FORMS)}")
-    file = Path(output or f"report.{form}")
+    file = Path(output or f"report.{form or 'html'}")
+    form = form or FORMS.get(file.suffix.lower())
+    if form not in FORMS.values():
+        raise ArgumentError("output", str(file), "expected a file that ends in .html or .md")
     beside = file.with_name(f"{file.stem}_figures") if form == "md" else None
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
     data = read_report_data(os.fspath(store), require, per, command)
     if error_model:
         written_error_models(data, error_model)
-    check_output(file, folders)
+    check_output_file(file)
+    for folder in folders:
+        check_output_file(folder / "figure.png" if folder.is_dir() else folder)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
-    found, drawn, scenes = answer(data), figures_of(data), list(scenes_of(data))
+    found, drawn, scenes = answer(data), figures_of(data), scenes_of(data)
     pictures = {
         f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
         for figure in drawn for suffix in PICTURES if folders}
@@ -128,34 +120,9 @@ def write_report(
         "report": str(file), "figures": len(drawn), "store": data.store,
         "required": list(data.require), "per": list(data.per)}
     # Into the page's own stream a line more would not be HTML.
-    lines = [] if is_standard_stream(file) else [
+    lines = [] if standard_stream(file) else [
         f"{file}: {plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
     return Findings(lines, content | found.as_json(), None, 0, then if lines else ("", ""))
-
-
-def check_output(output: Path, folders: Sequence[Path]) -> None:
-    """Check that a report can be written, before it is computed.
-
-    Raises
-    ------
-    StoreError
-        If the output is a folder, or its folder is missing or not writable; if a folder of figures
-        is a file; or if anything would be written into a store.
-    """
-    for wanted in (output, *folders):
-        with write_errors_explained(wanted):
-            around = enclosing_store(wanted)
-        if around is not None:
-            raise StoreError(f"{wanted}: cannot be written: it is inside the store {around}")
-    check_output_file(output)
-    for folder in folders:
-        with write_errors_explained(folder):
-            if folder.is_dir():
-                check_folder_writable(folder)
-            elif os.path.lexists(folder):
-                raise StoreError(f"{folder}: cannot hold figures: it is a file; choose a folder")
-            else:
-                check_output_file(folder)  # it can be made
 
 
 def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
@@ -189,17 +156,16 @@ def provenance(data: ReportData, output: str) -> dict[str, Any]:
            for name, value in dict(run.get(part, {})).items()},
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
-    store = shlex.quote(data.store)
     trade = [] if data.trade is None else [quoted("sweep", "tradeoff", data.store, *(
         word for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
         for word in ("--per", name)))]
-    axes = [[axis.name, len(axis), _values(axis), axis.unit, _meaning(axis)]
+    axes = [[axis.name, len(axis), _values(axis), axis.unit, axis.meaning]
             for axis in pipeline.axes]
     return {
         "facts": {name: text for name, text in facts.items() if text},
         "commands": (
-            f"sweep run {pipeline_file(pipeline)} --store {store}", *trade,
-            data.command or f"sweep report {store} -o {shlex.quote(output)}"),
+            quoted("sweep", "run", f"{pipeline.name}.toml", "--store", data.store), *trade,
+            data.command or quoted("sweep", "report", data.store, "-o", output)),
         "axes": Table.of("Axes of the grid", ["axis", "values", "which", "unit", "meaning"], axes,
                          words=True) if axes else None,
         "drawn": "; ".join(f"{name} {distribution}"
@@ -213,13 +179,6 @@ def _recorded(value: Any) -> str:
     """Return what a run recorded of itself as text; of digests the first digits."""
     return ", ".join(f"{name} {text:.20}" for name, text in value.items()) if isinstance(
         value, Mapping) else str(value)
-
-
-def _meaning(axis: Axis) -> str:
-    """Return an axis' meaning; of one that explains each choice, only the axis' own choices."""
-    choices = [text for text in axis.meaning.split("; ")
-               if text.partition(": ")[0] in map(str, axis.values)]
-    return "; ".join(choices) or axis.meaning
 
 
 def _values(axis: Axis) -> str:

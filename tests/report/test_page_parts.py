@@ -23,8 +23,7 @@ def hostile_page():
     figure = ReportFigure(
         "name", HOSTILE, HOSTILE, Table.of(HOSTILE, [HOSTILE, "n"], [[HOSTILE, 1.0]]),
         [Column("n", "n")])
-    scenes = [Scene((HOSTILE,), HOSTILE, HOSTILE, HOSTILE, HOSTILE, picture, problem=HOSTILE)
-              for picture in (b"png", None)]
+    scenes = [Scene([HOSTILE], HOSTILE, HOSTILE, HOSTILE, picture) for picture in (b"png", None)]
     origin = {"facts": {"Store": HOSTILE, "Report": HOSTILE}, "commands": [HOSTILE],
               "axes": hostile_table(), "drawn": HOSTILE, "pipeline": HOSTILE, "file": HOSTILE}
     tile = dict.fromkeys(("name", "text", "detail"), HOSTILE)

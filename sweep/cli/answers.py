@@ -626,15 +626,16 @@ def _checked(report: ConformanceReport) -> Findings:
     whole = f"{report.kind} {report.name}{f' ({versions})' if versions else ''}"
     conforms = "conforms" if report.conforms else "does not conform"
     lines = [f"{whole} on {report.dictionary}: {conforms}",
-             *(f"  {each.verdict:5}  {each.check:22}  {each.text}" for each in report.findings)]
+             *(f"  {each.verdict:5}  {check:22}  {each.text}"
+               for check, each in report.findings.items())]
     key = "detector" if report.kind == "detector" else "solver"
     chosen = shlex.quote(f'{key}="{report.name}"')
     then = (f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
     return findings(lines, {
         "name": report.name, "kind": report.kind, "dictionary": report.dictionary,
         "versions": report.versions, "conforms": report.conforms, **report.numbers,
-        "findings": [{"check": each.check, "verdict": each.verdict, "text": each.text}
-                     for each in report.findings],
+        "findings": [{"check": check, "verdict": each.verdict, "text": each.text}
+                     for check, each in report.findings.items()],
     }, int(not report.conforms), *(then if report.conforms else ("", "")))
 
 

@@ -41,7 +41,7 @@ def searched(name, scenes, noise):
     detector, dictionary, chosen = METHODS[name]
     pipeline = trial_pipeline(
         "detector", detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", count=scenes)
-    batch = trial_scenes(pipeline)
+    batch = trial_scenes(pipeline, scenes)
     shown, images = batch.scenes, trial_images(batch)
     find = make_detector(pipeline.experiment.detectors[0])
     find(images[0], dictionary, 640)  # what is made once is made

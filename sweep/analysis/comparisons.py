@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -19,6 +20,7 @@ from sweep.analysis.dataset import (
     DRAWS,
     ERROR_INPUTS,
     INSIDE,
+    NOT_AVAILABLE,
     QUANTITIES,
     Labelled,
     Poses,
@@ -90,6 +92,9 @@ TRUTH = ("true_tvec_m", "true_rvec")
 
 #: Name of the mask of the pairs whose truth differs.
 DIFFERING = "differing"
+
+#: Part of the name of the first configuration's mean absolute error.
+OLDER = "older"
 
 
 class Pair:
@@ -228,18 +233,19 @@ def compare(
     """
     kept = kept_dimensions(first, per)
     kept_dimensions(second, per)
-    return paired_tables(first, second, kept, bins)[0].drop_vars("drawn")
+    table, = paired_tables(first, second, kept, bins)
+    return table.drop_vars([
+        name for name in table if name == "drawn" or f"_{OLDER}_" in str(name)])
 
 
 def paired_tables(
     first: xr.Dataset, second: xr.Dataset, kept: Sequence[str], bins: Bins | None,
     quantities: Sequence[Quantity] = QUANTITIES, levels: Sequence[float] = (LEVEL,),
-    more: Sequence[PairStatistic] = (),
 ) -> list[xr.Dataset]:
-    """Return the table of `compare` of some kinds of error, and of ``more`` statistics.
+    """Return the table of `compare` of some kinds of error, for each level of the intervals.
 
-    Beside it there is whether any cell has two draws, ``drawn``. There is one for each of the
-    ``levels`` of the intervals.
+    Beside it there are whether any cell has two draws, ``drawn``, and of each kind the mean
+    absolute error of the first configuration, such as ``rotation_older_deg``.
     """
     stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
@@ -267,7 +273,7 @@ def paired_tables(
               lambda pair: pair.first.run != pair.second.run),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
-        *(statistic for quantity in quantities for statistic in _differences(quantity)), *more,
+        *(statistic for quantity in quantities for statistic in _differences(quantity)),
     ]
     return aggregates(first, inputs, kept, [
         [replace(each, level=level) for each in statistics] for level in levels],
@@ -325,6 +331,8 @@ def _differences(quantity: Quantity) -> list[PairStatistic]:
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
              lambda pair: np.diff(np.sqrt(squares(pair))), lambda pair: pair.both_solved,
              units=quantity.units),
+        Mean(quantity.named(OLDER), "", lambda pair: quantity.norm(pair.first)[..., None],
+             lambda pair: pair.both_solved),
         ratio("", "", lambda pair: pair.both_solved),
         *([ratio("_unflipped", ", flipped in neither",
                  lambda pair: pair.first.unflipped & pair.second.unflipped)]
@@ -508,45 +516,30 @@ def regressions(
     kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    means: list[PairStatistic] = [
-        Mean(each.named("first"), "", functools.partial(_first_error, each),
-             lambda pair: pair.both_solved) for each in quantities]
-    table, = paired_tables(old, new, kept, None, quantities, [level], means)
+    table, = paired_tables(old, new, kept, None, quantities, [level])
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")
     rate = table["detection_difference"]
-    found = _worst(table, "detection_difference", "detection_rate", "", configuration, -rate,
-                   (rate < 0.0) & (table["detection_p_value"] <= 1.0 - level))
+    compared = [("detection_rate", "detection_difference", "", -rate,
+                 (rate < 0.0) & (table["detection_p_value"] <= 1.0 - level))]
     for each in quantities:
         name = each.named("difference")
-        found += _worst(
-            table, name, f"mean absolute {each.words}", each.units, configuration, table[name],
-            table[f"{name}_low"] > MARGIN * table[each.named("first")])
-    return found
-
-
-def _first_error(quantity: Quantity, pair: Pair) -> Floats:
-    return quantity.norm(pair.first)[..., None]
-
-
-def _worst(
-    table: xr.Dataset, name: str, quantity: str, units: str, configuration: Sequence[str],
-    excess: xr.DataArray, worse: xr.DataArray,
-) -> list[Regression]:
-    """Return the condition at which a difference is worst, of each configuration."""
-    conditions = [str(dim) for dim in worse.dims if dim not in configuration]
-    columns = xr.Dataset({
-        "difference": table[name], "low": table[f"{name}_low"], "high": table[f"{name}_high"],
-        "worse": worse,
-        "excess": excess.fillna(-np.inf).where(worse | ~worse.any(conditions), -np.inf)})
+        compared.append((f"mean absolute {each.words}", name, each.units, table[name],
+                         table[f"{name}_low"] > MARGIN * table[each.named(OLDER)]))
+    conditions = [name for name in kept if name not in configuration]
     found = []
-    for at, one in each_cell(columns, configuration):
-        cell = largest_cell(one, one["excess"].transpose(*conditions))
-        found.append(Regression(
-            quantity, at, {name: cell[name].item() for name in conditions},
-            float(cell["difference"]), float(cell["low"]), float(cell["high"]), units,
-            bool(one["worse"].any())))
+    for quantity, name, units, excess, worse in compared:
+        # The worst condition is one that is significantly worse, if any is.
+        columns = table[[f"{name}{end}" for end in INTERVAL]].assign(
+            worse=worse, excess=excess.fillna(-np.inf).where(
+                worse | ~worse.any(conditions), -np.inf))
+        for at, one in each_cell(columns, configuration):
+            cell = largest_cell(one, one["excess"].transpose(*conditions))
+            difference, low, high = (float(cell[f"{name}{end}"]) for end in INTERVAL)
+            found.append(Regression(
+                quantity, at, {dim: cell[dim].item() for dim in conditions},
+                difference, low, high, units, bool(one["worse"].any())))
     return found
 
 
@@ -556,8 +549,27 @@ def _worst(
 #: Coordinates of the dimension ``statistic`` -> share of the differences up to it.
 STATISTICS = {"median": 0.5, "p99": 0.99, "worst": 1.0}
 
-#: Relative difference of true poses up to which they are one: other processors round otherwise.
-TRUTH_RTOL = 1e-9
+#: Differences of true poses up to which they are one: other processors round otherwise.
+SAME_TRUTH = {"rtol": 1e-9, "atol": 1e-12, "equal_nan": True}
+
+#: Variables of `store_differences`: meaning, units.
+DIFFERENCES = {
+    "computed_once": ("poses that one store computed and the other did not", "1"),
+    "detections_compared": ("poses computed in both", "1"),
+    "detections": ("poses by their flags in the first and in the second store", "1"),
+    "detections_differing": ("poses computed in both, with another flag", "1"),
+    "estimates": ("poses by their flags in the first and in the second store", "1"),
+    "estimates_differing": ("poses computed in both, with another flag", "1"),
+    "corners_compared": ("corners that both found", "1"),
+    "corners_found_once": ("corners that one of both found", "1"),
+    "corners_differing": ("corners with another coordinate", "1"),
+    "corner_shift_px": ("distance of corners that differ", "px"),
+    "poses_compared": ("poses that both solved", "1"),
+    "poses_differing": ("poses with another position or rotation", "1"),
+    "position_shift_m": ("distance of positions that differ", "m"),
+    "rotation_shift_deg": ("angle of rotations that differ", "degree"),
+    "fingerprint": ("what the results depend on and differs between the stores", ""),
+}
 
 
 @describes
@@ -614,115 +626,99 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
             if name in first and name in second]
     sides = [side[read].drop_vars([*side[read].coords]).compute() for side in (first, second)]
     for name in TRUTH:
-        if name in read:
-            ours, theirs = (side[name].transpose(*sides[0][name].dims).values for side in sides)
-            if not np.allclose(ours, theirs, TRUTH_RTOL, 1e-3 * TRUTH_RTOL, equal_nan=True):
-                raise DatasetError(f"not the same true poses: {name} differs")
-    columns: dict[str, tuple[xr.DataArray, str, str]] = {}
-    done: dict[str, list[xr.DataArray]] = {}
-    for kind, stage in ((DetectionStatus, "detection"), (EstimateStatus, "estimate")):
-        # A dataset that was cut or joined has NaN where nothing was run.
-        flags = [side[stage].fillna(0).astype(np.uint8) for side in sides]
-        done[stage] = [~each.isin((kind.not_run, kind.not_needed)) for each in flags]
-        both = done[stage][0] & done[stage][1]
-        columns |= {
-            f"{stage}s_differing": (((flags[0] != flags[1]) & both).sum(scene),
-                                    "poses computed in both, with another flag", "1"),
-            f"{stage}s": (_by_flags(kind, stage, flags, both, scene),
-                          "poses by their flags in the first and in the second store", "1")}
-    found = done["detection"]
-    both = found[0] & found[1]
-    corners = _summed([_apart([side[name] for side in sides], [
-        xr.apply_ufunc(np.isfinite, side[name]).all("xy") & both for side in sides], "xy")
-        for name in CORNER_VARIABLES if name in read], scene)
-    poses = _summed([_poses_apart(sides)], scene)
-    differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
-    columns |= {
-        "detections_compared": (both.sum(scene), "poses computed in both", "1"),
-        "computed_once": ((found[0] ^ found[1]).sum(scene),
-                          "poses that one store computed and the other did not", "1"),
-        "corners_compared": (corners["both"], "corners that both found", "1"),
-        "corners_found_once": (corners["once"], "corners that one of both found", "1"),
-        "corners_differing": (corners["differ"], "corners with another coordinate", "1"),
-        "corner_shift_px": (corners["distance"], "distance of corners that differ", "px"),
-        "poses_compared": (poses["both"], "poses that both solved", "1"),
-        "poses_differing": (poses["differ"], "poses with another position or rotation", "1"),
-        "position_shift_m": (poses["distance"], "distance of positions that differ", "m"),
-        "rotation_shift_deg": (poses["angle"], "angle of rotations that differ", "degree"),
-        "fingerprint": (
-            xr.DataArray(np.array([pair for _, *pair in differences], dtype=object).reshape(-1, 2),
-                         dims=("entry", "store")),
-            "what the results depend on and differs between the stores", ""),
-    }
+        if name in read and not xr.apply_ufunc(
+                np.isclose, *(side[name] for side in sides), kwargs=SAME_TRUTH).all():
+            raise DatasetError(f"not the same true poses: {name} differs")
+    once, *detections = _by_flags(DetectionStatus, "detection", sides, scene)
+    _, _, *estimates = _by_flags(EstimateStatus, "estimate", sides, scene)
+    computed = ~functools.reduce(operator.or_, (
+        side["detection"].fillna(0).isin(NOT_AVAILABLE) for side in sides))
+    corners = _apart([[side[name].where(computed) for name in CORNER_VARIABLES if name in read]
+                      for side in sides], "xy", scene, _distance)
+    shared, _, *moved = _apart([
+        [xr.concat([side["translation_error_m"], side["rotation_error_rad"]], "xyz").where(
+            side["estimate"] == EstimateStatus.solved)] for side in sides],
+        "xyz", scene, _distance, _turn)
+    changes = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
+    fingerprint = xr.DataArray(
+        np.array([pair for _, *pair in changes], dtype=object).reshape(-1, 2),
+        dims=("entry", "store"))
     return xr.Dataset(
-        {name: array.assign_attrs(cf_attributes(meaning, units))
-         for name, (array, meaning, units) in columns.items()},
+        {name: array.assign_attrs(cf_attributes(*described)) for (name, described), array in zip(
+            DIFFERENCES.items(),
+            [once, *detections, *estimates, *corners, shared, *moved, fingerprint], strict=True)},
         {**{dim: first[dim] for dim in axes_of(first) if dim not in scene and dim in first.coords},
          "statistic": list(STATISTICS), "store": ["first", "second"],
-         "entry": np.array([entry for entry, _, _ in differences], dtype=object)})
+         "entry": np.array([entry for entry, _, _ in changes], dtype=object)})
 
 
 def _by_flags(
-    kind: type[IntEnum], name: str, flags: Sequence[xr.DataArray], both: xr.DataArray,
-    scene: Sequence[str],
-) -> xr.DataArray:
-    """Return the poses that both computed by their two flags: (settings, flags, flags)."""
-    values, labels = np.array(list(kind)), [f"first_{name}", f"second_{name}"]
+    kind: type[IntEnum], stage: str, sides: Sequence[xr.Dataset], scene: Sequence[str]
+) -> list[xr.DataArray]:
+    """Return numbers of poses that one store computed, and of those that both computed.
 
-    def counts(first: Integers, second: Integers, both: Masks) -> Integers:
-        codes = np.searchsorted(values, first) * len(values) + np.searchsorted(values, second)
-        return np.bincount(codes[both], minlength=len(values) ** 2).reshape([len(values)] * 2)
+    Of the latter: all, by their two flags (settings, flags, flags), those whose flags differ.
+    """
+    values, labels = np.array(list(kind)), [f"first_{stage}", f"second_{stage}"]
 
-    found: xr.DataArray = xr.apply_ufunc(
-        counts, *flags, both, input_core_dims=[scene] * 3, output_core_dims=[labels],
-        vectorize=True)
-    return found.assign_coords({label: [each.name for each in kind] for label in labels})
+    def counts(*flags: Integers) -> Integers:
+        codes = np.ravel_multi_index([np.searchsorted(values, each).ravel() for each in flags],
+                                     [len(values)] * 2)
+        return np.bincount(codes, minlength=len(values) ** 2).reshape([len(values)] * 2)
+
+    # A dataset that was cut or joined has NaN where nothing was run.
+    table = xr.apply_ufunc(
+        counts, *(side[stage].fillna(0).astype(np.uint8) for side in sides),
+        input_core_dims=[scene] * 2, output_core_dims=[labels], vectorize=True,
+    ).assign_coords({label: [each.name for each in kind] for label in labels})
+    done = [~table[label].isin(["not_run", "not_needed"]) for label in labels]
+    both = table.where(done[0] & done[1], 0)
+    return [table.where(done[0] ^ done[1], 0).sum(labels), both.sum(labels), both,
+            both.where(table[labels[0]] != table[labels[1]], 0).sum(labels)]
 
 
 def _apart(
-    vectors: Sequence[xr.DataArray], present: Sequence[xr.DataArray], across: str
-) -> xr.Dataset:
-    """Return which vectors both have, one has and which differ, and the length between them."""
-    (first, second), both = vectors, present[0] & present[1]
-    return xr.Dataset({
-        "both": both, "once": present[0] ^ present[1],
-        "differ": both & (first != second).any(across),
-        "distance": ((second.astype(np.float64) - first) ** 2).sum(across) ** 0.5})
+    sides: Sequence[Sequence[xr.DataArray]], across: str, scene: Sequence[str],
+    *lengths: Callable[[Floats, Floats], Floats],
+) -> Sequence[xr.DataArray]:
+    """Return how many vectors both stores have, one has and differ, and how far these are apart.
 
-
-def _poses_apart(sides: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return which poses differ, and how far: m, degrees."""
-    solved = [side["estimate"] == EstimateStatus.solved for side in sides]
-    positions, rotations = ([side[name].transpose(*solved[0].dims, "xyz") for side in sides]
-                            for name in ("translation_error_m", "rotation_error_rad"))
-    moved = _apart(positions, solved, "xyz")
-    differ = moved["differ"] | _apart(rotations, solved, "xyz")["differ"]
-    # Errors are rotations from the true one: R2 R1ᵀ = (R2 Rᵀ)(R1 Rᵀ)ᵀ.
-    first, second = (rotation_of_vector(each.values[differ.values].astype(np.float64))
-                     for each in rotations)
-    angle = xr.zeros_like(moved["distance"])
-    angle.values[differ.values] = np.degrees(np.linalg.norm(
-        vector_of_rotation(second @ np.swapaxes(first, -1, -2)), axis=-1))
-    return moved.assign(differ=differ, angle=angle)
-
-
-def _summed(parts: Sequence[xr.Dataset], scene: Sequence[str]) -> xr.Dataset:
-    """Return counts of masks, and `STATISTICS` of the lengths of the differences.
-
-    They are over all dimensions of scenes and of labels.
+    Parameters
+    ----------
+    sides
+        Of each store arrays of vectors along ``across``, NaN where there is none; they are pooled
+        over scenes and labels.
+    lengths
+        Each between vectors (n, components) of both stores: the result has its `STATISTICS`.
     """
-    def statistics(length: Floats, differ: Masks) -> Floats:
-        some = length[differ] if differ.any() else np.array([np.nan])
-        return np.asarray(np.quantile(some, [*STATISTICS.values()]))
+    def compared(first: Floats, second: Floats) -> tuple[Any, ...]:
+        there = [~np.isnan(each).any(axis=1) for each in (first, second)]
+        both = there[0] & there[1]
+        differ = both & (first != second).any(axis=1)
+        return (both.sum(), (there[0] ^ there[1]).sum(), differ.sum(), *(
+            np.quantile(length(first[differ], second[differ]) if differ.any() else [np.nan],
+                        [*STATISTICS.values()]) for length in lengths))
 
-    table = xr.concat([part.stack(
-        item=[dim for dim in part.dims if dim in scene or dim in LABELS], create_index=False)
-        for part in parts], "item")
-    return xr.Dataset({
-        name: array.sum("item") if array.dtype.kind == "b" else xr.apply_ufunc(
-            statistics, array, table["differ"], input_core_dims=[["item"]] * 2,
-            output_core_dims=[["statistic"]], vectorize=True)
-        for name, array in table.items()})
+    listed = [xr.concat([array.astype(np.float64).stack(
+        item=[dim for dim in (*scene, *LABELS) if dim in array.dims and dim != across],
+        create_index=False) for array in side], "item") for side in sides]
+    found: Sequence[xr.DataArray] = xr.apply_ufunc(
+        compared, *listed, input_core_dims=[["item", across]] * 2,
+        output_core_dims=[[]] * 3 + [["statistic"]] * len(lengths), vectorize=True)
+    return found
+
+
+def _distance(first: Floats, second: Floats) -> Floats:
+    """Return the distances of corners, or of the positions of poses."""
+    return np.asarray(np.sqrt(((second - first)[:, :3] ** 2).sum(axis=1)))
+
+
+def _turn(first: Floats, second: Floats) -> Floats:
+    """Return the angles between the rotations of poses, degrees."""
+    # Errors are rotations from the true one: R2 R1ᵀ = (R2 Rᵀ)(R1 Rᵀ)ᵀ.
+    ours, theirs = (rotation_of_vector(each[:, 3:]) for each in (first, second))
+    turned = vector_of_rotation(theirs @ np.swapaxes(ours, -1, -2))
+    return np.asarray(np.degrees(np.linalg.norm(turned, axis=-1)))
 
 
 def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:

@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -94,17 +93,12 @@ class BinSums:
         start, count = 4 + POWERS * quantity, some[:, :1]
         return cls(count[:, 0], some[:, 1:4] / count, some[:, start : start + POWERS] / count)
 
-    def square(self, centre: Floats) -> Floats:
-        """Return the mean squares of the errors minus ``centre`` (bins,)."""
-        s1, s2, _, _ = self.means.T
-        return np.asarray(np.maximum(s2 - 2.0 * centre * s1 + centre**2, FLOOR))
-
-    def fourth_power(self, centre: Floats) -> Floats:
-        """Return the mean fourth powers of the errors minus ``centre`` (bins,)."""
-        s1, s2, s3, s4 = self.means.T
-        return np.asarray(np.maximum(
-            s4 - 4.0 * centre * s3 + 6.0 * centre**2 * s2 - 4.0 * centre**3 * s1 + centre**4,
-            FLOOR**2))
+    def about(self, centre: Floats, power: int) -> Floats:
+        """Return the mean squares, or fourth powers, of the errors minus ``centre`` (bins,)."""
+        raw = [1.0, *self.means.T]
+        terms = ((-1.0) ** k * math.comb(power, k) * centre**k * raw[power - k]
+                 for k in range(power + 1))
+        return np.asarray(np.maximum(sum(terms), FLOOR ** (power // 2)))
 
 
 @dataclass(frozen=True)
@@ -119,7 +113,7 @@ class Fit:
     def score(self, sums: BinSums, basis: Floats) -> float:
         """Return the log-likelihood of normal errors of other poses, up to a constant."""
         log_variance = basis @ self.log_variance
-        square = sums.square(basis @ self.bias)
+        square = sums.about(basis @ self.bias, 2)
         return float(-0.5 * (sums.count * (log_variance + square * np.exp(-log_variance))).sum())
 
     def at(self, basis: Floats) -> Floats:
@@ -195,7 +189,7 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     count, mean = sums.count, sums.means[:, 0]
 
     def squares(bias: Floats) -> Floats:
-        return sums.square(basis @ bias)
+        return sums.about(basis @ bias, 2)
 
     bias = _weighted(basis, penalty, count, mean)
     log_variance = _weighted(basis, penalty, count, np.log(squares(bias)))
@@ -207,7 +201,7 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
         if np.abs(step).max() < CONVERGED:
             break
     fitted = basis @ log_variance
-    kurtosis = sums.fourth_power(basis @ bias) * np.exp(-2.0 * fitted)
+    kurtosis = sums.about(basis @ bias, 4) * np.exp(-2.0 * fitted)
     ratio = squares(bias) * np.exp(-fitted)
     bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
     # Mean of (residual² / variance - 1)². A bin's own is too small as often as it has not seen
@@ -309,9 +303,6 @@ def select_knots(
 #: Distinct values up to which each has a bin of its own.
 MAX_VALUES = 24
 
-#: Values that differ by less, relatively (angles: in degrees / 100), are the same.
-SAME = 1e-6
-
 #: Smallest viewing angles and bearings up to here: the model begins at 0.
 FRONTAL_DEG = 5.0
 
@@ -337,6 +328,8 @@ CORNER = 3.0
 class Condition:
     """A condition that errors depend on, or that was seen with others.
 
+    Its values are scaled once, as the model is linear in them: distances and sides are logarithms.
+
     Attributes
     ----------
     words, units
@@ -344,8 +337,9 @@ class Condition:
     logarithmic
         Whether the model is linear in its logarithm.
     tolerance
-        Ratio of the largest value to the smallest (angles: difference in degrees) from which on it
-        varies.
+        Difference of the largest scaled value to the smallest from which on it varies.
+    rounding
+        Scaled values that differ by less are the same; bins reach twice as much beyond the ends.
     bins, cells
         Bins of the fit, and cells in which the fit is judged, into which values are put that are
         not a few.
@@ -355,58 +349,44 @@ class Condition:
     units: str
     logarithmic: bool
     tolerance: float
+    rounding: float
     bins: int = 0
     cells: int = 0
-
-    @property
-    def same(self) -> float:
-        """Difference of scaled values that counts as none."""
-        return math.log(self.tolerance) if self.logarithmic else self.tolerance
 
     def scaled(self, values: ArrayLike) -> Floats:
         """Return values as the model is linear in them."""
         return np.asarray(np.log(values) if self.logarithmic else values, dtype=np.float64)
 
-    def wider(self, low: float, high: float) -> tuple[float, float]:
-        """Return ends that are farther out by as much as counts as the same."""
-        if self.logarithmic:
-            return low / self.tolerance, high * self.tolerance
-        return low - self.tolerance, high + self.tolerance
+    def unscaled(self, values: Floats) -> Floats:
+        """Return the values that were scaled."""
+        return np.exp(values) if self.logarithmic else values
 
     def varies(self, values: Floats) -> bool:
         """Return whether the last of the sorted values is another than the first."""
-        return bool(values[-1] > self.wider(values[0], values[0])[1])
+        return bool(values[-1] - values[0] > self.tolerance)
 
     def distinct(self, values: Floats) -> Floats:
         """Return the sorted values, those that differ by rounding once."""
         values = np.unique(values[np.isfinite(values)])
-        least = SAME * values[1:] if self.logarithmic else 100 * SAME
-        first = np.ones(len(values[:1]), dtype=bool)
-        return np.asarray(values[np.concatenate([first, np.diff(values) > least])])
+        return np.asarray(values[np.diff(values, prepend=-np.inf) > self.rounding])
 
-    def middles(self, groups: Sequence[Floats] | Floats) -> Floats:
-        """Return the values between neighbouring groups of sorted values."""
-        last = np.array([group[-1] for group in groups[:-1]])
-        first = np.array([group[0] for group in groups[1:]])
-        return np.asarray(np.sqrt(last * first) if self.logarithmic else (last + first) / 2)
+    def begins(self, low: Floats) -> Floats:
+        """Return low ends; those of angles that begin near 0 begin at 0."""
+        return low if self.logarithmic else np.where(low <= FRONTAL_DEG, 0.0, low)
 
     def edges(self, values: Floats, count: int, *, single: bool) -> Floats:
         """Return edges of one bin a value, or of ``count`` bins of about as many values each.
 
-        A ``single`` bin, of what does not vary, is as wide as what counts as the same. The ends of
-        others are so far out that rounding puts no pose outside; angles that begin near 0 begin
-        at 0.
+        A ``single`` bin, of what does not vary, is as wide as what counts as the same.
         """
+        ends, outwards = values[[0, -1]], np.array([-1.0, 1.0])
         if single:
-            return np.maximum(self.wider(values[0], values[-1]), 0.0)
-        inner = self.middles(values[:, None]) if len(values) <= MAX_VALUES else (
+            ends = ends + outwards * self.tolerance
+            return ends if self.logarithmic else np.maximum(ends, 0.0)
+        inner = (values[1:] + values[:-1]) / 2 if len(values) <= MAX_VALUES else (
             np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))[1:-1])
-        ends = values[[0, -1]]
-        margin = 2.0 * SAME * ends if self.logarithmic else 100.0 * SAME
-        low, high = ends + np.array([-1.0, 1.0]) * margin
-        if not self.logarithmic and low <= FRONTAL_DEG:
-            low = 0.0
-        return np.concatenate([[low], inner, [high]])
+        low, high = ends + outwards * 2.0 * self.rounding
+        return np.concatenate([[self.begins(low)], inner, [high]])
 
     def between(self, values: Floats) -> Floats | None:
         """Return the middles between the few values, None if there are many.
@@ -417,24 +397,24 @@ class Condition:
         ...     np.array([*np.linspace(0.0, 0.1, 99), 20.0])).tolist()
         [10.05]
         """
-        groups: Sequence[Floats] = list(values[:, None])
-        if len(values) > MAX_VALUES:
-            jumps = np.diff(self.scaled(values)) > self.same
-            groups = np.split(values, np.flatnonzero(jumps) + 1)
-            if len(groups) > MAX_VALUES or any(map(self.varies, groups)):
-                return None
-        return self.middles(groups)
+        few = len(values) <= MAX_VALUES
+        jumps = np.flatnonzero(np.diff(values) > (0.0 if few else self.tolerance))
+        if not few and (len(jumps) >= MAX_VALUES
+                        or any(map(self.varies, np.split(values, jumps + 1)))):
+            return None
+        return np.asarray((values[jumps] + values[jumps + 1]) / 2)
 
 
 #: Models do not depend on the last, but hold where it was seen.
 CONDITIONS = {
-    "distance_m": Condition("the distance along the optical axis", "m", True, 1.02, 16, 12),
+    "distance_m": Condition("the distance along the optical axis", "m", True,
+                            math.log(1.02), 1e-6, 16, 12),
     "side_px": Condition("the side of the black square, were it parallel to the image", "px",
-                         True, 1.02, 8, 6),
+                         True, math.log(1.02), 1e-6, 8, 6),
     "viewing_angle_deg": Condition("the angle between the marker's normal and the line of sight",
-                                   "degree", False, 1.0, 16, 12),
+                                   "degree", False, 1.0, 1e-4, 16, 12),
     "bearing_deg": Condition("the angle between the line of sight and the optical axis", "degree",
-                             False, 1.0),
+                             False, 1.0, 1e-4),
 }
 
 #: Conditions on which models depend.
@@ -460,23 +440,20 @@ class Sights:
 
     Attributes
     ----------
-    conditions
-        `CONDITIONS`, (4, n); the side is fx · size / distance.
+    at
+        `CONDITIONS`, scaled, (n, 4); the side is fx · size / distance.
     half
         Which half of the trials, (n,).
     solved, flipped
         Masks (n,).
-    position_m
-        True positions (n, 3).
     errors
-        Errors (n, 6) along and about the camera's axes; positions over the distance.
+        Errors (n, 6) in the sight frame; positions over the distance.
     """
 
-    conditions: Floats
+    at: Floats
     half: Integers
     solved: Masks
     flipped: Masks
-    position_m: Floats
     errors: Floats
 
     @classmethod
@@ -492,39 +469,22 @@ class Sights:
                 "true_tvec_m", "true_rvec", FOCAL_SIZE, "translation_error_m",
                 "rotation_error_rad"))
         distance = position[:, 2]
-        conditions = np.stack([distance, focal_size / distance,
-                               viewing_angle_of(rotation, position), bearing_of(position)])
-        return cls(conditions, rows(poses[HALF]), rows(poses.solved), rows(poses.flipped), position,
-                   np.concatenate([moved / distance[:, None], turned], axis=-1))
+        at = np.stack([condition.scaled(values) for condition, values in zip(
+            CONDITIONS.values(), (distance, focal_size / distance, viewing_angle_of(
+                rotation, position), bearing_of(position)), strict=True)], axis=-1)
+        errors = np.concatenate([in_sight_frame(each, position) for each in (
+            moved / distance[:, None], turned)], axis=-1)
+        return cls(at, rows(poses[HALF]), rows(poses.solved), rows(poses.flipped), errors)
 
     @property
     def used(self) -> Masks:
         """Solved poses that are not flipped (n,)."""
         return self.solved & ~self.flipped
 
-    @cached_property
-    def at(self) -> Floats:
-        """Return ln(distance), ln(side), viewing angle and bearing, (n, 4)."""
-        return np.stack([condition.scaled(values) for condition, values in zip(
-            CONDITIONS.values(), self.conditions, strict=True)], axis=-1)
-
-    @cached_property
-    def in_sight(self) -> Floats:
-        """The errors in the sight frame, (n, 6)."""
-        return np.concatenate([in_sight_frame(part, self.position_m)
-                               for part in np.split(self.errors, 2, axis=-1)], axis=-1)
-
-
-#: The poses of each model, in blocks.
-Models = Sequence[Sequence[Sights]]
-
 
 @dataclass(frozen=True)
 class Bins:
-    """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
-
-    A value at the last edge belongs to the last bin.
-    """
+    """Edges of bins along the scaled conditions, of all four or without the bearing."""
 
     edges: tuple[Floats, ...]
 
@@ -536,9 +496,8 @@ class Bins:
     def sums(self, poses: Sights, used: Masks, columns: Iterable[ArrayLike] = (1.0,)) -> Floats:
         """Return sums (halves, bins, columns) of columns (n,) over the used poses in each bin."""
         inside, at = used.copy(), poses.half
-        for values, edges, count in zip(poses.conditions, self.edges, self.shape, strict=False):
+        for values, edges, count in zip(poses.at.T, self.edges, self.shape, strict=False):
             number = np.searchsorted(edges, values, side="right") - 1
-            number = np.where(values == edges[-1], count - 1, number)
             inside &= (number >= 0) & (number < count)
             at = at * count + np.clip(number, 0, count - 1)
         size = math.prod(self.shape)
@@ -552,34 +511,25 @@ def moments_of(bins: Bins, poses: Sights) -> Floats:
     def columns() -> Iterable[ArrayLike]:
         yield 1.0
         yield from poses.at[:, :3].T
-        for error in poses.in_sight.T:
+        for error in poses.errors.T:
             yield from (error, error**2, error**2 * error, (error**2) ** 2)
 
     return bins.sums(poses, poses.used, columns())
 
 
 def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights) -> Floats:
-    """Return sums (halves, bins, 16) of how many errors lie within two sigma of the bias.
+    """Return sums (halves, bins, 10) of how many errors lie within two sigma of the bias.
 
     The first four columns are poses looked for, solved, flipped and judged; then follow those
-    within, for each error in the sight frame, and along and about the camera's axes. Each half of
-    the trials is judged by the model of the other: ``fitted`` (halves, knots, quantities, 2) are
-    bias and ln(variance).
+    within, for each error. Each half of the trials is judged by the model of the other: ``fitted``
+    (halves, knots, quantities, 2) are bias and ln(variance).
     """
     basis = hat_basis(poses.at[:, :3], knots)
     of_halves = np.tensordot(basis, fitted, axes=(1, 1))[np.arange(len(basis)), 1 - poses.half]
-    bias, sigma = of_halves[..., 0], np.exp(0.5 * of_halves[..., 1])
-    within = [np.abs(poses.in_sight - bias) <= 2.0 * sigma]
-    turn = sight_rotation(poses.position_m)
-    for part in (slice(0, 3), slice(3, 6)):
-        mean = np.einsum("nij,nj->ni", turn, bias[:, part])
-        spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
-        within.append(np.abs(poses.errors[:, part] - mean) <= 2.0 * spread)
-    everywhere = np.ones_like(poses.solved)
-    counts = [bins.sums(poses, mask)
-              for mask in (everywhere, poses.solved, poses.flipped, poses.used)]
-    return np.concatenate(
-        [*counts, bins.sums(poses, poses.used, np.concatenate(within, axis=-1).T)], axis=-1)
+    within = np.abs(poses.errors - of_halves[..., 0]) <= 2.0 * np.exp(0.5 * of_halves[..., 1])
+    counts = [bins.sums(poses, mask) for mask in (
+        np.ones_like(poses.solved), poses.solved, poses.flipped, poses.used)]
+    return np.concatenate([*counts, bins.sums(poses, poses.used, within.T)], axis=-1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -616,7 +566,7 @@ def bins_and_cells(
     Parameters
     ----------
     found
-        The distinct values of each condition.
+        The distinct values of each condition, scaled.
     poses
         Scenes of the dataset.
     collinear
@@ -668,45 +618,11 @@ def region_directions(found: Mapping[str, Floats]) -> Floats:
     """
     unit = np.eye(len(found))
     rows = [*unit, unit[:2].sum(axis=0)]
-    ranges = {k: np.ptp(CONDITIONS[name].scaled(values))
-              for k, (name, values) in enumerate(found.items()) if CONDITIONS[name].varies(values)}
+    ranges = {k: np.ptp(values) for k, (name, values) in enumerate(found.items())
+              if CONDITIONS[name].varies(values)}
     for a, b in itertools.combinations(ranges, 2):
         rows += [unit[a] / ranges[a] + sign * unit[b] / ranges[b] for sign in (1.0, -1.0)]
     return np.stack(rows)
-
-
-def region_ends(directions: Floats, low: Floats, high: Floats, draws: Floats) -> tuple[Any, Any]:
-    """Return the ends (models, directions) of the region along directions.
-
-    An end has a margin for rounding; where there is hardly an extent, as wide as what counts as
-    the same; of sums and differences `SLACK` and what so many ``draws`` (models,) in each cell of
-    the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
-
-    Parameters
-    ----------
-    directions
-        Of `region_directions`.
-    low, high
-        Extremes (models, directions) of the poses that were looked for.
-    draws
-        Fewest poses (models,) of a cell of the grid.
-    """
-    listed = list(CONDITIONS.values())
-    axes, alone = slice(0, len(listed)), slice(0, len(listed) + 1)
-    angles = np.array([not each.logarithmic for each in listed])
-    # Knots at the ends lie 2e-6 outside the poses; ln(fx size) has the tolerance of ln(distance).
-    same = np.array([each.same for each in (*listed, listed[0])])
-    rounding = np.where([*angles, False], 200.0 * SAME, 3.0 * SAME)
-    margin = np.repeat(SLACK + np.sqrt(CORNER / draws)[:, None], low.shape[1], axis=1)
-    margin[:, alone] = np.where(high[:, alone] - low[:, alone] <= same, same, rounding)
-    margin[:, len(listed)] = np.maximum(margin[:, len(listed)], 2.0 * rounding[0])  # of two ends
-    ends = (low - margin)[:, axes]
-    ends = np.where(angles & (ends <= FRONTAL_DEG), 0.0, ends)
-    # Where an angle begins at 0, its sums and differences reach as much farther.
-    margin[:, alone.stop :] += (low[:, axes] - ends) @ np.abs(directions[alone.stop :]).T
-    low, high = low - margin, high + margin
-    low[:, axes] = ends
-    return low, high
 
 
 def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
@@ -717,13 +633,12 @@ def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
     """
     knots = []
     columns = moments.reshape(*bins.shape, 4)
-    for axis, (name, edges) in enumerate(zip(PREDICTORS, bins.edges, strict=True)):
+    for axis, edges in enumerate(bins.edges):
         others = tuple(k for k in range(len(bins.shape)) if k != axis)
         count, total = np.moveaxis(columns[..., [0, 1 + axis]].sum(axis=others), -1, 0)
         middle = total[count > 0] / count[count > 0]
         if len(middle) > 1:
-            low, high = CONDITIONS[name].scaled(edges[[0, -1]])
-            middle = np.unique([low, *middle[1:-1], high])
+            middle = np.unique([edges[0], *middle[1:-1], edges[-1]])
         knots.append(middle)
     return knots
 
@@ -779,7 +694,6 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
         ("quantity",),
         "power of the distance (of the side, if only that varies) with which sigma goes", "1"),
     "coverage": (OF_CELLS, "share of held-out errors within two sigma of the bias", "1"),
-    "camera_coverage": (OF_CELLS, "the same along and about the camera's own axes", "1"),
     "use": (OF_CELLS, "whether the model may be used", ""),
     "judged": (CELLS, "held-out poses that were judged", "1"),
     "looked_for": (CELLS, "poses looked for", "1"),
@@ -792,7 +706,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "knots": (("quantity", "predictor"), "knots that the error needs", "1"),
 }
 
-#: Values of variables (models, ...), by name.
+#: Values of variables of a model, by name.
 Values = dict[str, NDArray[Any]]
 
 
@@ -822,8 +736,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         - ``exponent`` (quantity): of the distance (or the side, where only that varies), if sigma
           is a power of it at every angle, with its interval.
         - ``coverage`` (quantity, cells): share of errors within two sigma of the bias, by a model
-          of the other half of the trials (even, odd); ``judged`` poses. ``camera_coverage``: the
-          same along and about the camera's own axes.
+          of the other half of the trials (even, odd); ``judged`` poses.
         - ``use`` (quantity, cells): whether the model may be used there (`Use`): the coverage lies
           within 0.93 to 0.97, with a tolerance of a standard error, and that of each half of the
           trials with one of two.
@@ -863,22 +776,22 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     focal_size = focal_size_of(results)
     halves = (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS)
     columns = arranged(results, {**inputs, HALF: halves, FOCAL_SIZE: focal_size}, kept)[0]
-    models: Models = [
+    models = [
         Columns({name: each[k : k + 1] for name, each in columns.items()}, Poses).map(Sights.of)
         for k in range(math.prod(results.sizes[name] for name in kept))]
     found = {name: condition.distinct(np.concatenate(
-        [block.conditions[k] for model in models for block in model]))
+        [block.at[:, k] for model in models for block in model]))
         for k, (name, condition) in enumerate(CONDITIONS.items())}
     if not all(map(len, found.values())):
         raise DatasetError("no pose was looked for: there are no errors to model")
     poses = math.prod(
         size for name, size in results["true_tvec_m"].sizes.items() if name != "xyz")
     least, most = float(focal_size.min()), float(focal_size.max())
-    bins, cells = bins_and_cells(
-        found, poses, collinear=most <= least * CONDITIONS["side_px"].tolerance)
+    bins, cells = bins_and_cells(found, poses, collinear=not CONDITIONS["side_px"].varies(
+        np.log([least, most])))
     region, drawn = region_cells(found, poses, results.sizes[DRAWS])
     directions = region_directions(found)
-    moments = _totals(functools.partial(moments_of, bins), models)
+    moments = np.stack([sum(moments_of(bins, block) for block in model) for model in models])
     _check_solved(moments, results, kept)
     values = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
     selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), values)
@@ -887,26 +800,24 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     # All errors are given at the knots of all: what is linear between some is so between all.
     knots = [np.unique(np.concatenate(each)) for each in zip(
         shown, *(own for model in selected for own in model), strict=True)]
-    # The model of each half, by which the other is judged: (halves, knots, quantities, 2).
-    judged = np.stack([
-        sum(within_of(cells, knots, np.stack(
-            [_at_knots(half, own, knots)[:2].transpose(2, 1, 0) for half in of_model]), block)
-            for block in model)
-        for model, own, of_model in zip(models, selected, moments, strict=True)])
-    whole = moments.sum(axis=1)
-    arrays = {
-        **_of_knots(np.stack([_at_knots(sums, own, knots)
-                              for sums, own in zip(whole, selected, strict=True)]), knots),
-        **_exponents(whole), **_of_cells(judged, cells),
-        **_of_region(models, region, drawn, directions),
-        "knots": np.array([[[*map(len, own)] for own in model] for model in selected])}
+    tables = []
+    for model, sums, own in zip(models, moments, selected, strict=True):
+        # The model of each half, by which the other is judged: (halves, knots, quantities, 2).
+        fitted = np.stack([_at_knots(half, own, knots)[:2].transpose(2, 1, 0) for half in sums])
+        judged = sum(within_of(cells, knots, fitted, block) for block in model)
+        whole = sums.sum(axis=0)
+        tables.append({
+            **_of_knots(_at_knots(whole, own, knots), knots), **_exponents(whole),
+            **_of_cells(np.asarray(judged), cells), **_of_region(model, region, drawn, directions),
+            "knots": np.array([[*map(len, each)] for each in own])})
     variables: dict[str, Any] = {"direction_weight": (
         ("direction", "condition"), directions,
         cf_attributes("weights of ln(distance), ln(side), viewing angle and bearing", ""))}
-    for name, array in arrays.items():
+    for name in tables[0]:
         ending = next((each for each in INTERVAL if each and name.endswith(each)), "")
         ending = ending if name not in VARIABLES else ""
         dims, meaning, units = VARIABLES[name.removesuffix(ending)]
+        array = np.stack([table[name] for table in tables])
         variables[name] = (
             (*kept, *dims),
             array.reshape(*(results.sizes[each] for each in kept), *array.shape[1:]),
@@ -915,30 +826,21 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
-
-    def add(name: str, condition: str, numbers: Floats, words: str) -> None:
-        dim = name.removesuffix("_low").removesuffix("_high")
-        coordinates[name] = dim, numbers, {
-            "units": CONDITIONS[condition].units,
-            "long_name": f"{words} {CONDITIONS[condition].words}"}
-
-    for name, at_knots, edges in zip(PREDICTORS, knots, cells.edges, strict=True):
-        # A knot at an end must not leave the domain by the rounding of its logarithm.
-        add(name, name, np.clip(np.exp(at_knots), edges[0], edges[-1])
-            if CONDITIONS[name].logarithmic else at_knots, "knots of")
-        add(f"cell_{name}_low", name, edges[:-1], "low end of cells of")
-        add(f"cell_{name}_high", name, edges[1:], "high end of cells of")
-    for name, edges in zip(CONDITIONS, region.edges, strict=True):
-        add(f"region_{name}", name, edges[:-1], "low end of cells of the region of")
+    parts = [(name, name, at, "knots") for name, at in zip(PREDICTORS, knots, strict=True)]
+    for name, edges in zip(PREDICTORS, cells.edges, strict=True):
+        parts += [(f"cell_{name}_low", name, edges[:-1], "low end of cells"),
+                  (f"cell_{name}_high", name, edges[1:], "high end of cells")]
+    parts += [(f"region_{name}", name, edges[:-1], "low end of cells of the region")
+              for name, edges in zip(CONDITIONS, region.edges, strict=True)]
+    for coordinate, name, at, words in parts:
+        condition = CONDITIONS[name]
+        coordinates[coordinate] = (
+            coordinate.removesuffix("_low").removesuffix("_high"), condition.unscaled(at),
+            {"units": condition.units, "long_name": f"{words} of {condition.words}"})
     return with_sampling(xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),
         "focal_size_varies": int(most > least * (1 + 1e-9)),
     }), results)
-
-
-def _totals(of_block: Callable[[Sights], Floats], models: Models) -> Floats:
-    """Return the sums over the blocks of each model, (models, ...)."""
-    return np.stack([functools.reduce(np.add, map(of_block, model)) for model in models])
 
 
 def _at_knots(
@@ -988,25 +890,40 @@ def _metres(distance_m: Floats) -> Floats:
 
 
 def _of_region(
-    models: Models, region: Bins, drawn: Sequence[int], directions: Floats
+    model: Sequence[Sights], region: Bins, drawn: tuple[int, ...], directions: Floats
 ) -> Values:
-    """Return the joint region of the conditions that was seen."""
-    seen = _totals(lambda poses: region.sums(poses, np.ones_like(poses.solved)), models)
-    cells = seen.sum(axis=(1, 3)).reshape(-1, *region.shape)
-    of_grid = cells.sum(axis=tuple(1 + k for k in drawn)).reshape(len(cells), -1)
-    draws = np.where(of_grid > 0, of_grid, np.inf).min(axis=1)
-    projected = [np.concatenate([block.at for block in model]) @ directions.T for model in models]
-    low, high = (np.stack([extreme(each, axis=0) for each in projected])
-                 for extreme in (np.min, np.max))
-    low, high = region_ends(directions, low, high, draws)
+    """Return the joint region of the conditions that was seen.
+
+    An end along a direction has a margin for rounding; where there is hardly an extent, as wide as
+    what counts as the same; of sums and differences `SLACK` and what the fewest draws of a cell of
+    the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
+    """
+    cells = np.asarray(sum(
+        region.sums(block, np.ones_like(block.solved)).sum(axis=(0, 2)) for block in model))
+    cells = cells.reshape(region.shape)
+    of_grid = cells.sum(axis=drawn)
+    projected = np.concatenate([block.at for block in model]) @ directions.T
+    low, high = projected.min(axis=0), projected.max(axis=0)
+    listed = [*CONDITIONS.values()]
+    axes, alone = slice(0, len(listed)), slice(0, len(listed) + 1)
+    # Knots at the ends lie two roundings outside the poses; ln(fx size) is of two ends.
+    same = np.array([each.tolerance for each in (*listed, listed[0])])
+    rounding = np.array([*(3.0 * each.rounding for each in listed), 6.0 * listed[0].rounding])
+    margin = np.full(len(low), SLACK + math.sqrt(CORNER / of_grid[of_grid > 0].min()))
+    margin[alone] = np.where(high[alone] - low[alone] <= same, same, rounding)
+    ends = np.array([condition.begins(end) for condition, end in zip(
+        listed, (low - margin)[axes], strict=True)])
+    # Where an angle begins at 0, its sums and differences reach as much farther.
+    margin[alone.stop :] += np.abs(directions[alone.stop :]) @ (low[axes] - ends)
+    low, high = low - margin, high + margin
+    low[axes] = ends
     return {"region_low": low, "region_high": high, "region_seen": cells > 0}
 
 
-def _of_knots(fits: Floats, knots: Sequence[Floats]) -> Values:
-    """Return sigma and bias at the knots; ``fits`` are (models, 4, quantities, knots)."""
+def _of_knots(fit: Floats, knots: Sequence[Floats]) -> Values:
+    """Return sigma and bias at the knots; ``fit`` is (4, quantities, knots)."""
     metres = _metres(np.exp(knots[0]))[:, :, None, None]
-    bias, log_variance, bias_error, error = np.moveaxis(fits.reshape(
-        *fits.shape[:3], *map(len, knots)), 1, 0)
+    bias, log_variance, bias_error, error = fit.reshape(*fit.shape[:2], *map(len, knots))
     values = {}
     for ending, side in zip(INTERVAL, (0.0, -1.0, 1.0), strict=True):
         values[f"sigma{ending}"] = metres * np.exp(
@@ -1015,42 +932,36 @@ def _of_knots(fits: Floats, knots: Sequence[Floats]) -> Values:
     return values
 
 
-def _of_cells(halves: Floats, bins: Bins) -> Values:
-    """Return whether models may be used in cells; ``halves`` (models, halves, cells, columns)."""
-    looked_for, solved, flipped, n = np.moveaxis(
-        np.rint(halves[..., :4].sum(axis=1)).astype(np.int64), -1, 0)
+def _of_cells(judged: Floats, bins: Bins) -> Values:
+    """Return whether a model may be used in cells; ``judged`` (halves, cells, columns)."""
+    looked_for, solved, flipped, n = np.rint(judged[..., :4].sum(axis=0)).astype(np.int64).T
+    within, of_halves = judged[..., 4:], judged[..., [3]]
     with np.errstate(invalid="ignore", divide="ignore"):
-        within, camera = np.split(halves[..., 4:], 2, axis=-1)
-        coverage, in_camera = (each.sum(axis=1) / n[..., None] for each in (within, camera))
+        coverage, of_half = within.sum(axis=0) / n[:, None], within / of_halves
         flip_rate, solved_rate = flipped / solved, solved / looked_for
-        judged = halves[..., [3]]
         spread, spread_of_half = (
-            np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[..., None], judged))
-        of_half = within / judged
+            np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[:, None], of_halves))
     # Limits are wider by a standard error, of each half by two.
     low, high = (
         (sign * (coverage - limit) > spread) | (
-            sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=1)
+            sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=0)
         for sign, limit in zip((-1.0, 1.0), COVERAGE, strict=True))
     use = np.select(
-        [*(each[..., None] for each in (
+        [*(each[:, None] for each in (
             looked_for == 0, solved_rate < MIN_DETECTION, flip_rate > MAX_FLIPS, n < MIN_JUDGED)),
          low, high],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
         Use.holds).astype(np.uint8)
-    of_quantities = {"coverage": coverage, "camera_coverage": in_camera, "use": use}
-    values = {name: np.moveaxis(each, -1, 1).reshape(len(n), len(QUANTITIES), *bins.shape)
-              for name, each in of_quantities.items()}
-    return values | {name: each.reshape(-1, *bins.shape) for name, each in (
-        ("judged", n), ("looked_for", looked_for), ("solved_rate", solved_rate),
-        ("flip_rate", flip_rate))}
+    values = {"coverage": coverage.T, "use": use.T, "judged": n, "looked_for": looked_for,
+              "solved_rate": solved_rate, "flip_rate": flip_rate}
+    return {name: each.reshape(*each.shape[:-1], *bins.shape) for name, each in values.items()}
 
 
 def _exponents(moments: Floats) -> Values:
     """Return the power of the distance, or of the side, with which sigma goes."""
-    values = np.full((3, len(moments), len(QUANTITIES)), np.nan)
-    for model, k in np.ndindex(*values.shape[1:]):
-        sums = BinSums.of(moments[model], k)
+    values = np.full((3, len(QUANTITIES)), np.nan)
+    for k in range(len(QUANTITIES)):
+        sums = BinSums.of(moments, k)
         axis = 0 if np.ptp(sums.at[:, 0]) > 0.05 or np.ptp(sums.at[:, 1]) < 0.05 else 1
         if np.ptp(sums.at[:, axis]) < 0.05:
             continue
@@ -1059,7 +970,7 @@ def _exponents(moments: Floats) -> Values:
         fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
         metres = 1.0 if axis == 0 and k < 3 else 0.0
         half = DEVIATIONS * 0.5 * math.sqrt(max(fit.log_variance_covariance[0, 0], 0.0))
-        values[:, model, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
+        values[:, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
     return {f"exponent{ending}": each for ending, each in zip(INTERVAL, values, strict=True)}
 
 
@@ -1220,8 +1131,8 @@ def _seen(model: xr.Dataset, at: Floats, *, any_bearing: bool) -> Masks:
         at, weights, low, high = at[:, :-1], weights[free, :-1], low[free], high[free]
         cells = np.asarray(cells.any(axis=-1))
     numbers = tuple(
-        np.searchsorted(model[f"region_{name}"].values[1:], np.exp(value) if (
-            condition.logarithmic) else value, side="right")
+        np.searchsorted(
+            model[f"region_{name}"].values[1:], condition.unscaled(value), side="right")
         for value, (name, condition) in zip(at.T, CONDITIONS.items(), strict=False))
     with np.errstate(invalid="ignore"):
         projected = at @ weights.T

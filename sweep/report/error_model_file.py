@@ -34,7 +34,7 @@ TEMPLATE = Path(__file__).parent / "templates" / "error_model.json"
 #: Variables of the models that the file has of each quantity.
 OF_QUANTITIES = (
     *(f"{name}{end}" for name in ("sigma", "bias", "exponent") for end in INTERVAL), "knots",
-    "coverage", "camera_coverage")
+    "coverage")
 
 #: Of the usual rule for one tag: sigma = 0.02 d² metres.
 RULE_M = 0.02

@@ -247,16 +247,16 @@ def axis_values(
     known = [*AXIS_FORMS, "values"]
     if form not in known or len(table) != 1:
         raise ValueError(f"a list, or a table with one of {', '.join(known)}{nearest(form, known)}")
-    if form in AXIS_FORMS:
-        return _generated(parameter, form, ends, quota)
-    if not isinstance(ends, list):
-        raise ValueError(f"{form} = a list")  # noqa: TRY004  (a fault of the file)
-    if not 0 < len(ends) <= quota:
+    if form not in AXIS_FORMS and not isinstance(ends, list):
+        raise ValueError(f"{form} = a list")
+    if form not in AXIS_FORMS and not 0 < len(ends) <= quota:
         raise ValueError(TOO_MANY if ends else "at least one value")
-    values = tuple(_checked(parameter, value) for value in ends)
-    value, count = collections.Counter(values).most_common(1)[0]
-    if count > 1 and not repeats:
-        raise ValueError(f"each value once ({shown(value)} is repeated)")
+    values = _generated(parameter, form, ends, quota) if form in AXIS_FORMS else tuple(
+        _checked(parameter, value) for value in ends)
+    if not repeats and not isinstance(values, range):
+        value, count = collections.Counter(values).most_common(1)[0]
+        if count > 1:
+            raise ValueError(f"each value once ({shown(value)} is repeated)")
     return values
 
 

@@ -82,6 +82,7 @@ BROKEN = [
     (P + "tilt_deg = 3\n[axes]\ntilt_deg = [0, 1]",
      "axes.tilt_deg = [0, 1]: expected it once: pose.tilt_deg is given too"),
     (P + "[axes]\ntilt_deg = [0, 1, 0.0]", "expected each value once (0.0 is repeated)"),
+    (P + "[axes]\ntilt_deg = { linspace = [1, 1, 2] }", "each value once (1.0 is repeated)"),
     (P + "[axes]\ntilt_deg = { linspce = [0, 1, 3] }",
      "a table with one of range, arange, linspace, geom, values; did you mean linspace?"),
     (P + "[axes]\ntrial = 5",

@@ -898,7 +898,7 @@ def conditions(
         them together holds of none that someone puts up. IDs of markers are no conditions.
     """
     if per is not None:
-        return tuple(per)
+        return kept_dimensions(results, per)
     if found := tuple(name for name in required_per if name in results.dims):
         return found
     axes = [name for name in axes_of(results, Stage.scene)
@@ -1103,11 +1103,12 @@ def requirement_limits(
     rule = stopping_rule(results)
     rule = rule if rule is not None and rule.kind == "along" else None
     require = [require] if isinstance(require, str) and require else require
-    if not require or not along:
-        if rule is None:
-            raise ArgumentError("require" if not require else "along", along,
-                                "this store was not made by sweep limit, so that nothing says it")
+    if rule is not None:
         require, along = require or rule.requirements, along or rule.along
+    if not require:
+        raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
+    if not along:
+        raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
     if rule is not None and along == rule.along:
         per = rule.per if per is None else per
         at_all = rule.at_all if at_all is None else at_all

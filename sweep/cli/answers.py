@@ -149,8 +149,8 @@ def size(
     "--along distance_m --at-all tilt_deg -o limit.svg":
         "finds up to which distance it is at all tilts, with a figure"})
 def limit(
-    pipeline: str, *, settings: Sequence[str] = (), require: Sequence[str] = (), along: str = "",
-    per: Names = None, at_all: Names = None, max_trials: int | None = None,
+    pipeline: str, *, settings: Sequence[str] = (), requirements: Sequence[str] = (),
+    along: str = "", per: Names = None, at_all: Names = None, max_trials: int | None = None,
     store: str | None = None, overwrite: bool = False, workers: int | None = None,
     reuse: Sequence[str] = (), yes: bool = False, scheduler: str | None = None,
     output: str | None = None,
@@ -161,7 +161,7 @@ def limit(
     ----------
     pipeline, settings, overwrite, workers, reuse, yes, scheduler
         As for `run`.
-    require : --require REQUIREMENT
+    requirements : --require REQUIREMENT
         What must hold, in quotes: 'detection >= 0.9'; may be repeated, all hold together (default:
         the section [require] of the file).
     along : --along AXIS
@@ -183,10 +183,10 @@ def limit(
     SESSION.stopped = CONTINUES
     with Child(BLOCK_TASK) as child, library.progress.progress_display() as display:
         limits, summary = library.runner.search_limits(
-            pipeline, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
-            settings=settings, store=store, begin=announce_compilation, workers=workers,
-            scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=display,
-            child=child)
+            pipeline, require=requirements, along=along, per=per, at_all=at_all,
+            max_trials=max_trials, settings=settings, store=store, begin=announce_compilation,
+            workers=workers, scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes,
+            progress=display, child=child)
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if figure is not None:

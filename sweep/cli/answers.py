@@ -19,6 +19,7 @@ from sweep.cli.command import (
     announce_compilation,
     command,
     command_line,
+    detected_line,
     executed,
     findings,
     quiet_matplotlib,
@@ -362,7 +363,7 @@ def photos(
     each = f" with {count} detector settings" if count > 1 else ""
     return summarised(
         summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
-        f"{summary.detected_line}{each}", photographs=prepared.lines)
+        f"{detected_line(summary)}{each}", photographs=prepared.lines)
 
 
 @command("your camera", "pipelines/photographs/README.md", {
@@ -561,7 +562,7 @@ def score(
         scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
         overwrite=overwrite)
     return summarised(
-        summary, f"{summary.poses:,} poses, {summary.detected_line}", answers=scored.lines)
+        summary, f"{summary.poses:,} poses, {detected_line(summary)}", answers=scored.lines)
 
 
 @command("other programs", "pipelines/plugins/README.md", {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import errno
 import inspect
 import io
@@ -17,6 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from sweep import library
@@ -31,7 +31,6 @@ from sweep.errors import (
 from sweep.messages import notice, plain, quoted
 
 if TYPE_CHECKING:
-    from sweep.execution.status import Summary
     from sweep.experiment.pipeline import Pipeline
     from sweep.report.table import Findings
 
@@ -379,7 +378,7 @@ def listed(texts: Sequence[str], more: str) -> list[str]:
 
 def executed(
     pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
-) -> Summary:
+) -> SimpleNamespace:
     """Run a pipeline into a store, after lines on stderr on what it was made of."""
     announce_compilation(pipeline)
     for line in lines:
@@ -390,8 +389,13 @@ def executed(
             pipeline, store, workers=workers, overwrite=overwrite, progress=display)
 
 
+def detected_line(summary: SimpleNamespace) -> str:
+    """Return in words how many of the markers that a run looked for were detected."""
+    return f"detected {summary.detected:,} of {summary.looked_for:,} looked for"
+
+
 def summarised(
-    summary: Summary, line: str, notes: Sequence[str] = (), then: str = "", **numbers: Any
+    summary: SimpleNamespace, line: str, notes: Sequence[str] = (), then: str = "", **numbers: Any
 ) -> Findings:
     """Return the outcome of a run: ``line``, the dataset, warnings, and what to do next."""
     again = [] if summary.computed_blocks or summary.retried else [
@@ -400,7 +404,7 @@ def summarised(
            else "")]
     return findings(
         [*notes, *again, line, f'xarray.open_zarr("{summary.data}")', *summary.warnings],
-        dataclasses.asdict(summary) | numbers, int(summary.nothing_computed),
+        vars(summary) | numbers, int(summary.nothing_computed),
         then or summary.advice or f"sweep report {quoted(summary.store)}")
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 from sweep import library
@@ -16,6 +17,7 @@ from sweep.cli.command import (
     announce_compilation,
     check_png,
     command,
+    detected_line,
     findings,
     listed,
     precision_settings,
@@ -30,7 +32,6 @@ from sweep.messages import byte_count, duration, plain, quoted
 
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection
-    from sweep.execution.forecast import Forecast
     from sweep.experiment.pipeline import Pipeline
     from sweep.experiment.sampling import StoppingRule
     from sweep.integrity.verification import Reproduction
@@ -120,7 +121,7 @@ def run(
                          "has the new ones")
         then = quoted("sweep", "require", summary.store, *words)
     return summarised(
-        summary, f"{poses}, {summary.detected_line}{speed}", notes, then)
+        summary, f"{poses}, {detected_line(summary)}{speed}", notes, then)
 
 
 def _conditions(pipeline: Pipeline) -> list[str]:
@@ -153,8 +154,7 @@ def plan(
     expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
     refused = library.forecast.objections(
-        expected, library.forecast.free_disk(f"runs/{read.name}.zarr"),
-        up_to=read.stopping is not None)
+        read, expected, library.forecast.free_disk(f"runs/{read.name}.zarr"))
     sections = {
         "Camera": [facts.camera_line, *facts.camera_notes],
         "Poses": [facts.pose_line, *facts.pose_notes, *facts.detector_notes, *bound],
@@ -176,7 +176,7 @@ def plan(
         "views": facts.view_ranges,
         "dimensions": {axis.name: len(axis) for axis in read.axes},
         "require": {"all": list(read.requirements), "per": list(read.require_per)},
-        **dataclasses.asdict(expected),
+        **vars(expected),
         "parts": [dataclasses.asdict(part) for part in listed],
     }, 0, quoted("sweep", "run", pipeline, *words))
 
@@ -209,7 +209,7 @@ def _rule_lines(rule: StoppingRule) -> list[str]:
     return lines
 
 
-def _expected(pipeline: Pipeline, expected: Forecast) -> list[str]:
+def _expected(pipeline: Pipeline, expected: SimpleNamespace) -> list[str]:
     """Return poses, results, blocks, bytes, memory and time that a run is expected to take."""
     most = "" if pipeline.stopping is None else "at most "
     poses = f"{most}{expected.poses:,}"
@@ -413,7 +413,7 @@ def status(store: str) -> Findings:
     then = state.advice or f"sweep report {quoted(store)}"
     if not state.finished:
         then = f"sweep {'status' if state.being_written else 'run'} {quoted(store)}"
-    return findings([*lines, *state.warnings], state, 0, then)
+    return findings([*lines, *state.warnings], vars(state), 0, then)
 
 
 @command("experiments", "sweep/integrity/README.md", {

@@ -27,7 +27,7 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.exchange.answers import CORNER_COLUMNS, POSITION, VECTOR
-from sweep.execution.forecast import FreeDisk, free_disk
+from sweep.execution.forecast import free_disk
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
 from sweep.measure.flags import DetectionStatus
@@ -579,10 +579,10 @@ def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) ->
     pages = [-(-len(encoded_image(images, row)) // 4096)
              for row in np.flatnonzero(images.batch.visible).tolist()]
     total = int(count * 4096 * np.mean(pages)) if pages else 0
-    free = free_disk(str(folder)) or FreeDisk(total, None)
-    if total > min(MAX_BYTES, free.bytes) or (free.files is not None and count > free.files):
+    free = free_disk(str(folder))
+    if total > min(MAX_BYTES, free.bytes) or count > free.files:
         raise StoreError(
             f"{plain(folder, 300)}: the export takes about {byte_count(total)} in {count:,} files, "
-            f"and {byte_count(free.bytes)} are free; choose fewer scenes, windows, or confirm it "
-            "with --yes (in Python, yes=True)"
+            f"and {byte_count(int(min(free.bytes, 1e18)))} are free; choose fewer scenes, windows, "
+            "or confirm it with --yes (in Python, yes=True)"
         )

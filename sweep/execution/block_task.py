@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,24 +25,13 @@ from sweep.experiment.grid import TRIAL, Axis, Block
 from sweep.experiment.parameters import Stage, lacking_plugins
 from sweep.experiment.pipeline import Pipeline, file_digest
 from sweep.experiment.sampling import StoppingRule
-from sweep.experiment.schema import Variable
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision
-from sweep.store.blocks import (
-    Receipt,
-    RunStore,
-    begin_block,
-    check_whole,
-    receipt_of,
-    receipts,
-    recorded,
-    region,
-    withdraw_block,
-    write_block,
-)
+from sweep.store import blocks
+from sweep.store.blocks import Receipt, RunStore
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
 from sweep.store.provenance import changes, differences, fingerprint
@@ -52,34 +41,32 @@ from sweep.typing import Masks
 # Where the cells of a new grid lie in an old one: cells agree where all parameter values do.
 #
 # Whether a parameter is fixed, an axis of its own, or goes together with others does not matter:
-# a cell of the new grid gives every parameter a value, and these are looked up in the old grid.
+# a cell of the new grid gives every parameter a value, and these are looked up in the old grid. A
+# parameter that one of the two grids keeps fixed is an axis of one value there.
 
 class Key(NamedTuple):
-    """Parameters that are looked up together, and what finds a row of their values.
+    """An axis of an old grid, what finds a row along it, and the new axes that give the row."""
 
-    Those of an ``axis`` of the old grid: the index along it, None if it has no such row. Or one
-    that the old grid keeps fixed: 0 if it is the same. ``new`` are the new grid's axes that have
-    any of them, and ``fixed`` the values of the others there.
-    """
+    axis: Axis
+    row_of: Callable[[tuple[Any, ...]], int | None]
+    new: list[Axis]
 
-    axis: str | None
-    parameters: tuple[str, ...]
-    find: Callable[[tuple[Any, ...]], int | None]
-    new: tuple[Axis, ...]
-    fixed: Mapping[str, Any]
-
-    def found(self, along: Sequence[range]) -> Iterator[int | None]:
-        """Yield the matching cell for each combination of indices along the new axes, in order."""
-        for chosen in itertools.product(*along):
-            values = dict(self.fixed)
-            for axis, index in zip(self.new, chosen, strict=True):
+    def rows(self, along: Sequence[range]) -> Iterator[int]:
+        """Yield the row, -1 without, at each combination of indices along the new axes."""
+        for indices in itertools.product(*along):
+            values: dict[str, Any] = {}
+            for axis, index in zip(self.new, indices, strict=True):
                 values |= axis.at(index)
-            yield self.find(tuple(values[name] for name in self.parameters))
+            row = self.row_of(tuple(values[name] for name in self.axis.columns))
+            yield -1 if row is None else row
 
 
-def fixed_value(pipeline: Pipeline, name: str) -> Any:
-    """Return a fixed parameter's value; of ``trial`` the first."""
-    return 0 if name == TRIAL else pipeline.fixed.get(name)
+def _axes(pipeline: Pipeline, names: AbstractSet[str]) -> list[Axis]:
+    """Return a pipeline's axes, stage by stage, and an axis of one value for each other name."""
+    own = {name for axis in pipeline.axes for name in axis.columns}
+    fixed = pipeline.fixed | {TRIAL: 0}
+    return [*sorted(pipeline.axes, key=lambda axis: axis.stage),
+            *(Axis(name, {name: (fixed.get(name),)}) for name in sorted(names - own))]
 
 
 def _row_finder(axis: Axis) -> Callable[[tuple[Any, ...]], int | None]:
@@ -97,75 +84,38 @@ class Source:
     ----------
     store
         The old store.
-    new
-        The new grid.
     done
-        Numbers of the old store's committed blocks.
+        Numbers of its committed blocks.
     keys
-        Values that are looked up for each cell.
+        The axes of its grid, and those that only the new one has.
     """
 
     store: RunStore
-    new: Pipeline
-    done: frozenset[int]
-    keys: tuple[Key, ...]
+    done: AbstractSet[int]
+    keys: list[Key]
 
     @staticmethod
-    def of(new: Pipeline, store: RunStore, done: frozenset[int]) -> Source:
+    def of(new: Pipeline, store: RunStore, done: AbstractSet[int]) -> Source:
         """Return how the cells of a new grid are found in a store."""
         old = store.pipeline
-        owned = {name for axis in old.axes for name in axis.columns}
-        looked_up: list[tuple[str | None, tuple[str, ...], Callable[..., int | None]]] = [
-            *((axis.name, tuple(axis.columns), _row_finder(axis)) for axis in old.axes),
-            *((None, (name,), {(fixed_value(old, name),): 0}.get)
-              for axis in new.axes for name in axis.columns if name not in owned),
-        ]
-        return Source(store, new, done, tuple(
-            Key(axis, names, find,
-                tuple(sorted(new.axes_with(names), key=lambda each: each.stage)),
-                {name: fixed_value(new, name) for name in names})
-            for axis, names, find in looked_up))
-
-    def located(
-        self, order: Sequence[str], cuts: Mapping[str, range]
-    ) -> tuple[Masks, dict[str, NDArray[np.intp]]]:
-        """Return which cells of a box of the new grid the old one has, and where.
-
-        Parameters
-        ----------
-        order
-            The new grid's axes, stage by stage, along which the results' dimensions are.
-        cuts
-            The box: axis -> indices.
-
-        Returns
-        -------
-        Whether the old grid has a cell; old axis -> index along it.
-        """
-        shape = tuple(len(cuts[name]) for name in order)
-        exists = np.ones(shape, dtype=bool)
-        indices: dict[str, NDArray[np.intp]] = {}
-        for key in self.keys:
-            names = [axis.name for axis in key.new]
-            at = [-1 if k is None else k for k in key.found([cuts[name] for name in names])]
-            spread = np.array(at).reshape([len(cuts[name]) if name in names else 1
-                                           for name in order])
-            exists &= spread >= 0
-            if key.axis is not None:
-                indices[key.axis] = np.broadcast_to(spread, shape)
-        return exists, indices
+        names = {name for each in (new, old) for axis in each.axes for name in axis.columns}
+        return Source(store, done, [
+            Key(axis, _row_finder(axis), [
+                each for each in _axes(new, names)
+                if not axis.columns.keys().isdisjoint(each.columns)])
+            for axis in _axes(old, names)])
 
     def read(
-        self, variable: Variable, number: int, at: Mapping[str, NDArray[np.intp]]
+        self, name: str, number: int, at: Mapping[str, NDArray[np.intp]]
     ) -> NDArray[Any]:
         """Return a variable of some cells of an old block (cells, inner), by their indices."""
         pipeline, block = self.store.pipeline, self.store.blocks[number]
-        old = next(each for each in self.store.variables if each.name == variable.name)
+        old = next(each for each in self.store.variables if each.name == name)
         starts = dict(zip(
             (axis.name for axis in pipeline.experiment.scene_axes), block.starts, strict=True))
-        part = np.asarray(self.store.array(variable.name)[region(old, pipeline, block)])
-        return variable.fitted(part[tuple(
-            at[name] - starts.get(name, 0) for name in old.dimensions(pipeline) if name in at)])
+        part = np.asarray(self.store.array(name)[blocks.region(old, pipeline, block)])
+        return part[tuple(
+            at[name] - starts.get(name, 0) for name in old.dimensions(pipeline) if name in at)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -178,7 +128,8 @@ class Source:
 #: Flags of cells that are not reused, so that the new store has the reasons of all its failures.
 LOST = {
     "detection": (DetectionStatus.failed, DetectionStatus.crashed),
-    "estimate": (EstimateStatus.failed, EstimateStatus.crashed),
+    "estimate": (EstimateStatus.failed, EstimateStatus.crashed,
+                 EstimateStatus.not_run, EstimateStatus.not_needed),
 }
 
 
@@ -201,15 +152,15 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     present = {variable.name for variable in store.variables}
     lacking = [variable.name for variable in pipeline.experiment.variables
                if variable.name not in present and not variable.drawn_as]
-    source = Source.of(pipeline, store, frozenset(check_whole(store)))
+    source = Source.of(pipeline, store, blocks.check_whole(store))
     agree = (
         not any(changes(theirs, mine)) and pipeline.distributions == old.distributions
         and all(pipeline.fixed[name] == old.fixed[name]
                 for name in pipeline.fixed.keys() & old.fixed.keys())
         # What several new axes give is looked up cell by cell.
-        and all(len(key.new) > 1 or any(
-            index is not None for index in key.found([range(len(axis)) for axis in key.new]))
-            for key in source.keys)
+        and all(sum(len(axis) > 1 for axis in key.new) > 1
+                or any(row >= 0 for row in key.rows([range(len(axis)) for axis in key.new]))
+                for key in source.keys)
     )
     if lacking or not agree:
         lines = [f"{name}: not a variable of the store" for name in lacking]
@@ -226,27 +177,17 @@ def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
         return False
 
 
-@dataclass(slots=True)
-class ReusedCells:
-    """The cells of a block that old stores have.
+def read_cells(
+    pipeline: Pipeline, block: Block, sources: Sequence[Source]
+) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_], set[str]]:
+    """Read a block's reusable cells from old stores; of several, the first that has a cell.
 
-    Attributes
-    ----------
-    values
-        Variable -> values in the dataset's dimensions; fill values in cells that are missing.
-    available
-        (N, detector settings, estimators): the cells that need not be computed.
-    processors
-        Features of the processors that computed the blocks which cells come from.
+    Returns
+    -------
+    Variable -> values in the dataset's dimensions, fill values in cells that are missing; (N,
+    detector settings, estimators) the cells that need not be computed; features of the processors
+    that computed the blocks which cells come from.
     """
-
-    values: dict[str, NDArray[Any]]
-    available: NDArray[np.bool_]
-    processors: set[str]
-
-
-def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
-    """Read a block's reusable cells from old stores; of several, the first that has a cell."""
     settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     # The last axis stands in for a grid without any.
     order = [*(axis.name for axis in (*pipeline.experiment.scene_axes, *settings)), ""]
@@ -264,24 +205,28 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
     available = np.zeros([len(part) for part in parts], dtype=bool)
     processors: set[str] = set()
     for source in sources:
-        exists, at = source.located(order, cuts)
-        blocks, numbers = source.store.blocks, np.zeros(exists.shape, dtype=np.intp)
+        at: dict[str, NDArray[np.intp]] = {}
+        for key in source.keys:
+            along = {axis.name: cuts.get(axis.name, range(1)) for axis in key.new}
+            shape = [len(cuts[name]) if name in along else 1 for name in order]
+            rows = np.array([*key.rows([*along.values()])]).reshape(shape)
+            at[key.axis.name] = np.broadcast_to(rows, available.shape)
+        wanted = ~available & np.all([rows >= 0 for rows in at.values()], axis=0)
+        old, numbers = source.store.blocks, np.zeros(available.shape, dtype=np.intp)
         for axis, extent, count in zip(
-            source.store.pipeline.experiment.scene_axes, blocks.extents, blocks.counts, strict=True
+            source.store.pipeline.experiment.scene_axes, old.extents, old.counts, strict=True
         ):
             numbers = numbers * count + at[axis.name] // extent
         present = {variable.name for variable in source.store.variables}
         taken = np.zeros_like(available)
-        wanted = exists & ~available
-        for number in source.done.intersection(np.unique(numbers[wanted]).tolist()):
+        for number in source.done & {*np.unique(numbers[wanted]).tolist()}:
             cells = np.nonzero(wanted & (numbers == number))
             inside = {name: index[cells] for name, index in at.items()}
-            flags = {v.name: source.read(v, number, inside) for v in variables if v.name in LOST}
             # A cell is finished if its flags say that it was run. With a configuration of a scene
             # (or of a detection), what it shares is copied.
-            ended = ~np.isin(flags["estimate"], (EstimateStatus.not_run, EstimateStatus.not_needed))
-            for name, lost in LOST.items():
-                ended &= ~np.isin(flags[name], lost)
+            ended = ~np.any([
+                np.isin(source.read(name, number, inside), lost) for name, lost in LOST.items()],
+                axis=0)
             inside = {name: index[ended] for name, index in inside.items()}
             finished = tuple(index[ended] for index in cells)
             taken[finished] = True
@@ -289,20 +234,18 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
                 if variable.name in present:
                     target = tuple(finished[order.index(name)]
                                    for name in variable.dimensions(pipeline) if name in order)
-                    values[variable.name][target] = source.read(variable, number, inside)
-        lacking = [variable for variable in variables if variable.name not in present]
+                    values[variable.name][target] = variable.fitted(
+                        source.read(variable.name, number, inside))
         rows = np.flatnonzero(taken.reshape(len(block), -1).any(axis=1))
-        if lacking and len(rows):  # what follows from the parameters alone
-            indices = [index[rows] for index in block.indices()]
-            drawn = pipeline.experiment.scene_values(indices)
-            for v in lacking:
-                values[v.name].reshape(-1)[rows] = drawn[v.drawn_as].broadcast(len(rows))
-        used = np.unique(numbers[taken]).tolist()
-        for _, receipt in receipts(source.store, used):
+        if len(rows):  # what follows from the parameters alone
+            drawn = pipeline.experiment.scene_values(block.indices(rows))
+            for v in variables:
+                if v.name not in present:
+                    values[v.name].reshape(-1)[rows] = drawn[v.drawn_as].broadcast(len(rows))
+        for _, receipt in blocks.receipts(source.store, np.unique(numbers[taken]).tolist()):
             processors.update(receipt.processors)
         available |= taken
-    searches = pipeline.size(Stage.detection)
-    return ReusedCells(values, available.reshape(len(block), searches, -1), processors)
+    return values, available.reshape(len(block), pipeline.size(Stage.detection), -1), processors
 
 
 # --------------------------------------------------------------------------------------------------
@@ -371,33 +314,6 @@ def _decider(url: str, run_id: str, rule: StoppingRule) -> Decider:
     return Decider.of(_opened(url, run_id), rule)
 
 
-def compute_blocks(
-    url: str, run_id: str, blocks: Sequence[Block], decision: Decision | None,
-    reuse: Sequence[str] = (), time_limit_s: float = TIME_LIMIT_S,
-) -> list[Receipt]:
-    """Compute blocks one after another as :func:`compute_block` does.
-
-    Their receipts are returned without the failures, which the store has.
-    """
-    return [
-        dataclasses.replace(
-            compute_block(url, run_id, block, reuse, time_limit_s, decision), failures=())
-        for block in blocks
-    ]
-
-
-@contextlib.contextmanager
-def _local_faults(url: str) -> Iterator[None]:
-    """Raise MachineFaultError for a store that this machine cannot use."""
-    try:
-        with machine_faults_raised():
-            yield
-    except StoreReplacedError:
-        raise
-    except StoreError as error:
-        raise local_fault(str(error).removeprefix(f"{url}: ")) from None
-
-
 def compute_block(
     url: str, run_id: str, block: Block, reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S, decision: Decision | None = None,
@@ -429,38 +345,44 @@ def compute_block(
         If this machine cannot compute the block, or cannot read or write the store; nothing of the
         block is committed. Another machine may be able to.
     """
-    with _local_faults(url):
-        store = _opened(url, run_id)
-        needed, before = np.ones(len(block), dtype=bool), receipt_of(store, block)
-        if before is not None and (decision is None or before.basis == decision.basis):
-            return before  # another process may write the store, too
-        if decision is not None:
-            needed = _decider(url, run_id, decision.rule).needed(block, decision)
-        sources = [_source(url, run_id, old) for old in reuse]
-        if before is not None:
-            done = frozenset([store.blocks.number(block)])
-            sources.insert(0, Source.of(store.pipeline, store, done))
-        begun_before = begin_block(store, block)
-        try:
-            start = time.perf_counter()
-            values, receipt = _computed(
-                store, block, needed, sources, time_limit_s, isolated=begun_before)
-            seconds = receipt.seconds if before is None else {
-                stage: [sum(both) for both in itertools.zip_longest(
-                    before.seconds[stage], spent, fillvalue=0.0)]
-                for stage, spent in receipt.seconds.items()
-            }
-            return write_block(store, block, values, dataclasses.replace(
-                receipt, seconds=seconds, wall_s=time.perf_counter() - start, written=time.time(),
-                basis=None if decision is None else decision.basis))
-        except Exception:
-            if not begun_before:  # it did not end this process
-                withdraw_block(store, block)
-            raise
+    basis = None if decision is None else decision.basis
+    try:
+        with machine_faults_raised():
+            store = _opened(url, run_id)
+            before = blocks.receipt_of(store, block)
+            if before is not None and basis in (None, before.basis):
+                return before  # another process may write the store, too
+            needed = np.ones(len(block), dtype=bool) if decision is None else (
+                _decider(url, run_id, decision.rule).needed(block, decision))
+            sources = [_source(url, run_id, old) for old in reuse]
+            if before is not None:
+                itself = {store.blocks.number(block)}
+                sources.insert(0, Source.of(store.pipeline, store, itself))
+            begun_before = blocks.begin_block(store, block)
+            try:
+                start = time.perf_counter()
+                values, receipt = _computed(
+                    store, block, needed, sources, time_limit_s, isolated=begun_before)
+                seconds = receipt.seconds if before is None else {
+                    stage: [sum(both) for both in itertools.zip_longest(
+                        before.seconds[stage], spent, fillvalue=0.0)]
+                    for stage, spent in receipt.seconds.items()
+                }
+                return blocks.write_block(store, block, values, dataclasses.replace(
+                    receipt, seconds=seconds, wall_s=time.perf_counter() - start,
+                    written=time.time(), basis=basis))
+            except Exception:
+                if not begun_before:  # it did not end this process
+                    blocks.withdraw_block(store, block)
+                raise
+    except StoreReplacedError:
+        raise
+    except StoreError as error:  # one that this machine cannot use
+        raise local_fault(str(error).removeprefix(f"{url}: ")) from None
 
 
 def _computed(
-    store: RunStore, block: Block, needed: NDArray[np.bool_], sources: Sequence[Source],
+    store: RunStore, block: Block, needed: Masks, sources: Sequence[Source],
     time_limit_s: float, *, isolated: bool,
 ) -> tuple[dict[str, NDArray[Any]], Receipt]:
     """Return the values of a block's ``needed`` scenes (N,), and what a receipt tells of them.
@@ -468,32 +390,35 @@ def _computed(
     Cells that a source has are taken from it, the others are computed.
     """
     pipeline = store.pipeline
-    shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
-    need = np.broadcast_to(needed[:, None, None], shape).copy()
-    reused = read_cells(pipeline, block, sources) if sources and need.any() else None
-    processors: set[str] = set() if reused is None else reused.processors
-    if reused is not None:
-        need &= ~reused.available.reshape(shape)
+    values, available, processors = read_cells(
+        pipeline, block, sources if needed.any() else ())
+    need = needed[:, None, None] & ~available
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells = CellsResult.not_run(pipeline.experiment, len(block))
     seconds: dict[str, list[float]] = {stage: [] for stage in cells.seconds}
     if len(rows):
-        indices = [index[rows] for index in block.indices()]
-        some = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
+        some = _compute(pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated)
         for name, columns in some.columns.items():
             cells.columns[name][:, rows] = columns
         seconds, cells.failures = some.seconds, some.failures
         processors.add(processor())
-    values = {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
-              for v in store.variables}
-    if reused is not None:
-        values = {v.name: _merged(v, values, reused) for v in store.variables}
+    computed = {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
+                for v in store.variables}
     lengths = dict(zip(
         (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
     for v in store.variables:
+        # A cell is computed or reused as a whole, as the flag of the variable's stage says.
+        new = computed[v.name]
+        flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(v.stage)
+        if flag is None:
+            missing = np.isnan(new) if v.flags is None else new == v.fill
+        else:
+            missing = computed[flag] == 0
+            missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
         mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
-        values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
+        whole = np.where(missing, values[v.name], new)
+        values[v.name] = np.where(mask, whole, v.not_needed).astype(v.dtype)
     return values, Receipt(
         run_id=store.run_id,
         processors=tuple(sorted(processors)),
@@ -503,12 +428,12 @@ def _computed(
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
         seconds=seconds,
-        failures=recorded(pipeline, block, cells.failures, rows.tolist()),
+        failures=blocks.recorded(pipeline, block, cells.failures, rows.tolist()),
     )
 
 
 def _compute(
-    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_],
+    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks,
     time_limit_s: float, *, isolated: bool,
 ) -> CellsResult:
     """Compute cells in this process, or in a child if that was tried or the block raises.
@@ -528,20 +453,3 @@ def _compute(
         cells = run_cells_isolated(pipeline, indices, need, time_limit_s)
     check_repeatable(pipeline, indices, need, cells, time_limit_s)
     return cells
-
-
-def _merged(
-    variable: Variable, computed: dict[str, NDArray[Any]], reused: ReusedCells
-) -> NDArray[Any]:
-    """Return a variable with the reused values in the cells that were not computed.
-
-    A cell is computed or reused as a whole, as the flag of the variable's stage says.
-    """
-    new, old = computed[variable.name], reused.values[variable.name]
-    flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(variable.stage)
-    if flag is None:
-        missing = new == variable.fill if variable.flags is not None else np.isnan(new)
-    else:
-        missing = computed[flag] == 0
-        missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
-    return np.where(missing, old, new).astype(variable.dtype)

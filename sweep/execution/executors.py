@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Generator, Iterable
+from collections.abc import Collection, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from sweep.errors import StoreReplacedError
-from sweep.evaluation.machine_faults import machine_fault, machine_faults_raised
+from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution import BLOCK_TASK
-from sweep.execution.block_task import compute_blocks
-from sweep.execution.waves import Work
-from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts, explained
+from sweep.execution.block_task import compute_block
+from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts
 from sweep.messages import exception_line, notice
 from sweep.store.blocks import Receipt
 
@@ -28,21 +27,19 @@ from sweep.store.blocks import Receipt
 #: How often a block is tried whose worker dies, or fails by a fault of its machine.
 MAX_ATTEMPTS = 10
 
-
 #: How long no block may be finished before a line says so.
 SILENCE_S = 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """Why work failed.
+class Failed(NamedTuple):
+    """Why a block failed.
 
     Attributes
     ----------
     reason
         In a line.
     machine_fault
-        Whether a machine is at fault, and not the work.
+        Whether a machine is at fault, and not the block.
     died
         Whether the worker's process ended: the block is computed in isolation when it is begun
         again.
@@ -56,24 +53,33 @@ class Failed:
     worker: str = ""
 
 
-def attempted(
-    compute: Callable[..., list[Receipt]], arguments: tuple[Any, ...], worker: str = ""
-) -> list[Receipt] | Failed:
-    """Return the receipts of blocks, which a worker computes, or why there are none.
+def failure(error: Exception, worker: str = "") -> Failed:
+    """Return why a block failed that raised.
 
     Raises
     ------
     StoreReplacedError
-        If the store was moved, deleted or replaced.
+        If the store was moved, deleted or replaced: this one goes on.
+    """
+    if isinstance(error, StoreReplacedError):
+        raise error
+    fault = machine_fault(error)
+    return Failed(str(fault or exception_line(error)), fault is not None, worker=worker)
+
+
+def attempt(arguments: tuple[Any, ...], worker: str = "") -> Receipt | Failed:
+    """Return the receipt of a block, which a worker computes, or why there is none.
+
+    The receipt is without the cells that failed, which the store has.
     """
     try:
-        return compute(*arguments)
-    except StoreReplacedError:
-        raise
+        return dataclasses.replace(compute_block(*arguments), failures=())
     except Exception as error:
-        fault = machine_fault(error)
-        return Failed(exception_line(error) if fault is None else str(fault), fault is not None,
-                      worker=worker)
+        return failure(error, worker)
+
+
+#: A block's number, and the arguments of :func:`compute_block`.
+Task = tuple[int, tuple[Any, ...]]
 
 
 class Executor(ABC):
@@ -88,17 +94,14 @@ class Executor(ABC):
     threads: int
 
     def map(
-        self, works: Iterable[Work], task: Callable[[Work], tuple[Any, ...]], limit_s: float,
-        interrupts: Interrupts,
-    ) -> Generator[tuple[Work, list[Receipt] | Failed]]:
-        """Compute blocks; yield each piece of work with its receipts, or why there are none.
+        self, tasks: Iterable[Task], limit_s: float, interrupts: Interrupts
+    ) -> Generator[tuple[int, Receipt | Failed]]:
+        """Compute blocks; yield the number of each with its receipt, or why there is none.
 
         Parameters
         ----------
-        works
+        tasks
             The blocks.
-        task
-            Gives the arguments of :func:`compute_blocks` for work.
         limit_s
             Block timeout in seconds.
         interrupts
@@ -111,20 +114,20 @@ class Executor(ABC):
         StoreReplacedError
             If the store was moved, deleted or replaced.
         """
-        left, finished = iter(works), SimpleQueue[Any]()
+        left, finished = iter(tasks), SimpleQueue[Any]()
         # Submitted blocks, and how they failed before.
-        out: dict[Any, tuple[Work, list[Failed]]] = {}
+        out: dict[Any, tuple[Task, list[Failed]]] = {}
         last, told_s = time.monotonic(), SILENCE_S
 
-        def begin(work: Work, failures: list[Failed]) -> None:
-            future = self.submit(task(work), failures)
-            out[future] = work, failures
+        def begin(task: Task, failures: list[Failed]) -> None:
+            future = self.submit(task[1], failures)
+            out[future] = task, failures
             future.add_done_callback(finished.put)
 
         try:
             while True:
-                while len(out) < self.room() and (work := next(left, None)) is not None:
-                    begin(work, [])
+                while len(out) < self.room() and (task := next(left, None)) is not None:
+                    begin(task, [])
                 if not out:
                     return
                 interrupts.check()
@@ -138,29 +141,29 @@ class Executor(ABC):
                                f"{self.workers()}; a block ends after at most {limit_s:.0f} s")
                     continue
                 last, told_s = time.monotonic(), SILENCE_S
-                work, failures = out.pop(future)
+                task, failures = out.pop(future)
                 result = self.result(future)
                 if isinstance(result, Failed):
                     failures = [*failures, result]
                     again = result.died or (result.machine_fault and self.elsewhere(failures))
                     if again and len(failures) < MAX_ATTEMPTS:
-                        begin(work, failures)
+                        begin(task, failures)
                         continue
-                yield work, result
+                yield task[0], result
         finally:
             self.cancel(out)
 
     @abstractmethod
     def room(self) -> int:
-        """Return how many tasks may be out now."""
+        """Return how many blocks may be out now."""
 
     @abstractmethod
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
-        """Call :func:`compute_blocks`, rather not where it failed; return a future."""
+        """Call :func:`attempt`, rather not where the block failed; return a future."""
 
     @abstractmethod
-    def result(self, future: Any) -> list[Receipt] | Failed:
-        """Return the receipts of a future that is done, or why there are none."""
+    def result(self, future: Any) -> Receipt | Failed:
+        """Return the receipt of a future that is done, or why there is none."""
 
     @abstractmethod
     def elsewhere(self, failures: list[Failed]) -> bool:
@@ -243,26 +246,28 @@ class Children(Executor):
         del failures
         return self._pool.submit(self._call, arguments)
 
-    def _call(self, arguments: tuple[Any, ...]) -> list[Receipt] | Failed:
+    def _call(self, arguments: tuple[Any, ...]) -> Receipt | Failed:
+        *_, limit_s, _ = arguments
         child = self._idle.get()
         try:
-            # The block keeps its own time limit; this one is for what surrounds it.
-            result = child.call(
-                attempted, compute_blocks, arguments, limit_s=2 * arguments[-1])
-        except ChildDiedError as error:
-            result = Failed(
-                f"its process ended: {explained(error)}", error.from_outside, died=True)
-        try:
+            try:
+                # The block keeps its own time limit; this one is for what surrounds it.
+                result = child.call(attempt, arguments, limit_s=2 * limit_s)
+            except ChildDiedError as error:
+                result = Failed(
+                    f"its process ended: {error.line}", error.from_outside, died=True)
             if isinstance(result, Failed):
-                with machine_faults_raised():
-                    child.restart()
+                child.restart()
+        except Exception as error:  # of a process that cannot be started
+            return failure(error)
         finally:
             self._idle.put(child)
         return result
 
-    def result(self, future: Any) -> list[Receipt] | Failed:
-        """Return the receipts, or why there are none."""
-        return attempted(future.result, ())
+    def result(self, future: Any) -> Receipt | Failed:
+        """Return the receipt, or why there is none."""
+        found: Receipt | Failed = future.result()
+        return found
 
     def elsewhere(self, failures: list[Failed]) -> bool:
         """Return whether this machine failed for the first time."""

@@ -10,8 +10,9 @@ import statistics
 import time
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +23,7 @@ from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import (
-    Child,
-    ChildDiedError,
-    ChildError,
-    default_workers,
-    last_line,
-)
+from sweep.isolation.child_process import Child, ChildDiedError, ChildError, default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
@@ -60,8 +55,7 @@ COMPILATION_LIMIT_S = 900.0
 UNMEASURED_S = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
+class Timing(NamedTuple):
     """The cost of a scene.
 
     Attributes
@@ -100,8 +94,7 @@ def seconds_of(pipeline: Pipeline, count: int) -> tuple[float, int]:
 def _photographs(pipeline: Pipeline) -> Blocks:
     """Return blocks of one photograph, which is searched once, for all its markers."""
     axes = pipeline.experiment.scene_axes
-    lengths = tuple(len(axis) for axis in axes)
-    return Blocks(lengths, tuple(
+    return Blocks(tuple(map(len, axes)), tuple(
         1 if axis.name == TRIAL or "photographs" in axis.columns else len(axis) for axis in axes))
 
 
@@ -152,6 +145,17 @@ def measure(
         if assumed_s is None:
             raise
         return Timing(assumed_s, 0)
+
+
+#: Committed blocks from which the cost of a scene is estimated.
+SAMPLED_RECEIPTS = 100
+
+
+def timing_of(store: RunStore, done: AbstractSet[int]) -> Timing:
+    """Return the cost of a scene of some committed blocks; assumed if there are none."""
+    some = sorted(done)[:SAMPLED_RECEIPTS]
+    spent = [receipt.wall_s / receipt.scenes for _, receipt in receipts(store, some)]
+    return Timing(statistics.fmean(spent or [BLOCK_S / len(store.blocks[0])]), len(spent))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -239,26 +243,23 @@ def blocks_of(
     time_limit_s
         Block timeout in seconds, if the user gave one.
     """
-    axes = pipeline.experiment.scene_axes
-    lengths = tuple(len(axis) for axis in axes)
     if pipeline.shows_photographs:
         return _photographs(pipeline)
+    axes, rule = pipeline.experiment.scene_axes, make_rule(pipeline)
     total_s = pipeline.size(Stage.scene) * scene_s
-    rule = make_rule(pipeline)
     if rule is not None:
         # Writing a block costs as much if few of its scenes are needed.
-        total_s = max(total_s * rule.ends[0] / rule.ends[-1], WAVE_BLOCK_S * BLOCKS_PER_WORKER)
+        total_s = max(total_s * least_share(rule), WAVE_BLOCK_S * BLOCKS_PER_WORKER)
     work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
-    most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1))
-    target = max(min(int(work_s / scene_s), most), 1)
-    blocks = Blocks(lengths, _cut(axes, target, rule))
-    if block_s is None:
+    longest = 0 if block_s is not None else int(longest_block_s(time_limit_s) / scene_s)
+    most = max(min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1)), 1)
+    target = min(max(int(work_s / scene_s), 1), most)
+    while True:
+        blocks = Blocks(tuple(map(len, axes)), _cut(axes, target, rule))
         # Blocks that fit into the axes are smaller than wanted, so that there may be more.
-        most = min(most, int(longest_block_s(time_limit_s) / scene_s))
-        while target < most and len(blocks) > MAX_BLOCKS:
-            target = min(math.ceil(LARGER * target), most)
-            blocks = Blocks(lengths, _cut(axes, target, rule))
-    return blocks
+        if len(blocks) <= MAX_BLOCKS or target >= min(longest, most):
+            return blocks
+        target = min(math.ceil(LARGER * target), longest, most)
 
 
 def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int, ...]:
@@ -277,152 +278,16 @@ def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int,
             order = []
     for k in order:
         most = max(target // math.prod(extents), 1)
-        length = len(axes[k])
-        if most >= length:
-            extents[k] = length
-            continue
         # Equal parts rather than a short last one.
-        extents[k] = -(-length // -(-length // most))
-        break
+        extents[k] = -(-len(axes[k]) // -(-len(axes[k]) // most))
+        if extents[k] < len(axes[k]):
+            break
     return tuple(extents)
 
 
-# --------------------------------------------------------------------------------------------------
-# Time and disk of a run, which is refused if it takes longer than a day, or more than the disk has.
-
-#: Seconds from which on a run has to be confirmed.
-MAX_S = 86_400.0
-
-#: Committed blocks from which the cost of a scene is estimated.
-SAMPLED_RECEIPTS = 100
-
-
-@dataclass(frozen=True, slots=True)
-class Forecast:
-    """The expected cost of a run.
-
-    Attributes
-    ----------
-    poses, results
-        Cells of the scene axes; estimates, which are poses times configurations.
-    block, blocks
-        Scenes of a block along each scene axis; number of blocks.
-    files, bytes
-        Files that the run makes; bytes that it writes, before compression.
-    worker_bytes
-        Memory of a worker.
-    pose_s, sampled
-        Mean seconds a pose, all configurations included; scenes that were measured.
-    over
-        Whether the measurement was abandoned: a pose takes more than ``pose_s``.
-    workers, seconds
-        Number of workers, and how long they would take.
-    least_share
-        Share of the poses that is computed in any case: of a run in waves the first wave. All else
-        is that of all poses.
-    """
-
-    poses: int
-    results: int
-    block: tuple[int, ...]
-    blocks: int
-    files: int
-    bytes: int
-    worker_bytes: int
-    pose_s: float
-    sampled: int
-    over: bool
-    workers: int
-    seconds: float
-    least_share: float
-
-
-def forecast_of(
-    pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int, left: int | None = None
-) -> Forecast:
-    """Return the expected cost of a run; of its time, files and bytes for ``left`` of its blocks.
-
-    A block has a file for each variable, and its receipt.
-    """
-    poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
-    left_poses = math.ceil(poses * left / max(len(blocks), 1))
-    # Of a child that ended, the memory was at most this.
-    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-    return Forecast(
-        poses=poses,
-        results=pipeline.size(*Stage),
-        block=blocks.extents,
-        blocks=len(blocks),
-        files=left * (len(pipeline.experiment.variables) + 1),
-        bytes=pipeline.experiment.bytes_of(left_poses),
-        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
-        pose_s=timing.scene_s,
-        sampled=timing.sampled,
-        over=timing.over,
-        workers=workers,
-        seconds=START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1)),
-        least_share=least_share(pipeline),
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class FreeDisk:
-    """Free space on a disk; ``files`` is None where their number is not limited."""
-
-    bytes: int
-    files: int | None
-
-
-def free_disk(url: str) -> FreeDisk | None:
-    """Return the free space on the disk of a local store; None if it is not known."""
-    if is_remote(url):
-        return None
-    path = Path(url).absolute()
-    with contextlib.suppress(OSError):
-        folder = next(each for each in (path, *path.parents) if each.exists())
-        state = os.statvfs(folder)
-        return FreeDisk(
-            state.f_bavail * state.f_frsize, state.f_favail if state.f_files else None
-        )
-    return None
-
-
-def objections(demand: Forecast, free: FreeDisk | None, *, up_to: bool = False) -> list[str]:
-    """Return why a run has to be confirmed; nothing if it need not be.
-
-    ``up_to``: the demand is the most that it may take.
-    """
-    found, about = [], "up to" if up_to else "about"
-    if demand.seconds > MAX_S:
-        workers = f"{demand.workers} worker{'s' if demand.workers > 1 else ''}"
-        found.append(f"takes {about} {duration(demand.seconds)} with {workers}")
-    if free is not None and demand.bytes > free.bytes:
-        found.append(
-            f"writes {byte_count(demand.bytes)} before compression, and {byte_count(free.bytes)} "
-            "are free"
-        )
-    if free is not None and free.files is not None and demand.files > free.files:
-        found.append(f"makes {demand.files:,} files, and the disk has room for {free.files:,}")
-    return found
-
-
-def check_affordable(url: str, pipeline: Pipeline, demand: Forecast) -> None:
-    """Raise StoreError if a run has to be confirmed.
-
-    A run whose sampling stops is judged by all its trials: how many it needs, nobody knows.
-    """
-    if found := objections(demand, free_disk(url), up_to=pipeline.stopping is not None):
-        raise StoreError(
-            f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
-            "`--yes` (in Python, yes=True)"
-        )
-
-
-def timing_of(store: RunStore, done: AbstractSet[int]) -> Timing:
-    """Return the cost of a scene of some committed blocks; assumed if there are none."""
-    some = sorted(done)[:SAMPLED_RECEIPTS]
-    spent = [receipt.wall_s / receipt.scenes for _, receipt in receipts(store, some)]
-    return Timing(statistics.fmean(spent) if spent else BLOCK_S / len(store.blocks[0]), len(spent))
+def least_share(rule: Stopping | None) -> float:
+    """Return the share of the poses that is computed in any case: in waves, the first wave's."""
+    return 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -435,9 +300,8 @@ PLAN_S = 12.0
 START_S = 1.5
 
 
-
-def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
-    """Return the expected cost of a run; write nothing.
+def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
+    """Return the expected cost of a run, as :func:`forecast_of` does; write nothing.
 
     A seeded sample of scenes is measured in a child process, for a few seconds at most,
     compilation not counted.
@@ -463,18 +327,100 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
             timing = measure(child, pipeline, PLAN_S)
     except ChildError as error:
         raise RunError(
-            f"a measured scene crashed its process ({last_line(error)}); "
+            f"a measured scene crashed its process ({error.line}); "
             "`sweep run` isolates it and computes the others"
         ) from None
-    least = least_share(pipeline) * pipeline.size(Stage.scene) * timing.scene_s
+    least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.scene_s
     here = default_workers()
     count = workers or (1 if least < SMALL_RUN_S else here)
     blocks = blocks_of(pipeline, timing.scene_s, count)
     expected = forecast_of(pipeline, timing, blocks, min(count, here))
-    return replace(expected, workers=count)
+    expected.workers = count
+    return expected
 
 
-def least_share(pipeline: Pipeline) -> float:
-    """Return the share of the poses that is computed in any case: in waves, the first wave's."""
-    rule = make_rule(pipeline)
-    return 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
+def forecast_of(
+    pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int, left: int | None = None
+) -> SimpleNamespace:
+    """Return the expected cost of a run; of its time, files and bytes for ``left`` of its blocks.
+
+    Returns
+    -------
+    ``poses`` and ``results``: cells of the scene axes, and estimates; ``block`` and ``blocks``:
+    scenes of a block along each scene axis, and their number; ``files`` and ``bytes`` (before
+    compression) that the run writes, and ``worker_bytes`` of a worker's memory; ``pose_s``: mean
+    seconds a pose, all configurations included, of so many ``sampled`` ones, and whether the
+    measurement was abandoned since a pose takes ``over`` that; ``workers``, and the ``seconds``
+    that they take; ``least_share`` of the poses that is computed in any case: of a run in waves the
+    first wave. All else is that of all poses.
+    """
+    poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
+    left_poses = math.ceil(poses * left / max(len(blocks), 1))
+    # Of a child that ended, the memory was at most this.
+    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    return SimpleNamespace(
+        poses=poses,
+        results=pipeline.size(*Stage),
+        block=blocks.extents,
+        blocks=len(blocks),
+        files=left * (len(pipeline.experiment.variables) + 1),  # and a receipt
+        bytes=pipeline.experiment.bytes_of(left_poses),
+        worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
+        pose_s=timing.scene_s,
+        sampled=timing.sampled,
+        over=timing.over,
+        workers=workers,
+        seconds=START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1)),
+        least_share=least_share(make_rule(pipeline)),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# A run is refused if it takes longer than a day, or more than the disk has.
+
+#: Seconds from which on a run has to be confirmed.
+MAX_S = 86_400.0
+
+
+class FreeDisk(NamedTuple):
+    """Bytes and files for which a disk has room; infinite if that is not limited, or not known."""
+
+    bytes: float = math.inf
+    files: float = math.inf
+
+
+def free_disk(url: str) -> FreeDisk:
+    """Return the free space on the disk of a local store."""
+    with contextlib.suppress(OSError):
+        if not is_remote(url):
+            path = Path(url).absolute()
+            state = os.statvfs(next(each for each in (path, *path.parents) if each.exists()))
+            return FreeDisk(state.f_bavail * state.f_frsize,
+                            state.f_favail if state.f_files else math.inf)
+    return FreeDisk()
+
+
+def objections(pipeline: Pipeline, demand: SimpleNamespace, free: FreeDisk) -> list[str]:
+    """Return why a run has to be confirmed; nothing if it need not be.
+
+    A run whose sampling stops is judged by all its trials: how many it needs, nobody knows.
+    """
+    found, about = [], "about" if pipeline.stopping is None else "up to"
+    if demand.seconds > MAX_S:
+        workers = f"{demand.workers} worker{'s' if demand.workers > 1 else ''}"
+        found.append(f"takes {about} {duration(demand.seconds)} with {workers}")
+    if demand.bytes > free.bytes:
+        found.append(f"writes {byte_count(demand.bytes)} before compression, and "
+                     f"{byte_count(int(free.bytes))} are free")
+    if demand.files > free.files:
+        found.append(f"makes {demand.files:,} files, and the disk has room for {free.files:,}")
+    return found
+
+
+def check_affordable(url: str, pipeline: Pipeline, demand: SimpleNamespace) -> None:
+    """Raise StoreError if a run has to be confirmed."""
+    if found := objections(pipeline, demand, free_disk(url)):
+        raise StoreError(
+            f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
+            "`--yes` (in Python, yes=True)"
+        )

@@ -9,9 +9,9 @@ import os
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 from urllib.parse import urlsplit
 
 import dask
@@ -19,8 +19,8 @@ from distributed import Client, KilledWorker, LocalCluster, Security, get_worker
 from distributed.core import rpc
 
 from sweep.errors import ArgumentError, RunError, StoreReplacedError
-from sweep.execution.block_task import compute_blocks, other_here
-from sweep.execution.executors import Executor, Failed, attempted
+from sweep.execution.block_task import other_here
+from sweep.execution.executors import Executor, Failed, attempt
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import ADVICE, SINGLE_THREADED, default_workers
 from sweep.messages import exception_line, notice
@@ -77,16 +77,24 @@ def connected(
         If the cluster cannot be used: it does not answer or refuses, has no workers, or a worker
         has other versions; each within a bounded time.
     """
-    argument = "client" if scheduler is None else "scheduler"
-    name = scheduler or _name(client)
+    argument, name = ("client", _name(client)) if scheduler is None else ("scheduler", scheduler)
     own: Any = client
     with contextlib.ExitStack() as stack:
-        if scheduler is None:
-            _check_client(client, name)
-        else:
+        if scheduler is not None:
             stack.enter_context(silenced_dask_loggers())
             own = stack.enter_context(_local_cluster(workers or default_workers())) \
                 if scheduler == LOCAL else _checked_address(scheduler)
+        elif not isinstance(client, (Client, Cluster)):
+            raise ArgumentError(
+                "client", client,
+                "expected a distributed.Client or a cluster object such as LocalCluster; "
+                "the address of a scheduler is given as scheduler")
+        else:
+            state = "asynchronous" if getattr(client, "asynchronous", False) else (
+                getattr(client, "status", "running"))
+            state = getattr(state, "name", state)
+            if state in ("asynchronous", "closing", "closed", "failed"):
+                raise ArgumentError("client", name, f"it is {state}")
         if not isinstance(own, Client):
             try:
                 own = stack.enter_context(Client(own, timeout=ANSWER_S, set_as_default=False))
@@ -124,42 +132,24 @@ def _checked_address(address: str) -> str:
         # Dask's client waits without end for a handshake, so that comes first, and alone; in a
         # thread, since the caller may be in an event loop, as notebooks are.
         with ThreadPoolExecutor(1) as thread:
-            kind = thread.submit(asyncio.run, _kind_of_server(address)).result()
-    except TimeoutError:
-        reason = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
+            thread.submit(asyncio.run, _ask_scheduler(address)).result()
     except Exception as error:
-        reason = (f"expected an address such as tcp://host:8786, or {LOCAL}; "
-                  f"cannot connect: {exception_line(error)}")
-    else:
-        if kind == "Scheduler":
-            return address
-        reason = f"a {kind} answers there, not a scheduler"
-    raise ArgumentError("scheduler", address, reason)
+        raise ArgumentError(
+            "scheduler", address,
+            f"expected an address such as tcp://host:8786, or {LOCAL}; no scheduler answers "
+            f"there within {ANSWER_S:.0f} s: {exception_line(error)}") from None
+    return address
 
 
-async def _kind_of_server(address: str) -> str:
-    """Return the type of server at an address: Scheduler, Worker, Nanny."""
+async def _ask_scheduler(address: str) -> None:
+    """Raise an error if what is at an address does not answer, or is a worker or a nanny."""
     options = Security().get_connection_args("client")
     async with asyncio.timeout(ANSWER_S), rpc(
         address, timeout=2 * ANSWER_S, connection_args=options
     ) as server:
-        return str((await server.identity())["type"])
-
-
-def _check_client(client: Client | Cluster | None, name: str) -> None:
-    """Raise ArgumentError if the caller's client or cluster object cannot be used."""
-    if not isinstance(client, (Client, Cluster)):
-        raise ArgumentError(
-            "client", client,
-            "expected a distributed.Client or a cluster object such as LocalCluster; "
-            "the address of a scheduler is given as scheduler",
-        )
-    if getattr(client, "asynchronous", False):
-        raise ArgumentError("client", name, "it is asynchronous; expected one that is not")
-    state = getattr(client, "status", "running")
-    state = getattr(state, "name", state)
-    if state in ("closing", "closed", "failed"):
-        raise ArgumentError("client", name, f"it is {state}")
+        kind = (await server.identity())["type"]
+    if kind != "Scheduler":
+        raise TypeError(f"a {kind}")
 
 
 def _name(client: object) -> str:
@@ -169,17 +159,11 @@ def _name(client: object) -> str:
     return f"{type(client).__name__}({address})"
 
 
-class Worker(NamedTuple):
-    """A process that is to compute: what it has otherwise than this one, and which it is."""
-
-    other: list[str]
-    process: tuple[str, int]
-    processor: str
-
-
-def this_process(pipeline: Pipeline, begun: dict[str, Any]) -> Worker:
-    """Return the versions and processor that the calling process' numbers depend on."""
-    return Worker(other_here(pipeline, begun), (socket.gethostname(), os.getpid()), processor())
+def this_process(
+    pipeline: Pipeline, begun: dict[str, Any]
+) -> tuple[list[str], tuple[str, int], str]:
+    """Return where the calling process differs from the run's; which it is; its processor."""
+    return other_here(pipeline, begun), (socket.gethostname(), os.getpid()), processor()
 
 
 def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) -> None:
@@ -204,39 +188,32 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
         }
         with contextlib.suppress(TimeoutError), client.as_current():
             wait(list(asked.values()), timeout=WORKERS_S)
-        identities: dict[str, Worker] = {
-            worker: answer.result() for worker, answer in asked.items() if answer.done()}
+        told = {worker: answer.result() for worker, answer in asked.items() if answer.done()}
     except TimeoutError:
         raise ArgumentError(
             argument, name, f"no workers within {WORKERS_S:.0f} s; start some") from None
     except Exception as error:
         raise ArgumentError(
             argument, name, f"its workers cannot run sweep: {exception_line(error)}") from None
-    own = socket.gethostname(), os.getpid()
-    if any(worker.process == own for worker in identities.values()):
+    if any(process == (socket.gethostname(), os.getpid()) for _, process, _ in told.values()):
         raise ArgumentError(
-            argument, name,
-            "its workers are threads of this process, which a scene may end; "
-            "start it with processes=True",
-        )
-    lines = [f"  {address}: {line}" for address, worker in sorted(identities.items())
-             for line in worker.other]
-    if lines:
+            argument, name, "its workers are threads of this process, which a scene may end; "
+            "start it with processes=True")
+    if lines := [f"  {worker}: {line}" for worker, (other, _, _) in sorted(told.items())
+                 for line in other]:
         raise ArgumentError(
-            argument, name,
-            "workers with other versions; install the same everywhere\n" + "\n".join(lines),
-        )
-    used = Counter(worker.processor for worker in identities.values())
-    for line in differing_processors(used, "workers"):
+            argument, name, "\n".join(["workers with other versions; install the same everywhere",
+                                       *lines]))
+    for line in differing_processors(Counter(used for _, _, used in told.values()), "workers"):
         notice(f"warning: {line}")
 
 
 @contextlib.contextmanager
 def silenced_dask_loggers() -> Iterator[None]:
     """Silence the loggers of Dask while the body runs: this package's errors say what matters."""
-    names = [name for name in list(logging.Logger.manager.loggerDict)
-             if name.partition(".")[0] in ("distributed", "tornado", "asyncio")]
-    before = {logger: logger.level for logger in map(logging.getLogger, names)}
+    before = {logging.getLogger(name): logging.getLogger(name).level
+              for name in list(logging.Logger.manager.loggerDict)
+              if name.partition(".")[0] in ("distributed", "tornado", "asyncio")}
     for logger in before:
         logger.setLevel(logging.CRITICAL)
     try:
@@ -324,7 +301,7 @@ class OnCluster(Executor):
         """Give blocks to the cluster: if some workers failed them, to others, best elsewhere."""
         others = self._others(failures) if failures else []
         return self._client.submit(
-            on_worker, compute_blocks, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
+            on_worker, arguments, pure=False, key=f"block-{time.monotonic_ns()}",
             workers=others or None, allow_other_workers=bool(others),
         )
 
@@ -342,12 +319,12 @@ class OnCluster(Executor):
             notice(f"worker {worker}: {failures[-1].reason}; others compute its blocks")
         return bool(self._others(failures))
 
-    def result(self, future: Any) -> list[Receipt] | Failed:
-        """Return the receipts, or why there are none."""
-        status = future.status
+    def result(self, future: Any) -> Receipt | Failed:
+        """Return the receipt, or why there is none."""
+        status, error = future.status, None
         try:
             if status == "finished":
-                return cast("list[Receipt] | Failed", future.result())  # through the scheduler
+                return cast("Receipt | Failed", future.result())  # through the scheduler
             error = future.exception() if status == "error" else None
         except OSError:
             raise RunError(AWAY) from None
@@ -372,8 +349,6 @@ class OnCluster(Executor):
                 self._client.cancel(list(out))
 
 
-def on_worker(
-    compute: Callable[..., list[Receipt]], arguments: tuple[Any, ...]
-) -> list[Receipt] | Failed:
-    """Compute blocks on a worker; return their receipts, or why there are none."""
-    return attempted(compute, arguments, get_worker().address)
+def on_worker(arguments: tuple[Any, ...]) -> Receipt | Failed:
+    """Compute a block on a worker; return its receipt, or why there is none."""
+    return attempt(arguments, get_worker().address)

@@ -50,7 +50,6 @@ class Progress:
             return f"{self.done:,} of {self.total:,} poses"
         return f"{self.settled:,} of {self.conditions:,} conditions done, {self.needed:,} poses"
 
-
     @property
     def share(self) -> tuple[float, float]:
         """How much is done, and of how much."""
@@ -61,24 +60,8 @@ class Progress:
 
 ProgressReport = Callable[[Progress], None]
 
-
 #: Called with the current step, and the share of it that is done.
 StageReport = Callable[[str, float], None]
-
-
-@contextlib.contextmanager
-def stage_display() -> Iterator[StageReport]:
-    """Show the current step on stderr: a bar on a terminal, else a line for each new step."""
-    printed = ""
-
-    def line(what: str, *_: float) -> None:
-        nonlocal printed
-        if what != printed:
-            notice(what)
-            printed = what
-
-    with _display(line) as update:
-        yield lambda what, share: update(what, share, 1.0)
 
 
 @contextlib.contextmanager
@@ -96,15 +79,13 @@ def progress_report(progress: bool | ProgressReport | None) -> Iterator[Progress
     ArgumentError
         If it is none of these.
     """
-    if progress is None or progress is False:
-        yield None
-    elif progress is not True:
-        if not callable(progress):
-            raise ArgumentError("progress", progress, "expected True, False, None or a function")
-        yield progress
-    else:
+    if progress is True:
         with progress_display(ends=True) as display:
             yield display
+    elif callable(progress) or not progress:
+        yield progress or None
+    else:
+        raise ArgumentError("progress", progress, "expected True, False, None or a function")
 
 
 @contextlib.contextmanager
@@ -113,43 +94,42 @@ def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
 
     ``ends``: with a line for the beginning and one for the end, however short the run is.
     """
-    printed_s = -math.inf if ends else time.monotonic()
-
-    def line(what: str, done: float, total: float) -> None:
-        nonlocal printed_s
-        now = time.monotonic()
-        if now > printed_s + LINE_INTERVAL_S or (ends and done == total):
-            notice(what)
-            printed_s = now
-
-    with _display(line) as update:
-        yield lambda progress: update(progress.line, *progress.share)
+    with _display(LINE_INTERVAL_S, ends=ends) as show:
+        yield lambda progress: show(progress.line, *progress.share)
 
 
 @contextlib.contextmanager
-def _display(
-    line: Callable[[str, float, float], None]
-) -> Iterator[Callable[[str, float, float], None]]:
-    """Show what is done, and of how much, on stderr.
+def stage_display() -> Iterator[StageReport]:
+    """Show the current step on stderr: a bar on a terminal, else a line for each new step."""
+    with _display(0.0, ends=True) as show:
+        yield lambda what, share: show(what, share, 1.0)
 
-    On a terminal, that is a bar, which disappears at the end; elsewhere ``line`` is called.
+
+@contextlib.contextmanager
+def _display(every_s: float, *, ends: bool) -> Iterator[Callable[[str, float, float], None]]:
+    """Show what is done, how much of it, and of how much, on stderr.
+
+    On a terminal, that is a bar, which disappears at the end; elsewhere new lines ``every_s``, and
+    with ``ends`` at once and at the end.
     """
     if sys.stderr is None or not sys.stderr.isatty():
+        told, told_s = "", -math.inf if ends else time.monotonic()
+
+        def line(what: str, done: float, total: float) -> None:
+            nonlocal told, told_s
+            now = time.monotonic()
+            if what != told and (now >= told_s + every_s or (ends and done == total)):
+                notice(what)
+                told, told_s = what, now
+
         yield line
         return
-    from rich.console import Console  # noqa: PLC0415  (slow to import)
-    from rich.progress import (  # noqa: PLC0415
-        BarColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.progress import Progress as Bar  # noqa: PLC0415
+    from rich import progress as rich  # noqa: PLC0415  (slow to import)
+    from rich.console import Console  # noqa: PLC0415
 
-    with Bar(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        console=Console(stderr=True), transient=True,
-    ) as bar:
+    columns = (rich.TextColumn("{task.description}"), rich.BarColumn(), rich.TimeElapsedColumn(),
+               rich.TimeRemainingColumn())
+    with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
         yield lambda what, done, total: bar.update(
             task, description=what, completed=done, total=total)

@@ -10,8 +10,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from sweep.errors import (
@@ -21,12 +21,11 @@ from sweep.errors import (
     StoreError,
     StoreReplacedError,
 )
-from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast
+from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast, status
 from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
-from sweep.execution.status import Summary, Totals, close, drop_failed, failed_blocks, summary_of
-from sweep.execution.waves import InWaves, Work, condition_count
+from sweep.execution.waves import InWaves, condition_count
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -68,7 +67,7 @@ def execute(
     time_limit_s: float | None = None,
     progress: ProgressReport | None = None,
     child: Child | None = None,
-) -> Summary:
+) -> SimpleNamespace:
     """Run a pipeline into a store; blocks that are committed there are not computed again.
 
     Parameters
@@ -116,25 +115,25 @@ def execute(
         If blocks failed; the others are in the store, and another run continues.
     """
     started = time.perf_counter()
-    make_rule(pipeline)  # it refuses names that it does not know
+    rule = make_rule(pipeline)  # it refuses names that it does not know
     _check_arguments(workers, scheduler, client, block_s, time_limit_s)
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
     begun = _store_to_continue(url, pipeline, overwrite)
-    again = failed_blocks(begun) if retry_failed and begun is not None else {}
+    again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
     if begun is not None and begun.finished and not (again or stricter):
         blocks.check_whole(begun)
-        return summary_of(begun, {}, time.perf_counter() - started, {})
+        return status.summary_of(begun, {}, time.perf_counter() - started, {})
     for line in pipeline.facts.notes:
         notice(line)
-    if begun is not None and is_written(begun.storage):
-        notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
     done = set() if begun is None else blocks.committed(begun) - again.keys()
     if begun is None:
         check_writable(url)
+    elif is_written(begun.storage):
+        notice(f"{url}: another process is writing it, too: each of the two may compute a block")
 
     with contextlib.ExitStack() as stack:
         child = stack.enter_context(child or Child(BLOCK_TASK))
@@ -146,7 +145,7 @@ def execute(
             timing = forecast.measure(
                 child, pipeline, time_limit_s or TIME_LIMIT_S, assumed_s=forecast.UNMEASURED_S)
             # In waves, nobody knows how much more than the first one is needed.
-            left = forecast.least_share(pipeline)
+            left = forecast.least_share(rule)
         interrupts = stack.enter_context(Interrupts())
         executor: Executor
         if scheduler is not None or client is not None:
@@ -169,11 +168,12 @@ def execute(
         if stricter:
             begun = tighten(begun, pipeline)
         if again:  # once nothing refuses the run
-            begun, again = drop_failed(begun)
+            begun, again = status.drop_failed(begun)
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
-    return summary_of(lifecycle.open_store(url), computed, time.perf_counter() - started, again)
+    return status.summary_of(
+        lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
 
 def recompute(
@@ -276,11 +276,21 @@ def _compute_and_close(
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
-        left = sorted(set(range(len(store.blocks))) - _committed_whole(store))
+        done = blocks.committed(store)
+        missing = blocks.missing_chunks(store, done)
+        for number, key in sorted(missing.items())[:1]:
+            notice(
+                f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of "
+                f"block {number}, as in a copy that was made during a run; they are computed again")
+        for number in missing:
+            blocks.drop_block(store, store.blocks[number])
+        left = sorted(set(range(len(store.blocks))) - (done - missing.keys()))
         computed = compute(store, left, executor, sources, time_limit_s, interrupts, progress)
-        _check_same_rule(store)
+        attributes, _ = lifecycle.read_root(store.url, store.storage)
+        if attributes["pipeline"] != store.pipeline.text:  # as it may be on S3
+            raise StoreError(f"{store.url}: another run has changed when its sampling stops")
         if not store.finished:  # by another process that wrote it, too
-            close(store)
+            status.close(store)
     return computed
 
 
@@ -311,11 +321,8 @@ def compute(
     waves = None if pipeline.stopping is None else InWaves(store, set(numbers))
     conditions = condition_count(pipeline)
     computed: Counter[str] = Counter()
-    failed: list[Failed] = []
-
-    def task(work: Work) -> tuple[Any, ...]:
-        some = [store.blocks[number] for number in work.numbers]
-        return (url, store.run_id, some, work.decision, sources, time_limit_s)
+    failed: list[str] = []
+    machine_faults = 0
 
     def report() -> None:
         if progress is not None:
@@ -325,58 +332,33 @@ def compute(
                     totals.needed, int(waves.settled_share * conditions), conditions))))
 
     done = blocks.committed(store).difference(numbers) if waves is None else waves.current
-    totals = Totals.of(blocks.receipts(store, done))
+    totals = status.Totals.of(blocks.receipts(store, done))
     report()
-    for works in waves or [(Work((number,)) for number in numbers)]:
-        with contextlib.closing(executor.map(works, task, time_limit_s, interrupts)) as results:
-            for work, result in results:
+    for wave in waves or [((number, None) for number in numbers)]:
+        tasks = (
+            (number, (url, store.run_id, store.blocks[number], sources, time_limit_s, decision))
+            for number, decision in wave)
+        with contextlib.closing(executor.map(tasks, time_limit_s, interrupts)) as results:
+            for number, result in results:
                 if isinstance(result, Failed):
-                    block = store.blocks[work.numbers[0]]
-                    failed.append(replace(result, reason=f"block {block}: {result.reason}"))
+                    failed.append(f"block {store.blocks[number]}: {result.reason}")
+                    machine_faults += result.machine_fault
                     if len(failed) >= MAX_FAILED_BLOCKS:
                         break
                     continue
-                for number, receipt in zip(work.numbers, result, strict=True):
-                    if waves is not None:
-                        waves.committed(number, receipt)
-                    computed.update({"blocks": 1, **receipt.computed})
-                    totals.add(receipt)
-                    report()
-        _raise_failed(store.url, failed)
+                if waves is not None:
+                    waves.committed(number, result)
+                computed.update({"blocks": 1, **result.computed})
+                totals.add(result)
+                report()
+        if failed and machine_faults == len(failed):
+            more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
+            raise RunError(f"{store.url}: {failed[0]}{more}")
+        if failed:
+            raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed", *failed]))
     if waves is not None:
         report()
     return computed
-
-
-def _raise_failed(url: str, failed: Sequence[Failed]) -> None:
-    """Raise RunError for blocks that failed; in one line if machines were at fault in all."""
-    if failed and all(each.machine_fault for each in failed):
-        more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
-        raise RunError(f"{url}: {failed[0].reason}{more}")
-    if failed:
-        listed = "\n".join(f"  {each.reason}" for each in failed)
-        raise RunError(f"{url}: {len(failed)} blocks failed\n{listed}")
-
-
-def _check_same_rule(store: RunStore) -> None:
-    """Raise StoreError if another process gave the store another rule, as it may on S3."""
-    attributes, _ = lifecycle.read_root(store.url, store.storage)
-    if attributes["pipeline"] != store.pipeline.text:
-        raise StoreError(f"{store.url}: another run has changed when its sampling stops")
-
-
-def _committed_whole(store: RunStore) -> set[int]:
-    """Return the blocks that are committed; drop those of which chunks are missing, and say so."""
-    done = blocks.committed(store)
-    if missing := blocks.missing_chunks(store, done):
-        number, key = next(iter(missing.items()))
-        notice(
-            f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of block "
-            f"{number}, as in a copy that was made during a run; they are computed again"
-        )
-        for number in missing:
-            blocks.drop_block(store, store.blocks[number])
-    return done - missing.keys()
 
 
 @contextlib.contextmanager
@@ -405,7 +387,7 @@ def search_limits(
     max_trials: int | None = None,
     settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
     begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
-) -> tuple[xr.Dataset, Summary | None]:
+) -> tuple[xr.Dataset, SimpleNamespace | None]:
     """Run a search, and return its limits and the run's summary, None if nothing had to run.
 
     Parameters

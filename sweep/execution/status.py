@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import selection_text
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
-from sweep.messages import plain
+from sweep.messages import plain, quoted
 from sweep.processor import differing_processors
 from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
@@ -48,8 +48,8 @@ class Totals:
         Counts of cells; the flag is the index.
     processors
         Blocks by the features of the processors that computed them.
-    failed, crashed
-        Such cells, at most :data:`MAX_ROWS` of each.
+    lost
+        The cells that "crashed" and that "failed", at most :data:`MAX_ROWS` of each.
     """
 
     blocks: int = 0
@@ -58,8 +58,7 @@ class Totals:
     detection: Integers = field(default_factory=lambda: np.zeros(len(DetectionStatus), np.int64))
     estimate: Integers = field(default_factory=lambda: np.zeros(len(EstimateStatus), np.int64))
     processors: Counter[str] = field(default_factory=Counter)
-    failed: list[FailedCell] = field(default_factory=list)
-    crashed: list[FailedCell] = field(default_factory=list)
+    lost: dict[str, list[FailedCell]] = field(default_factory=lambda: {"crashed": [], "failed": []})
 
     @staticmethod
     def of(receipts: Iterable[tuple[int, Receipt]]) -> Totals:
@@ -78,9 +77,8 @@ class Totals:
         self.detection[: len(receipt.detection)] += receipt.detection
         self.estimate[: len(receipt.estimate)] += receipt.estimate
         for cell in receipt.failures:
-            listed = self.failed if cell.kind == "failed" else self.crashed
-            if len(listed) < MAX_ROWS:
-                listed.append(cell)
+            if len(self.lost[cell.kind]) < MAX_ROWS:
+                self.lost[cell.kind].append(cell)
 
     @staticmethod
     def of_finished(store: RunStore) -> Totals:
@@ -95,18 +93,17 @@ class Totals:
         totals = Totals(
             detection=np.array(counts["detection"]), estimate=np.array(counts["estimate"]),
             processors=Counter(counts["processors"]))
-        if any(totals.lost.values()):
-            listed = Totals.of(blocks.receipts(store, blocks.committed(store)))
-            totals.failed, totals.crashed = listed.failed, listed.crashed
+        if any(lost_counts(totals.detection, totals.estimate).values()):
+            totals.lost = Totals.of(blocks.receipts(store, blocks.committed(store))).lost
         return totals
 
     @property
-    def lost(self) -> dict[str, int]:
-        """How many cells crashed and failed."""
-        return _lost(self.detection, self.estimate)
+    def cells(self) -> list[FailedCell]:
+        """The listed cells, those that failed first."""
+        return self.lost["failed"] + self.lost["crashed"]
 
 
-def _lost(detection: Iterable[int], estimate: Iterable[int]) -> dict[str, int]:
+def lost_counts(detection: Iterable[int], estimate: Iterable[int]) -> dict[str, int]:
     """Return how many cells crashed and failed, from counts by flag."""
     both = _by_name(DetectionStatus, detection) + _by_name(EstimateStatus, estimate)
     return {kind: both[kind] for kind in ("crashed", "failed")}
@@ -139,54 +136,33 @@ NOT_TRIED = (
 _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
-@dataclass(frozen=True, slots=True)
-class FailureGroup:
-    """Cells that failed for the same reason.
-
-    Attributes
-    ----------
-    kind
-        "failed" (an exception was raised) or "crashed" (the process died).
-    stage
-        "scene", "detection" or "estimation".
-    reason
-        Type and message of the first cell's exception, or how its process died.
-    count
-        Recorded cells; a store records 1,000 of each kind.
-    at
-        The first cell, as ``sweep repro --at`` takes it.
-    """
-
-    kind: str
-    stage: str
-    reason: str
-    count: int
-    at: str
-
-
-def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
+def failure_groups(cells: Iterable[FailedCell]) -> list[dict[str, Any]]:
     """Group failed cells by kind, stage, and message without its numbers; the largest first.
+
+    Returns
+    -------
+    Of each group the ``kind``, "failed" or "crashed"; the ``stage``, "scene", "detection" or
+    "estimation"; the ``reason``, type and message of the first cell's exception, or how its process
+    died; the ``count`` of recorded cells, of which a store records 1,000 of each kind; and the
+    first cell, ``at`` as ``sweep repro`` takes it.
 
     Examples
     --------
     >>> cells = [FailedCell(f"trial={n}", "failed", "scene", f"ValueError: {n} px") for n in (3, 8)]
-    >>> [(group.reason, group.count, group.at) for group in failure_groups(cells)]
+    >>> [(group["reason"], group["count"], group["at"]) for group in failure_groups(cells)]
     [('ValueError: 3 px', 2, 'trial=3')]
     """
-    alike: dict[tuple[str, str, str], list[FailedCell]] = {}
+    groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     for cell in cells:
-        key = cell.kind, cell.stage, _VARYING.sub("#", cell.reason)
-        alike.setdefault(key, []).append(cell)
-    groups = [
-        FailureGroup(
-            some[0].kind, some[0].stage, plain(some[0].reason, MAX_REASON), len(some), some[0].at)
-        for some in alike.values()
-    ]
-    return sorted(groups, key=lambda group: -group.count)
+        group = groups.setdefault((cell.kind, cell.stage, _VARYING.sub("#", cell.reason)), {
+            "kind": cell.kind, "stage": cell.stage, "reason": plain(cell.reason, MAX_REASON),
+            "count": 0, "at": cell.at})
+        group["count"] += 1
+    return sorted(groups.values(), key=lambda group: -int(group["count"]))
 
 
 def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
-    """Return the outcome of the cells that a store holds, as `Account` has it.
+    """Return the outcome of the cells that a store holds, as :func:`account_of` has it.
 
     Parameters
     ----------
@@ -197,7 +173,7 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
     first
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
-    groups = failure_groups([*totals.failed, *totals.crashed])
+    groups, repro = failure_groups(totals.cells), f"sweep repro {quoted(url)}"
     shares, warnings, advice = list[float](), list[str](), ""
     counts = {"detections": _by_name(DetectionStatus, totals.detection),
               "estimates": _by_name(EstimateStatus, totals.estimate)}
@@ -214,29 +190,20 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
             percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
             warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
                             f"{tried:,} {cells} ({percent})")
-    warnings += [f"  {group.count:,} x {group.kind} in {group.stage}: {group.reason}"
+    warnings += [f"  {group['count']:,} x {group['kind']} in {group['stage']}: {group['reason']}"
                  for group in groups[:MAX_GROUPS]]
     if others := groups[MAX_GROUPS:]:
-        rest = sum(group.count for group in others)
+        rest = sum(group["count"] for group in others)
         warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
     if groups:
-        advice = repro_command(url, [group.at for group in groups])
+        chosen = [f"--at {quoted(group['at'])}" for group in groups[:MAX_GROUPS] if group["at"]]
+        advice = " ".join([repro, *chosen])
     if 1.0 not in shares and (nothing := _nothing_found(*counts.values())):
         warnings.append(nothing)
-        advice = advice or f"{repro_command(url, [first])} -o scene.png"
+        advice = advice or f"{repro}{f' --at {quoted(first)}' if first else ''} -o scene.png"
     warnings += differing_processors(totals.processors, "blocks")
     return {"nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
             "failures": groups, "warnings": warnings, "advice": advice}
-
-
-def repro_command(url: str, cells: Sequence[str]) -> str:
-    """Return the command that recomputes cells of a store.
-
-    >>> repro_command("runs/a.zarr", ["trial=3", "dictionary=DICT_4X4_50"])
-    'sweep repro runs/a.zarr --at trial=3 --at dictionary=DICT_4X4_50'
-    """
-    chosen = [f"--at {shlex.quote(at)}" for at in cells[:MAX_GROUPS] if at]
-    return " ".join(["sweep repro", shlex.quote(url), *chosen])
 
 
 def _nothing_found(detection: Counter[str], estimate: Counter[str]) -> str:
@@ -288,14 +255,14 @@ def _failure_table(totals: Totals) -> xr.Dataset:
     """Return the table of failures, with the total number of cells of each kind."""
     import xarray as xr  # noqa: PLC0415  (slow to import)
 
-    cells = [*totals.failed, *totals.crashed]
     return xr.Dataset(
-        {name: ("failure", np.array([getattr(cell, name) for cell in cells], dtype=object))
+        {name: ("failure", np.array([getattr(cell, name) for cell in totals.cells], dtype=object))
          for name in ("at", "kind", "stage", "text")},
         attrs={
             "long_name": "scenes that raised or ended their process",
             "rows_kept": f"at most {MAX_ROWS} of each kind, and {blocks.MAX_PER_BLOCK} of a block",
-            **{f"{kind}_cells": count for kind, count in totals.lost.items()},
+            **{f"{kind}_cells": count
+               for kind, count in lost_counts(totals.detection, totals.estimate).items()},
         },
     )
 
@@ -312,14 +279,12 @@ def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -
         ).reshape(len(costs), *map(len, axes)))
         for stage, axes in (("scene", ()), ("detection", settings), ("estimation", both))
     }
-    coordinates = {axis.name: axis.coordinates() for axis in both}
-    return xr.Dataset(
-        seconds,
-        coords={"block": list(costs), **{
-            name: values.astype(object) if values.dtype.kind == "T" else values
-            for name, values in coordinates.items()}},
-        attrs={"long_name": "seconds per stage and treatment for each block"},
-    )
+    coordinates: dict[str, Any] = {"block": list(costs)}
+    for axis in both:
+        values = axis.coordinates()
+        coordinates[axis.name] = values.astype(object) if values.dtype.kind == "T" else values
+    return xr.Dataset(seconds, coordinates,
+                      {"long_name": "seconds per stage and treatment for each block"})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -338,7 +303,7 @@ def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict
     chosen = blocks.committed(store) if numbers is None else numbers
     return {
         number: count for number, receipt in blocks.receipts(store, chosen)
-        if (count := sum(_lost(receipt.detection, receipt.estimate).values()))
+        if (count := sum(lost_counts(receipt.detection, receipt.estimate).values()))
     }
 
 
@@ -369,51 +334,22 @@ def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
 # --------------------------------------------------------------------------------------------------
 # The totals of a store in one record: the summary of a run, and the status of a store.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Account:
-    """What a summary and a status have in common.
-
-    Attributes
-    ----------
-    store
-        The store as it was given, or the default.
-    poses, blocks
-        Cells of the grid's scene axes; blocks of the store.
-    looked_for
-        Detections that count in rates, over all detector settings: what is not visible, not
-        modelled or not needed is not looked for.
-    needed, conditions
-        Of a run in waves, how many of the committed poses were needed, and the conditions; None of
-        a run of fixed trials.
-    nothing_computed
-        Whether a stage was tried and failed on every cell.
-    failed_share
-        Share of the cells that failed or crashed, of those that a stage was tried on; the largest
-        of the stages.
-    failures
-        The cells that failed or crashed, by reason.
-    warnings
-        The same for a reader; that nothing was detected, or no pose estimated; and what may
-        surprise of the pipeline. Empty if there is nothing to tell.
-    advice
-        The command that recomputes one cell of each reason; empty where there is nothing to tell.
-    """
-
-    store: str
-    poses: int
-    blocks: int
-    looked_for: int
-    needed: int | None
-    conditions: int | None
-    nothing_computed: bool
-    failed_share: float
-    failures: list[FailureGroup]
-    warnings: list[str]
-    advice: str
-
-
 def account_of(store: RunStore, totals: Totals, needed: int = 0) -> dict[str, Any]:
-    """Return the fields of an account; ``needed`` is of a run in waves."""
+    """Return what a summary and a status have in common; ``needed`` is of a run in waves.
+
+    Returns
+    -------
+    The ``store`` as it was given; ``poses`` and ``blocks`` of the grid; detections that are
+    ``looked_for``, and so count in rates, over all detector settings: what is not visible, not
+    modelled or not needed is not; of a run in waves, how many of the committed poses were
+    ``needed``, and the number of ``conditions`` (None of a run of fixed trials).
+
+    ``nothing_computed``: whether a stage was tried and failed on every cell; ``failed_share`` of
+    the cells that a stage was tried on, the largest of the stages; ``failures`` by reason
+    (:func:`failure_groups`). ``warnings``: the same for a reader; that nothing was detected, or no
+    pose estimated; what may surprise of the pipeline. ``advice``: the command that recomputes one
+    cell of each reason; empty where there is nothing to tell.
+    """
     pipeline, in_waves = store.pipeline, store.pipeline.stopping is not None
     first = selection_text(pipeline, {axis.name: 0 for axis in pipeline.axes})
     outcome = outcome_of(store.url, totals, first)
@@ -426,52 +362,9 @@ def account_of(store: RunStore, totals: Totals, needed: int = 0) -> dict[str, An
     }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Summary(Account):
-    """The result of a run; ``sweep run --json`` prints it.
-
-    Attributes
-    ----------
-    data
-        What ``xarray.open_zarr`` opens.
-    results
-        Estimates: poses times detector settings times estimators.
-    detected
-        Markers that were detected, over all detector settings.
-    computed_blocks, computed_scenes, computed_estimates
-        What this run computed; the rest was committed before, or reused from other stores.
-    seconds
-        Duration of this run.
-    crashed, failed
-        Cells that are flagged so.
-    retried, recovered
-        Failed and crashed cells that were tried again, and those that did not fail again.
-    unsettled
-        Of a run in waves, conditions that would need more than ``max_trials``.
-    """
-
-    data: str
-    results: int
-    detected: int
-    computed_blocks: int
-    computed_scenes: int
-    computed_estimates: int
-    seconds: float
-    crashed: int
-    failed: int
-    retried: int
-    recovered: int
-    unsettled: int | None
-
-    @property
-    def detected_line(self) -> str:
-        """Detections among the markers that were looked for, in words."""
-        return f"detected {self.detected:,} of {self.looked_for:,} looked for"
-
-
 def summary_of(
     store: RunStore, computed: Mapping[str, int], seconds: float, retried: Mapping[int, int]
-) -> Summary:
+) -> SimpleNamespace:
     """Return the summary of a finished store from the counts that it recorded.
 
     Parameters
@@ -484,6 +377,15 @@ def summary_of(
         Duration of this run.
     retried
         Blocks that were computed again, and how many of their cells had failed.
+
+    Returns
+    -------
+    As `account_of`, with ``crashed`` and ``failed`` cells, ``data`` that ``xarray.open_zarr``
+    opens, the number of ``results`` (poses times detector settings times estimators), of markers
+    ``detected`` over all settings; ``computed_blocks``, ``computed_scenes``,
+    ``computed_estimates``, and the ``seconds`` that this run took; failed cells ``retried``, and
+    those of them ``recovered``; of a run in waves, conditions ``unsettled`` that would need more
+    than ``max_trials``.
 
     Raises
     ------
@@ -500,10 +402,10 @@ def summary_of(
             f"warning: {unsettled:,} of {account['conditions']:,} conditions are not settled after "
             f"all {rule.max_trials:,} trials; the report's table of precision names them")
     tried = sum(retried.values())
-    account |= {f"computed_{what}": computed.get(what, 0)
-                for what in ("blocks", "scenes", "estimates")}
-    return Summary(
-        **account | totals.lost,
+    return SimpleNamespace(
+        **account,
+        **lost_counts(totals.detection, totals.estimate),
+        **{f"computed_{what}": computed.get(what, 0) for what in ("blocks", "scenes", "estimates")},
         data=store.data_url,
         results=math.prod(len(axis) for axis in store.pipeline.axes),
         detected=int(totals.detection[DetectionStatus.detected]),
@@ -521,51 +423,19 @@ RATE_S = 60.0
 RATE_BLOCKS = 10
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Status(Account):
-    """A store's status, from the receipts of its committed blocks.
-
-    Attributes
-    ----------
-    title
-        The pipeline's title or name.
-    finished
-        Whether every block is committed and the store is closed.
-    being_written
-        Whether a process writes it; on S3 also one that was killed less than two minutes ago.
-    blocks_done, poses_done
-        How many blocks and poses are committed.
-    detection, estimate
-        Cells by flag; flags without cells are left out.
-    poses_per_s, seconds_left
-        Rate over the last minute of work; time to the end at that rate. None if unknown, and of a
-        store that nobody writes.
-    crashed, failed
-        Cells whose process died and cells that raised, at most 1,000 of each.
-    settled
-        Of a run in waves, how many of the conditions need no more trials.
-    processors
-        Blocks by the features of the processors that computed them: where there are several, the
-        last digits of results differ from a uniform run's.
-    """
-
-    title: str
-    finished: bool
-    being_written: bool
-    blocks_done: int
-    poses_done: int
-    detection: dict[str, int]
-    estimate: dict[str, int]
-    poses_per_s: float | None
-    seconds_left: float | None
-    crashed: list[FailedCell]
-    failed: list[FailedCell]
-    settled: int | None
-    processors: dict[str, int]
-
-
-def status(url: str) -> Status:
+def status(url: str) -> SimpleNamespace:
     """Return the status of a store, also while it is written.
+
+    Returns
+    -------
+    As `account_of`, with the pipeline's ``title`` or name; whether every block is committed and the
+    store is closed (``finished``), and whether a process writes it (``being_written``), on S3 also
+    one that was killed less than two minutes ago; ``blocks_done`` and ``poses_done``; cells by flag
+    of ``detection`` and ``estimate``, without flags that no cell has; ``poses_per_s`` over the last
+    minute of work, and ``seconds_left`` at that rate, None if unknown and of a store that nobody
+    writes; the cells that ``crashed`` and ``failed``, at most 1,000 of each; of a run in waves, the
+    conditions ``settled`` that need no more trials; blocks by the features of the ``processors``
+    that computed them, which the last digits of results depend on.
 
     Raises
     ------
@@ -583,10 +453,10 @@ def status(url: str) -> Status:
     elif account["conditions"] is not None:
         settled = int(InWaves(store).settled_share * account["conditions"])
     writing = not store.finished and is_written(store.storage)
-    rate = poses_per_second(written)
-    left = account["poses"] - totals.scenes
-    return Status(
+    rate, left = poses_per_second(written), account["poses"] - totals.scenes
+    return SimpleNamespace(
         **account,
+        **totals.lost,
         title=store.pipeline.heading,
         finished=store.finished,
         being_written=writing,
@@ -596,8 +466,6 @@ def status(url: str) -> Status:
         estimate=dict(_by_name(EstimateStatus, totals.estimate)),
         poses_per_s=rate,
         seconds_left=left / rate if rate and writing and settled is None else None,
-        crashed=totals.crashed,
-        failed=totals.failed,
         settled=settled,
         processors=dict(totals.processors),
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import zlib
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +18,8 @@ from sweep.experiment.sampling import StoppingRule, digest_of
 from sweep.sampling.rules import Decider, Decision, Waves, make_rule
 from sweep.store.blocks import Receipt, RunStore, committed, receipts
 
-#: Blocks of which nothing is needed that one task writes.
-SETTLED_AT_ONCE = 64
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """One task: blocks by their numbers, and the inputs that determine their needed scenes.
-
-    Without a decision, all scenes are computed.
-    """
-
-    numbers: tuple[int, ...]
-    decision: Decision | None = None
+#: A block's number, and the inputs that determine its needed scenes: all are without a decision.
+Work = tuple[int, Decision | None]
 
 
 class _Known(NamedTuple):
@@ -63,14 +52,13 @@ class InWaves:
         self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._read = sorted({"detection", *sampling.variables})
-        self._only = only
+        self._only = range(len(store.blocks)) if only is None else only
         self._known: dict[int, _Known] = {}
         self._settled_shares = np.zeros(len(self._waves.groups))
         #: Numbers of the blocks that are committed on the basis that they have now.
         self.current: set[int] = set()
         for number, receipt in receipts(store, committed(store)):
             self.committed(number, receipt)
-        self._groups = [self._of_group(group) for group in range(len(self._waves.groups))]
         self._next = self._next_wave()
 
     @property
@@ -91,34 +79,29 @@ class InWaves:
             receipt.basis, zlib.crc32(content.encode()), receipt.scenes_needed, receipt.scenes)
 
     def _next_wave(self) -> list[Work]:
-        return [work for group in self._groups for work in next(group, ())]
+        return [*itertools.chain(*map(self._of_group, range(len(self._waves.groups))))]
 
-    def _of_group(self, group: int) -> Iterator[list[Work]]:
-        """Yield the work of each wave of a group.
+    def _of_group(self, group: int) -> Iterator[Work]:
+        """Yield the work of the first wave of a group in which there is some.
 
-        In a wave, these are the blocks that are not committed on what follows from the wave
-        before. Once nothing was needed in a wave, all that is left is one wave.
+        These are the blocks that are not committed on what follows from the wave before. Once
+        nothing was needed in a wave, all that is left is one wave.
         """
-        wave, last, settled = 0, len(self._waves.ends) - 1, False
+        last, settled = len(self._waves.ends) - 1, False
         bases: tuple[int, ...] = ()  # for each wave from 1 on what it follows from
         digest = zlib.crc32(digest_of(self._rule).encode())
-        while True:
-            numbers = list(self._waves.numbers(group, wave, last if settled else wave))
+        for wave in itertools.count():
+            numbers = [*self._waves.numbers(group, wave, last if settled else wave)]
             basis = bases[-1] if bases else None
             decision = Decision(self._rule, wave, bases, settled) if bases else None
-            pending = [number for number in numbers
-                       if number not in self._known or self._known[number].basis != basis]
-            self.current.update(set(numbers).difference(pending))
+            pending = {number for number in numbers
+                       if number not in self._known or self._known[number].basis != basis}
+            self.current.update(set(numbers) - pending)
             if pending:
-                allowed = [number for number in pending if self._only is None
-                           or number in self._only or number in self._known]
-                size = SETTLED_AT_ONCE if settled else 1
-                yield [Work(tuple(allowed[at : at + size]), decision)
-                       for at in range(0, len(allowed), size)]
-                if len(allowed) < len(pending):
-                    return
-                self.current.update(pending)
-            found = [self._known.pop(number) for number in numbers]
+                yield from ((number, decision) for number in numbers if number in pending
+                            and (number in self._only or number in self._known))
+                return
+            found = [self._known[number] for number in numbers]
             needed, scenes = sum(each.needed for each in found), sum(each.scenes for each in found)
             ends = settled or wave == last
             self._settled_shares[group] = 1.0 if ends else 1.0 - needed / scenes
@@ -127,7 +110,6 @@ class InWaves:
             digest = zlib.crc32(json.dumps([digest, *(each.content for each in found)]).encode())
             bases = (*bases, digest)
             settled = wave > 0 and needed == 0
-            wave += 1
 
 
 # --------------------------------------------------------------------------------------------------

@@ -45,27 +45,6 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def ending(code: int) -> str:
-    """Return how a process with a return code of `subprocess` ended.
-
-    >>> ending(-11), ending(3)
-    ('SIGSEGV', 'exit status 3')
-    """
-    if code < 0:
-        with contextlib.suppress(ValueError):
-            return signal.Signals(-code).name
-    return f"exit status {code}"
-
-
-def explained(death: object) -> str:
-    """Return how a child process ended; of SIGKILL, what that may mean.
-
-    >>> explained("SIGKILL")
-    'SIGKILL, as where memory runs out: use fewer workers, or give them more memory'
-    """
-    return f"SIGKILL, as where memory runs out: {ADVICE}" if str(death) == "SIGKILL" else str(death)
-
-
 # --------------------------------------------------------------------------------------------------
 # Function calls in a child process, which may crash or never return.
 #
@@ -81,6 +60,12 @@ PARENT_S = 1.0
 
 class ChildError(Exception):
     """A call in a child process has no result."""
+
+    @property
+    def line(self) -> str:
+        """How the process ended, of SIGKILL also what it may mean; of a traceback the last line."""
+        last = str(self).strip().splitlines()[-1]
+        return f"{last}, as where memory runs out: {ADVICE}" if last == "SIGKILL" else last
 
 
 class ChildDiedError(ChildError):
@@ -106,11 +91,6 @@ class ChildDiedError(ChildError):
 
 class ChildRaisedError(ChildError):
     """A call raised in the child process; the message is the traceback."""
-
-
-def last_line(error: ChildError) -> str:
-    """Return how a child process ended, or the line of its traceback that names the exception."""
-    return str(error).strip().splitlines()[-1]
 
 
 Result = TypeVar("Result")
@@ -195,7 +175,8 @@ class Child:
             # The child ends itself with status 1 (`watchdog.ending_after`).
             if took_s >= limit_s + (0.0 if code == 1 else grace_s):
                 raise ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True) from None
-            raise ChildDiedError(ending(code)) from None
+            how = f"exit status {code}" if code >= 0 else signal.Signals(-code).name
+            raise ChildDiedError(how) from None
         finally:
             last.cancel()
             last.join()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +16,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import (
-    Child,
-    ChildDiedError,
-    ChildError,
-    ChildRaisedError,
-    explained,
-    last_line,
-)
+from sweep.isolation.child_process import Child, ChildDiedError, ChildError, ChildRaisedError
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -76,18 +70,19 @@ def _run_held(
 
 
 class _IsolatedCells:
-    """Computes cells of a pipeline in a child process; starts another after a crash.
+    """Computes cells of a pipeline in a child process, which begins again after a crash.
 
     ``cells`` are what has been computed so far; the other arguments are as in
     :func:`run_cells_isolated`.
     """
 
     def __init__(
-        self, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks, limit_s: float
+        self, child: Child, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: Masks,
+        limit_s: float,
     ) -> None:
+        self._child, self._fresh = child, True
         self._pipeline, self._indices, self._need = pipeline, indices, need
         self._limit_s, self._share = limit_s, PART
-        self._child: Child | None = None
         self.cells = CellsResult.not_run(pipeline.experiment, len(need))
 
     def compute(self, rows: NDArray[np.intp]) -> None:
@@ -112,20 +107,20 @@ class _IsolatedCells:
             If a child cannot be started, or raises what no scene's data can cause.
         """
         limit_s = max(share * self._limit_s, MIN_S)
-        if self._child is None:
-            with machine_faults_raised():
-                self._child = Child()
+        if self._fresh:
             try:
                 self._child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except ChildError as error:
                 raise local_fault("a child process ended before it computed anything: "
-                                  f"{explained(last_line(error))}") from None
+                                  f"{error.line}") from None
+            self._fresh = False
             limit_s += min(LOADING * self._limit_s, LOADING_S)
         try:
             return self._child.call(
                 _run_held, [index[rows] for index in self._indices], *masks, limit_s=limit_s)
         except ChildDiedError:
-            self._child = None
+            self._fresh = True
+            self._child.restart()
             raise
 
     def _take(
@@ -160,10 +155,9 @@ class _IsolatedCells:
                 flags["detection"][k][row] = DetectionStatus[lost]
             for j in np.flatnonzero(need[k]).tolist():
                 number = k * need.shape[1] + j
-                if lost:
-                    flags["estimate"][number][row] = EstimateStatus.no_detection
-                    flags["flipped"][number][row] = Flipped.no_estimate
-                elif unsolved := self._lost(Failure(row, "estimation", "", k, j), number):
+                unsolved = "no_detection" if lost else self._lost(
+                    Failure(row, "estimation", "", k, j), number)
+                if unsolved:
                     flags["estimate"][number][row] = EstimateStatus[unsolved]
                     flags["flipped"][number][row] = Flipped.no_estimate
 
@@ -185,34 +179,28 @@ class _IsolatedCells:
             need[0, part.setting, part.estimator] = True
         elif part.setting is not None:
             search[0, part.setting] = True
-        row, deaths, outside = np.array([part.scene]), list[ChildDiedError](), 0
-        while len(deaths) < DEATHS:
+        row, own, outside = np.array([part.scene]), list[str](), list[str]()
+        while len(own) < DEATHS:
             try:
                 computed = self._run(self._share, row, need, search)
             except ChildRaisedError as error:
                 self.cells.failures.append(dataclasses.replace(part, text=str(error)))
                 return "failed"
             except ChildDiedError as death:
-                if not death.from_outside:
-                    deaths.append(death)
-                elif (outside := outside + 1) > 1:
+                (outside if death.from_outside else own).append(death.line)
+                self._share /= 2 if death.timed_out else 1
+                if len(outside) > 1:
                     at = selected(self._pipeline, [int(i[part.scene]) for i in self._indices], part)
                     raise local_fault("two processes that computed one scene were ended by "
-                                      f"{explained(death)}; it is --at {at}") from None
-                if death.timed_out:
-                    self._share /= 2
+                                      f"{death.line}; it is --at {at}") from None
             else:
                 self._take(row, computed, part.stage, number)
                 return ""
-        self.cells.failures.append(dataclasses.replace(part, text=str(deaths[0]), crashed=True))
+        self.cells.failures.append(dataclasses.replace(part, text=own[0], crashed=True))
         return "crashed"
 
-    def close(self) -> None:
-        """End the child process."""
-        if self._child is not None:
-            self._child.close()
 
-
+@machine_faults_raised()
 def run_cells_isolated(
     pipeline: Pipeline,
     indices: Sequence[NDArray[np.intp]],
@@ -243,7 +231,8 @@ def run_cells_isolated(
         If no child process can be started, one raises what no scene's data can cause, or one that
         computes a single scene is ended twice by a signal from outside.
     """
-    with contextlib.closing(_IsolatedCells(pipeline, indices, need, limit_s)) as isolated:
+    with Child() as child:
+        isolated = _IsolatedCells(child, pipeline, indices, need, limit_s)
         isolated.compute(np.arange(len(need)))
         return isolated.cells
 
@@ -281,16 +270,15 @@ def check_repeatable(
     """
     raised = [failure for failure in cells.failures if not failure.crashed]
     scenes = sorted({failure.scene for failure in raised})
-    if not scenes:
-        return
     again = run_cells_isolated(
-        pipeline, [index[scenes] for index in indices], need[scenes], limit_s)
-    repeated = {dataclasses.replace(each, scene=scenes[each.scene], text="")
-                for each in again.failures}
-    for failure in raised:
-        if dataclasses.replace(failure, text="") not in repeated:
+        pipeline, [index[scenes] for index in indices], need[scenes], limit_s).failures \
+        if scenes else []
+    repeated = {(scenes[each.scene], each.stage, each.setting, each.estimator, each.crashed)
+                for each in again}
+    for each in raised:
+        if (each.scene, each.stage, each.setting, each.estimator, False) not in repeated:
             raise local_fault("raised in a scene, but not when that was repeated in another "
-                              f"process: {failure.text.strip().splitlines()[-1]}")
+                              f"process: {each.text.strip().splitlines()[-1]}")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -314,17 +302,17 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
     """
     for plugin in pipeline.plugins:
         try:
-            child.call(use, pipeline, plugin.kind, plugin.name, limit_s=limit_s)
+            child.call(use, pipeline, plugin.name, limit_s=limit_s)
         except ChildError as error:
             ends = ""
             if isinstance(error, ChildDiedError):
                 child.restart()
                 ends = "ends its process before the first pose: "
-            raise PluginError(f"{plugin.kind} {plugin.name}: {ends}{last_line(error)}") from None
+            raise PluginError(f"{plugin.kind} {plugin.name}: {ends}{error.line}") from None
 
 
 @single_threaded()
-def use(pipeline: Pipeline, kind: str, name: str) -> None:
+def use(pipeline: Pipeline, name: str) -> None:
     """Import a plug-in and make it with each of its settings; a detector searches a blank frame.
 
     Raises
@@ -333,19 +321,16 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
         If that cannot be done.
     """
     experiment = pipeline.experiment
-    if kind in ("effect", "renderer"):
+    if any(each.name == name and each.kind in ("effect", "renderer") for each in pipeline.plugins):
         _ = experiment.scene_plugins
     width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
     blank = np.full((height, width), 128, dtype=np.uint8)
-    searches = dict.fromkeys(
-        (setting, dictionary) for setting in experiment.detectors
-        if isinstance(setting, PluginSetting) and (kind, name) == ("detector", setting.plugin.name)
-        for dictionary in pipeline.values_of("dictionary"))
-    for setting, dictionary in list(searches)[:MAX_SETTINGS]:
+    settings: Any = [setting for setting in dict.fromkeys(experiment.detectors)
+                     if isinstance(setting, PluginSetting) and setting.plugin.name == name]
+    searches = itertools.product(settings, pipeline.values_of("dictionary"))
+    for setting, dictionary in itertools.islice(searches, MAX_SETTINGS):
         make_detector(setting)(blank, dictionary, max(width, height))
-    solvers = dict.fromkeys(
-        setting for setting in experiment.estimators
-        if isinstance(setting, PluggedEstimatorSetting) and (kind, name) == (
-            "estimator", setting.solver))
-    for solver in list(solvers)[:MAX_SETTINGS]:
+    solvers = [setting for setting in dict.fromkeys(experiment.estimators)
+               if isinstance(setting, PluggedEstimatorSetting) and setting.solver == name]
+    for solver in solvers[:MAX_SETTINGS]:
         build(solver)

@@ -90,7 +90,7 @@ def measure_tradeoff(
             summary = execute(pipeline, None, progress=display)
         for line in summary.warnings:
             notice(line)
-        store = summary.store
+        store = str(summary.store)
     question: dict[str, str | float] = {"criterion": criterion}
     if budget_ms is not None:
         question["budget_ms"] = budget_ms

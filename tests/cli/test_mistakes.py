@@ -129,7 +129,7 @@ def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.toml").write_text(TEXT)
     monkeypatch.setattr(
-        "sweep.execution.forecast.free_disk", lambda _url: FreeDisk(100, None))
+        "sweep.execution.forecast.free_disk", lambda _url: FreeDisk(100))
     code, out, err = command(*shlex.split("run small.toml"))
     assert (code, out) == (2, "")
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "

@@ -28,9 +28,8 @@ from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreReplac
 from sweep.execution import executors, on_cluster
 from sweep.execution.block_task import other_here
 from sweep.execution.executors import Children
-from sweep.execution.on_cluster import OnCluster, Worker, connected
+from sweep.execution.on_cluster import OnCluster, connected
 from sweep.execution.runner import compute, execute
-from sweep.execution.waves import Work
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.store.lifecycle import create_store, open_store
@@ -101,7 +100,7 @@ def compute_in(store, child):
 @pytest.mark.system
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
-    monkeypatch.setattr(executors, "compute_blocks", suicide)
+    monkeypatch.setattr(executors, "attempt", suicide)
     failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
         compute_in(open_store(undisturbed), Child())
@@ -114,7 +113,7 @@ def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch
     (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
 ])
 def test_block_that_fails_is_named(raised, error, reason, undisturbed, monkeypatch):
-    monkeypatch.setattr(executors, "compute_blocks", mock.Mock(side_effect=raised))
+    monkeypatch.setattr(executors, "compute_block", mock.Mock(side_effect=raised))
     with pytest.raises(error, match=reason):
         compute_in(open_store(undisturbed), Here())
 
@@ -159,7 +158,7 @@ def test_children_end_with_their_client_whatever_ends_it(tmp_path):
 
 def elsewhere(pipeline, begun):
     """Return what a thread says, as if it were another process, of other versions."""
-    return Worker(other_here(pipeline, begun | {"opencv": "0.0"}), ("elsewhere", 1), "AVX2")
+    return other_here(pipeline, begun | {"opencv": "0.0"}), ("elsewhere", 1), "AVX2"
 
 
 def refusal(client, scheduler=None):
@@ -208,7 +207,7 @@ def test_run_without_progress_says_so_once_in_a_while(monkeypatch, capsys):
     end = time.monotonic() + 0.35
     engine.room = lambda: 9 if time.monotonic() < end else pytest.fail("time is up")
     with Interrupts() as interrupts, pytest.raises(pytest.fail.Exception):
-        list(engine.map([Work((0,))], lambda _: (), 7, interrupts))
+        list(engine.map([(0, ())], 7, interrupts))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # after 0.1 s, and after 0.2 s
     assert all("no block was finished for 0 s: 1 are with 2 workers, 1 of them paused by Dask"

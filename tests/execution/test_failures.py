@@ -50,7 +50,8 @@ def outcome(detection, estimate, cells):
     counts = [[given.get(flag.name, 0) for flag in flags]
               for flags, given in ((DetectionStatus, detection), (EstimateStatus, estimate))]
     totals = Totals(
-        detection=np.array(counts[0]), estimate=np.array(counts[1]), failed=cells)
+        detection=np.array(counts[0]), estimate=np.array(counts[1]),
+        lost={"failed": cells, "crashed": []})
     return outcome_of("a b.zarr", totals, "trial=0")
 
 
@@ -67,7 +68,7 @@ def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
     cells += [lost_cell("ValueError: other", "trial=20"), lost_cell("KeyError: 'a'", "trial=21")]
     cells += [lost_cell("ValueError: other", "trial=22", stage="detection")]
     cells += [FailedCell("trial=23", "crashed", "scene", "ended by SIGSEGV")]
-    found = [(group.count, group.kind, group.stage, group.reason, group.at)
+    found = [tuple(group[name] for name in ("count", "kind", "stage", "reason", "at"))
              for group in failure_groups(cells)]
     assert found == [
         (9, "failed", "estimation", "ValueError: pose 0 at 0x7f0000: 0.0 px", "trial=0"),

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from sweep.execution.block_task import compute_block, compute_blocks
+from sweep.execution.block_task import compute_block
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
 from sweep.sampling.rules import block_unit, make_rule
@@ -51,15 +51,12 @@ def by_hand(url, pipeline, extents=None, numbers=None):
 def in_waves(store, most=None):
     """Compute blocks of a store in this process by its pipeline's rule; return how many."""
     waves, count = InWaves(store), 0
-    for work in itertools.chain.from_iterable(waves):
+    for number, decision in itertools.chain.from_iterable(waves):
         if most is not None and count >= most:
             break
-        found = compute_blocks(
-            store.url, store.run_id, [store.blocks[number] for number in work.numbers],
-            work.decision)
-        for number, receipt in zip(work.numbers, found, strict=True):
-            waves.committed(number, receipt)
-            count += 1
+        waves.committed(number, compute_block(
+            store.url, store.run_id, store.blocks[number], decision=decision))
+        count += 1
     return count
 
 

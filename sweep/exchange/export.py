@@ -102,47 +102,45 @@ def encoded_image(images: Images, row: int) -> bytes:
 MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
 
 
-@dataclass(frozen=True, slots=True)
-class FileCamera:
+class FileCamera(NamedTuple):
     """A camera as files have it: frame in pixels, (fx, fy, cx, cy) in px, and coefficients."""
 
     frame: tuple[int, ...]
     view: tuple[float, ...]
     distortion: tuple[float, ...]
 
-    @staticmethod
-    def of(scenes: Scenes, row: int) -> FileCamera:
-        """Return the camera of a scene, with 5, 8, 12 or 14 coefficients."""
-        coefficients = scenes.cameras.lenses[row, :14].tolist()
-        used = int(np.max(np.flatnonzero(coefficients), initial=-1)) + 1
-        count = next(length for length in (5, 8, 12, 14) if length >= used)
-        return FileCamera(
-            tuple(scenes.frame[row].tolist()), tuple(scenes.cameras.view[row].tolist()),
-            tuple(coefficients[:count]))
 
-    def files(self, name: str) -> dict[str, str]:
-        """Return suffix -> text of the files that ``cv::FileStorage`` and ROS read."""
-        fx, fy, cx, cy = self.view
-        opencv = cv2.FileStorage(
-            ".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-        ros: dict[str, Any] = {}
-        for key, length in zip(("image_width", "image_height"), self.frame, strict=True):
-            opencv.write(key, length)
-            ros[key] = length
-        ros |= {"camera_name": name, "distortion_model": MODELS.get(
-            len(self.distortion), "rational_polynomial")}
-        for key, rows in {
-            "camera_matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-            "distortion_coefficients": [self.distortion],
-            "rectification_matrix": np.eye(3),
-            "projection_matrix": [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]],
-        }.items():
-            matrix = np.array(rows, dtype=np.float64)
-            opencv.write(key, matrix)
-            ros[key] = {"rows": len(matrix), "cols": matrix.shape[1],
-                        "data": matrix.ravel().tolist()}
-        return {".opencv.yml": str(opencv.releaseAndGetString()),
-                ".ros.yaml": yaml.safe_dump(ros, sort_keys=False, default_flow_style=None)}
+def camera_of(scenes: Scenes, row: int) -> FileCamera:
+    """Return the camera of a scene, with 5, 8, 12 or 14 coefficients."""
+    coefficients = scenes.cameras.lenses[row, :14].tolist()
+    used = int(np.max(np.flatnonzero(coefficients), initial=-1)) + 1
+    count = next(length for length in (5, 8, 12, 14) if length >= used)
+    return FileCamera(
+        tuple(scenes.frame[row].tolist()), tuple(scenes.cameras.view[row].tolist()),
+        tuple(coefficients[:count]))
+
+
+def camera_files(camera: FileCamera, name: str) -> dict[str, str]:
+    """Return suffix -> text of the files that ``cv::FileStorage`` and ROS read."""
+    fx, fy, cx, cy = camera.view
+    opencv = cv2.FileStorage(
+        ".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    ros: dict[str, Any] = dict(zip(("image_width", "image_height"), camera.frame, strict=True))
+    for key, length in ros.items():
+        opencv.write(key, length)
+    ros |= {"camera_name": name, "distortion_model": MODELS.get(
+        len(camera.distortion), "rational_polynomial")}
+    for key, rows in {
+        "camera_matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+        "distortion_coefficients": [camera.distortion],
+        "rectification_matrix": np.eye(3),
+        "projection_matrix": [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]],
+    }.items():
+        matrix = np.array(rows, dtype=np.float64)
+        opencv.write(key, matrix)
+        ros[key] = {"rows": len(matrix), "cols": matrix.shape[1], "data": matrix.ravel().tolist()}
+    return {".opencv.yml": str(opencv.releaseAndGetString()),
+            ".ros.yaml": yaml.safe_dump(ros, sort_keys=False, default_flow_style=None)}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -194,7 +192,7 @@ def truth_of(images: Images) -> Truth:
         **_columns(("origin_x_px", "origin_y_px"), first),
         **_columns(("fx_px", "fy_px"), view[:, :2]),
         **_columns(("cx_px", "cy_px"), view[:, 2:] - first),
-        "camera": [FileCamera.of(scenes, row) for row in range(len(first))],
+        "camera": [camera_of(scenes, row) for row in range(len(first))],
         "marker_area_px": arrays["marker_area_px"],
     })
     varying = {
@@ -241,10 +239,11 @@ def _dataset(pipeline: Pipeline, arrays: dict[str, NDArray[Any]]) -> xr.Dataset:
         or (each.values is not None  # noqa: PD011  (of an array that is planned)
             and {*each.dimensions} <= {*dims, "corner", "xy", "xyz"})
     ]
-    variables: dict[str, Any] = {}
-    for each in planned:
-        found: Any = arrays.get(each.path, each.values)
-        variables[each.path] = (each.dimensions, np.reshape(found, each.shape), each.attributes)
+    variables: dict[str, Any] = {
+        each.path: (each.dimensions, np.reshape(
+            np.asarray(arrays.get(each.path, each.values)), each.shape), each.attributes)
+        for each in planned
+    }
     variables["image"] = (dims, arrays["image"].reshape(shape), {
         "long_name": "name of the image; empty where the target is not visible"})
     variables["true_corners_px"] = (
@@ -271,39 +270,27 @@ def _coco(squares: pd.DataFrame) -> dict[str, Any]:
     size = squares[["width_px", "height_px"]].to_numpy()[:, None]
     seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=2) & (
         squares[["visible"]].to_numpy() > 0)
-    marker = ["dictionary", "id"]
-    numbered = squares.assign(
-        image_id=squares.groupby("image", sort=False).ngroup(),
-        category_id=squares.groupby(marker, sort=False).ngroup() + 1)
-    annotations = pd.DataFrame({
-        "image_id": numbered["image_id"], "category_id": numbered["category_id"], "iscrowd": 0,
-        "bbox": np.hstack([points.min(axis=1), np.ptp(points, axis=1)]).tolist(),
-        "area": np.abs(signed_areas(points)),
-        "segmentation": points.reshape(-1, 1, 8).tolist(),
-        # COCO's 2: visible.
-        "keypoints": np.dstack([points, 2 * seen]).reshape(-1, 12).tolist(),
-        "num_keypoints": seen.sum(axis=1),
-        "rvec": squares[list(VECTOR)].to_numpy().tolist(),
-        "tvec_m": squares[list(POSITION)].to_numpy().tolist(),
-    })
-    images = numbered.drop_duplicates("image_id")
-    categories = numbered.drop_duplicates("category_id")
-    return {
-        "info": COCO_INFO,
-        "images": [
-            {"id": number, "file_name": f"images/{name}", "width": width, "height": height}
-            for number, name, width, height in images[
-                ["image_id", "image", "width_px", "height_px"]].itertuples(index=False)
-        ],
-        "annotations": [
-            {"id": number} | row for number, row in enumerate(annotations.to_dict("records"))],
-        "categories": [
-            {"id": number, "name": f"{dictionary} {marker_id}", "supercategory": dictionary,
-             "marker_id": marker_id, "keypoints": list(LABELS["corner"])}
-            for number, dictionary, marker_id in categories[
-                ["category_id", *marker]].itertuples(index=False)
-        ],
-    }
+    keypoints = np.dstack([points, 2 * seen]).reshape(-1, 12)  # COCO's 2: visible
+    boxes, areas = np.hstack([points.min(axis=1), np.ptp(points, axis=1)]), signed_areas(points)
+    images: dict[str, Any] = {}
+    categories: dict[tuple[str, int], Any] = {}
+    annotations = []
+    for number, row in enumerate(squares.to_dict("records")):
+        image = images.setdefault(row["image"], {
+            "id": len(images), "file_name": f"images/{row['image']}",
+            "width": row["width_px"], "height": row["height_px"]})
+        category = categories.setdefault((row["dictionary"], row["id"]), {
+            "id": len(categories) + 1, "name": f"{row['dictionary']} {row['id']}",
+            "supercategory": row["dictionary"], "marker_id": row["id"],
+            "keypoints": list(LABELS["corner"])})
+        annotations.append({
+            "id": number, "image_id": image["id"], "category_id": category["id"], "iscrowd": 0,
+            "bbox": boxes[number].tolist(), "area": float(abs(areas[number])),
+            "segmentation": points[number].reshape(1, 8).tolist(),
+            "keypoints": keypoints[number].tolist(), "num_keypoints": int(seen[number].sum()),
+            "rvec": [row[name] for name in VECTOR], "tvec_m": [row[name] for name in POSITION]})
+    return {"info": COCO_INFO, "images": [*images.values()], "annotations": annotations,
+            "categories": [*categories.values()]}
 
 
 def write_truth(pipeline: Pipeline, folder: Path, truths: Sequence[Truth]) -> int:
@@ -323,7 +310,7 @@ def write_truth(pipeline: Pipeline, folder: Path, truths: Sequence[Truth]) -> in
     write_whole(folder / "truth.nc", bytes(dataset.to_netcdf(engine="scipy")))
     (folder / "cameras").mkdir(exist_ok=True)
     for camera, name in cameras.items():
-        for suffix, text in camera.files(name).items():
+        for suffix, text in camera_files(camera, name).items():
             write_whole(folder / "cameras" / f"{name}{suffix}", text.encode())
     return len(cameras)
 

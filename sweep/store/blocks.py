@@ -272,15 +272,14 @@ def recorded(
 
     ``rows`` gives the number within the block of each scene that was computed.
     """
-    kept: dict[str, list[FailedCell]] = {"failed": [], "crashed": []}
-    for failure in failures:
-        kind = "crashed" if failure.crashed else "failed"
-        if len(kept[kind]) < MAX_PER_BLOCK:
-            kept[kind].append(FailedCell(
-                selected(pipeline, block.cell(rows[failure.scene]), failure), kind, failure.stage,
-                failure.text[-MAX_CHARACTERS:],
-            ))
-    return tuple(itertools.chain(*kept.values()))
+    kept: list[FailedCell] = []
+    for kind in ("failed", "crashed"):
+        some = (each for each in failures if each.crashed == (kind == "crashed"))
+        kept += (
+            FailedCell(selected(pipeline, block.cell(rows[each.scene]), each), kind, each.stage,
+                       each.text[-MAX_CHARACTERS:])
+            for each in itertools.islice(some, MAX_PER_BLOCK))
+    return tuple(kept)
 
 
 def selected(pipeline: Pipeline, cell: Sequence[int], failure: Any) -> str:
@@ -314,12 +313,8 @@ RECEIPTS_AT_ONCE = 1000
 
 def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice, ...]:
     """Return a block's part of a variable's array."""
-    slices = {
-        axis.name: slice(start, stop)
-        for axis, start, stop in zip(
-            pipeline.experiment.scene_axes, block.starts, block.stops, strict=True
-        )
-    }
+    axes = (axis.name for axis in pipeline.experiment.scene_axes)
+    slices = dict(zip(axes, map(slice, block.starts, block.stops), strict=True))
     return tuple(slices.get(name, slice(None)) for name in variable.dimensions(pipeline))
 
 

@@ -9,7 +9,7 @@ import os
 import stat
 import tempfile
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -111,23 +111,23 @@ def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[s
             yield key
 
 
+def _listed(keys: AsyncIterator[str]) -> list[str]:
+    async def names() -> list[str]:
+        return [key async for key in keys]
+
+    return sync(names())
+
+
 def list_folder(storage: Store, folder: str) -> list[str]:
     """Return the names in a folder of a storage; none if there is no such folder."""
-    async def names() -> list[str]:
-        return [name async for name in storage.list_dir(folder)]
-
-    try:
-        return sync(names())
-    except FileNotFoundError:
-        return []
+    with contextlib.suppress(FileNotFoundError):
+        return _listed(storage.list_dir(folder))
+    return []
 
 
 def list_files(storage: Store, prefix: str = "") -> list[str]:
     """Return the keys of all files below a prefix."""
-    async def keys() -> list[str]:
-        return [key async for key in storage.list_prefix(prefix)]
-
-    return sync(keys())
+    return _listed(storage.list_prefix(prefix))
 
 
 def files_in(storage: Store) -> dict[str, bytes]:

@@ -37,7 +37,6 @@ from sweep.experiment.schema import (
     VARIABLES,
     fixed_values,
     with_description,
-    with_descriptions,
 )
 from sweep.messages import plain, refusal
 from sweep.model.image_file import IMAGE_SUFFIXES, read_regular
@@ -522,7 +521,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
         each.name for each in (*VARIABLES.values(), *PHOTOGRAPH_SCHEMA)
         if each.name in dataset.data_vars
     ]
-    return with_descriptions(dataset[ordered])
+    return dataset[ordered]
 
 
 def _only_committed(
@@ -536,9 +535,8 @@ def _only_committed(
 
     shown = np.zeros(store.blocks.counts, dtype=bool)
     shown.flat[list(done)] = True
-    for k, (extent, length) in enumerate(
-            zip(store.blocks.extents, store.blocks.lengths, strict=True)):
-        shown = shown.repeat(extent, axis=k).take(range(length), axis=k)
+    shown = shown[np.ix_(*(np.arange(length) // extent for extent, length in zip(
+        store.blocks.extents, store.blocks.lengths, strict=True)))]
     mask = xr.DataArray(shown, dims=[axis.name for axis in store.pipeline.experiment.scene_axes])
     masked = {
         variable.name: dataset[variable.name].where(mask, variable.fill).astype(variable.dtype)

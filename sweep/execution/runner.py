@@ -176,31 +176,6 @@ def execute(
         lifecycle.open_store(url), computed, time.perf_counter() - started, again)
 
 
-def recompute(
-    store: RunStore,
-    numbers: Collection[int],
-    *,
-    workers: int | None = None,
-    time_limit_s: float | None = None,
-) -> None:
-    """Compute blocks of a store that this process holds alone, as :func:`execute` does.
-
-    Raises
-    ------
-    RunError
-        If blocks failed.
-    """
-    _check_arguments(workers, None, None, None, time_limit_s)
-    each_s = forecast.timing_of(store, blocks.committed(store)).scene_s * len(store.blocks[0])
-    limit_s = forecast.block_time_limit_s(time_limit_s, each_s)
-    with (
-        Interrupts() as interrupts, Child(BLOCK_TASK) as child,
-        Children(child, workers or default_workers(), at_once=workers is not None) as executor,
-        _continuable_errors(),
-    ):
-        compute(store, numbers, executor, (), limit_s, interrupts)
-
-
 def _check_arguments(
     workers: int | None, scheduler: str | None, client: object, block_s: float | None,
     time_limit_s: float | None,

@@ -16,7 +16,7 @@ from sweep.errors import ArgumentError, RunError, StoreError, SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import CellsResult, Failure, compare, is_same, to_dataset_layout
 from sweep.execution import TIME_LIMIT_S
-from sweep.execution.runner import recompute
+from sweep.execution.runner import execute
 from sweep.execution.status import close
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import Block
@@ -392,13 +392,15 @@ def report_on(store: RunStore, sample: int) -> IntegrityReport:
 
 
 # --------------------------------------------------------------------------------------------------
-# Repair: damaged blocks are recomputed; if another file is damaged, all others are written again.
+# Repair: damaged blocks are dropped, all other files written again, and a run does the rest.
 
 def repair(
     url: str, sample: int = SAMPLE, *, workers: int | None = None,
     time_limit_s: float | None = None,
 ) -> IntegrityReport:
-    """Verify a store and repair it: exactly the damaged blocks are recomputed.
+    """Verify a store and repair it: exactly the damaged blocks are dropped, and run again.
+
+    Those of an unfinished store are left to the run that continues it.
 
     Parameters
     ----------
@@ -429,18 +431,16 @@ def repair(
     if before.damage == lasting:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
-    if numbers:
-        computable(store)
+    pipeline = computable(store) if numbers else store.pipeline
     with lock.changing(url, store.storage):
-        if any(each.block is None for each in before.damage if each not in lasting):
-            lifecycle.reopen(store)
+        lifecycle.reopen(store)
         store = lifecycle.open_store(url, "r+")
         for number in numbers:
             blocks.drop_block(store, store.blocks[number])
-        if numbers:
-            recompute(store, numbers, workers=workers, time_limit_s=time_limit_s)
-        if before.finished:
+        if before.finished and not numbers:
             close(store)
+    if before.finished and numbers:
+        execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
     after = report_on(lifecycle.open_unchecked(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.unstable, after.damage = before.unstable, after.damage + lasting

@@ -1,4 +1,4 @@
-"""Detectors of other packages as plug-ins: their settings, and their conventions for corners.
+"""Detectors and solvers of other packages as plug-ins: their settings and conventions.
 
 Each module imports its package only when a detector is made. Plug-ins are found by the entry points
 of pyproject.toml; a package that is not installed is reported with the command that installs it.
@@ -6,23 +6,20 @@ of pyproject.toml; a package that is not installed is reported with the command 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-from sweep.plugins import DetectorPlugin
+from sweep.plugins import Plugin
 
-
-def install(extra: str) -> str:
-    """Return the command that installs an extra of ours."""
-    return f"pip install 'fiducial-sweep[{extra}]'"
+Record = TypeVar("Record", bound=Plugin)
 
 
 def adapter(
-    package: str, meaning: str, make: Callable[[Any, str], Callable[[Any], Any]],
-    settings: type[Any], families: Mapping[str, str], *others: str, **conventions: Any,
-) -> DetectorPlugin:
-    """Return the detector of a package that is an extra of ours, and of ``others`` it builds on."""
-    return DetectorPlugin(
-        make=make, settings=settings, meaning=f"{meaning} ({package})", families=families,
-        distribution=(package, *others), install=install(package), **conventions,
-    )
+    record: type[Record], package: str, meaning: str, make: Callable[..., Any],
+    settings: type[Any], **fields: Any,
+) -> Record:
+    """Return the plug-in of a package that is an extra of ours, with other ``fields`` of it."""
+    return record(**{
+        "make": make, "settings": settings, "meaning": f"{meaning} ({package})",
+        "distribution": package, "install": f"pip install 'fiducial-sweep[{package}]'", **fields,
+    })

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sweep.adapters import adapter
-from sweep.plugins import Markers, parameter
+from sweep.plugins import DetectorPlugin, Markers, parameter
 
 LIBRARIES = {f"STAG_HD{distance}": str(distance) for distance in range(11, 25, 2)}
 
@@ -20,29 +20,27 @@ class StagSettings:
 
     error_correction: int = parameter(
         -1, "STag: most wrong bits of a marker that is taken; -1: half of the library's distance",
-        low=-1, high=11,
-    )
+        -1, 11)
 
 
 def make(settings: StagSettings, library: str) -> Callable[[Any], Markers]:
     """Return the search for markers of one library."""
     import stag  # noqa: PLC0415  (optional)
 
-    distance = int(library)
-    most = (distance - 1) // 2
+    most = (int(library) - 1) // 2
     if settings.error_correction > most:
         raise ValueError(
-            f"error_correction = {settings.error_correction}: HD{library} allows at most {most}"
-        )
+            f"error_correction = {settings.error_correction}: HD{library} allows at most {most}")
 
     def search(image: Any) -> Markers:
-        corners, ids, rejected = stag.detectMarkers(image, distance, settings.error_correction)
+        corners, ids, rejected = stag.detectMarkers(
+            image, int(library), settings.error_correction)
         return Markers(
             np.reshape(corners, (-1, 4, 2)), np.ravel(np.asarray(ids, dtype=np.int64)),
-            np.reshape(rejected, (-1, 4, 2)),
-        )
+            np.reshape(rejected, (-1, 4, 2)))
 
     return search
 
 
-DETECTOR = adapter("stag-python", "STag", make, StagSettings, LIBRARIES)
+DETECTOR = adapter(
+    DetectorPlugin, "stag-python", "STag", make, StagSettings, families=LIBRARIES)

@@ -20,7 +20,7 @@ DETECTORS += [(name, "") for name in sys.argv[1:]]
 print("| detector | mean offset, px | beside centres at 0 | beside centres at 0.5 |")
 print("| --- | --- | --- | --- |")
 for name, setting in DETECTORS:
-    offset = check_plugin(name, settings=[setting] if setting else []).numbers["offset_px"]
+    offset = check_plugin(name, settings=[setting] if setting else []).attrs["offset_px"]
     declared = 0.0 if name == "opencv" else getattr(
         load("detector", name, ".")[0], "pixel_center", 0.0)
     x, y = (each + declared for each in offset)

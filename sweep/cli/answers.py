@@ -33,7 +33,8 @@ from sweep.isolation.child_process import Child
 from sweep.messages import byte_count, notice, quoted
 
 if TYPE_CHECKING:
-    from sweep.conformance.check import ConformanceReport
+    import pandas as pd
+
     from sweep.report.table import Findings
 
 
@@ -621,23 +622,20 @@ def _plugin_lines(plugin: dict[str, Any]) -> list[str]:
           for each in plugin["settings"])]
 
 
-def _checked(report: ConformanceReport) -> Findings:
+def _checked(report: pd.DataFrame) -> Findings:
     """Return the findings of a check of a plug-in."""
-    versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    whole = f"{report.kind} {report.name}{f' ({versions})' if versions else ''}"
-    conforms = "conforms" if report.conforms else "does not conform"
-    lines = [f"{whole} on {report.dictionary}: {conforms}",
-             *(f"  {each.verdict:5}  {check:22}  {each.text}"
-               for check, each in report.findings.items())]
-    key = "detector" if report.kind == "detector" else "solver"
-    chosen = shlex.quote(f'{key}="{report.name}"')
+    what = report.attrs
+    versions = ", ".join(f"{name} {version}" for name, version in what["versions"].items())
+    whole = f"{what['kind']} {what['name']}{f' ({versions})' if versions else ''}"
+    conforms = "conforms" if what["conforms"] else "does not conform"
+    lines = [f"{whole} on {what['dictionary']}: {conforms}",
+             *(f"  {verdict:5}  {check:22}  {text}"
+               for check, verdict, text in report.itertuples(index=False))]
+    key = "detector" if what["kind"] == "detector" else "solver"
+    chosen = shlex.quote(f'{key}="{what["name"]}"')
     then = (f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
-    return findings(lines, {
-        "name": report.name, "kind": report.kind, "dictionary": report.dictionary,
-        "versions": report.versions, "conforms": report.conforms, **report.numbers,
-        "findings": [{"check": check, "verdict": each.verdict, "text": each.text}
-                     for check, each in report.findings.items()],
-    }, int(not report.conforms), *(then if report.conforms else ("", "")))
+    return findings(lines, {**what, "findings": report.to_dict("records")},
+                    int(not what["conforms"]), *(then if what["conforms"] else ("", "")))
 
 
 @command("help", "pipelines/README.md", {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, MachineFaultError, PipelineError, PluginError, SweepError
@@ -331,44 +331,10 @@ def _next(number: int, kind: str, pipeline: Pipeline) -> Finding:
     return next(_running[0])
 
 
-@dataclass(frozen=True)
-class ConformanceReport:
-    """The results of all checks of a plug-in.
-
-    Attributes
-    ----------
-    name, kind
-        The plug-in's name, and "detector" or "estimator".
-    dictionary
-        Dictionary of the markers that it was tried on.
-    versions
-        Distributions that it is made of, with versions.
-    findings
-        By the name of the check, in their order; those after one that raises, ends its process or
-        does not return are missing.
-    """
-
-    name: str
-    kind: str
-    dictionary: str
-    versions: dict[str, str]
-    findings: dict[str, Finding]
-
-    @property
-    def conforms(self) -> bool:
-        """Whether no check has found a fault."""
-        return all(finding.verdict != FAULT for finding in self.findings.values())
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """Measurements of the checks: "detected", "offset_px", "rms_px"; "solved"."""
-        return {key: each.numbers[key] for each in self.findings.values() for key in each.numbers}
-
-
 def check_plugin(
     name: str, dictionary: str | None = None, settings: Sequence[str] = (), *,
     folder: str = ".", time_limit_s: float = TIME_LIMIT_S,
-) -> ConformanceReport:
+) -> pd.DataFrame:
     """Try a detector or a solver on 32 noise-free scenes, and on some that it may not expect.
 
     Parameters
@@ -382,6 +348,15 @@ def check_plugin(
         "key=value" with TOML values, as ``--set`` takes them.
     time_limit_s
         A check that takes longer is ended, and no other follows.
+
+    Returns
+    -------
+    DataFrame
+        A row for each check in their order, with the columns "check", "verdict" ("ok", "note" or
+        "fault") and "text"; checks after one that raises, ends its process or does not return are
+        missing. Attributes: "name", "kind" ("detector" or "estimator"), the "dictionary" of the
+        markers, "versions" of the distributions that the plug-in is made of, whether it "conforms",
+        and measurements: "detected", "offset_px", "rms_px"; "solved".
 
     Raises
     ------
@@ -416,4 +391,11 @@ def check_plugin(
                     line = f"the call ended by {line}"
                 findings[check] = Finding(FAULT, line)
                 break
-    return ConformanceReport(name, plugin.kind, dictionary, dict(plugin.versions), findings)
+    report = pd.DataFrame(
+        [(check, *found[:2]) for check, found in findings.items()],
+        columns=["check", "verdict", "text"])
+    report.attrs = {
+        "name": name, "kind": plugin.kind, "dictionary": dictionary,
+        "versions": dict(plugin.versions), "conforms": bool((report["verdict"] != FAULT).all()),
+        **{key: found.numbers[key] for found in findings.values() for key in found.numbers}}
+    return report

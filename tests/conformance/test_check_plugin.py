@@ -71,15 +71,13 @@ def checked(tmp_path):
 
 
 def faults(report):
-    return {check: finding.text for check, finding in report.findings.items()
-            if finding.verdict == "fault"}
+    return report[report.verdict == "fault"].set_index("check").text
 
 
 def test_what_conforms_passes_six_checks(checked):
     report = checked(DETECTOR)
-    assert report.conforms, faults(report)
-    assert [finding.verdict for finding in report.findings.values()] == ["ok"] * 6
-    assert report.numbers["detected"] == 32
+    assert report.verdict.tolist() == ["ok"] * 6, report
+    assert (report.attrs["conforms"], report.attrs["detected"]) == (True, 32)
 
 
 @pytest.mark.parametrize(("source", "body", "check", "named"), [
@@ -109,7 +107,7 @@ def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
 def test_a_crash_or_an_endless_call_ends_the_checks(source, body, check, named, checked):
     report = checked(source, body, child=Child, time_limit_s=2 if "sleep" in body else 60)
     assert named in faults(report)[check]
-    assert [*report.findings][-1] == check
+    assert report.check.iloc[-1] == check
 
 
 @pytest.mark.parametrize(("name", "options", "error", "named"), [

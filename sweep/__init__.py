@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
-    from sweep.fitting.folders import fit
+    from sweep.fitting.fit import fit
     from sweep.report.cost_tables import measure_tradeoff
     from sweep.report.decisions import require
     from sweep.report.reference import reference
@@ -80,7 +80,7 @@ experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported 
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "fit": "folders",
+    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit",
     "measure_tradeoff": "cost_tables", "reference": "reference", "require": "decisions",
     "write_report": "write_report",
 }

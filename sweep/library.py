@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sweep.exchange import answers, export, score
     from sweep.execution import forecast, progress, runner, status
     from sweep.experiment import parameters, pipeline, sampling
-    from sweep.fitting import folders
+    from sweep.fitting import fit
     from sweep.integrity import verification
     from sweep.photographs import prepare, twins
     from sweep.plugins import loading

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,8 +63,7 @@ class Shown(NamedTuple):
         return project(self.camera, in_plane, self.rotation, self.translation)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedMarker:
+class FittedMarker(NamedTuple):
     """The pixels of one marker in one photograph, with its true pose and print.
 
     Attributes
@@ -275,8 +273,7 @@ HIGH = np.array([*[2 * MAX_SHIFT_PX] * CORNERS, np.inf, np.inf, 100.0, 10.0, 0.9
 START = np.array([0.5, 0.0, 0.0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerState:
+class MarkerState(NamedTuple):
     """A marker's and its photograph's parameters, with residuals and slopes of the n fitted pixels.
 
     Attributes

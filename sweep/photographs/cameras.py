@@ -24,7 +24,7 @@ from sweep.model.camera import Cameras
 from sweep.model.image_file import read_regular
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector
-from sweep.photographs.board_view import FoundCorners
+from sweep.photographs.folder import FoundCorners
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -193,8 +193,8 @@ def fitted_board(camera: Calibration, found: FoundCorners) -> FittedPose | None:
 # --------------------------------------------------------------------------------------------------
 # Cameras from files: one camera, or two with the pose of one to the other.
 
-#: Largest deviation of RᵀR from the identity; files have few digits.
-ORTHOGONAL = 1e-3
+#: Largest deviation of R from a rotation matrix; files have few digits.
+ORTHOGONAL = 5e-4
 
 
 class StereoCamera(NamedTuple):
@@ -238,15 +238,14 @@ def stereo_of_file(written: str, size: tuple[int, int]) -> StereoCamera:
     with _reading("stereo", written, "a file with K1, D1, K2, D2, R and T of two cameras"):
         tree = read_tree(read_regular(written, MAX_BYTES))
         left, right = (calibration_of(tree, name) for name in ("1", "2"))
-        rotation = _numbers(tree, "R", 9, "the rotation").reshape(3, 3)
-        translation = _numbers(tree, "T", 3, "the translation, in metres,")
-        error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-        if not error < ORTHOGONAL or np.linalg.det(rotation) < 0:
+        rotation, translation = (_numbers(tree, *each) for each in (("R", (3, 3)), ("T", (3,))))
+        u, _, vt = np.linalg.svd(rotation)
+        nearest = np.asarray(u @ vt)
+        if np.abs(rotation - nearest).max() > ORTHOGONAL or np.linalg.det(nearest) < 0:
             raise ValueError("R: expected a rotation matrix")
     for each in (left, right):
         _check_size("stereo", written, each, size)
-    u, _, vt = np.linalg.svd(rotation)
-    return StereoCamera(left, right, u @ vt, translation)
+    return StereoCamera(left, right, nearest, translation)
 
 
 def covariance_of(calibration: Calibration) -> Floats | None:
@@ -268,19 +267,20 @@ def _reading(argument: str, written: str, expected: str) -> Iterator[None]:
         raise ArgumentError(argument, plain(written), f"expected {expected} ({reason})") from None
 
 
-def _numbers(tree: Any, name: str, count: int, meaning: str) -> Floats:
+def _numbers(tree: Any, name: str, shape: tuple[int, ...]) -> Floats:
     """Return the numbers of a matrix in a file; raises ValueError if they are not there."""
-    value = next((each for key, each in tree.items() if str(key).lower() == name.lower()), None)
-    if isinstance(value, dict):
-        value = value.get("data")
-    with contextlib.suppress(TypeError, ValueError):
-        numbers = np.array(value, dtype=np.float64).ravel()
-        if len(numbers) == count and np.isfinite(numbers).all():
-            return numbers
-    raise ValueError(
-        f"{name}: expected {count} numbers: {meaning} that takes points of the left camera's frame "
-        "to the right one's"
-    )
+    value = {str(key).upper(): each for key, each in tree.items()}.get(name)
+    data = value.get("data") if isinstance(value, dict) else value
+    try:
+        numbers = np.array(data, dtype=np.float64).reshape(shape)
+    except (TypeError, ValueError):
+        numbers = np.full(shape, np.nan)
+    if not np.isfinite(numbers).all():
+        raise ValueError(
+            f"{name}: expected {numbers.size} numbers: R and T, in metres, take points of the left "
+            "camera's frame to the right one's"
+        )
+    return numbers
 
 
 def _check_size(
@@ -332,24 +332,23 @@ def check_resolution(
     found
         The board's corners in each photograph.
     rms_px
-        Their RMS in the median photograph with this camera.
+        Their RMS in the median photograph with this camera; NaN if it is not known.
 
     Raises
     ------
     ArgumentError
         One line.
     """
-    if rms_px < DOUBTFUL_PX:
+    if not rms_px >= DOUBTFUL_PX:
         return
     best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
     own = _median_rms(camera, best)
-    fitting = {scale: _median_rms(scaled(camera, float(scale)), best) for scale in SCALES}
-    scale = min(fitting, key=lambda each: fitting[each])
-    if fitting[scale] < CLEARLY_BETTER * own:
+    least, scale = min((_median_rms(scaled(camera, float(each)), best), each) for each in SCALES)
+    if least < CLEARLY_BETTER * own:
         raise ArgumentError(
             "camera", plain(written),
-            f"the board's corners are {own:.2g} px RMS beside it, and {fitting[scale]:.2g} px if "
-            f"its numbers are times {scale}: it is of another resolution; give the calibration of "
+            f"the board's corners are {own:.2g} px RMS beside it, and {least:.2g} px if its "
+            f"numbers are times {scale}: it is of another resolution; give the calibration of "
             f"{size[0]} x {size[1]}",
         )
 
@@ -428,9 +427,8 @@ def calibrate(
     if fault:
         raise ArgumentError("camera", "calibrate", fault)
     fx, fy, cx, cy, *distortion = made.values.tolist()
-    camera = Calibration(
-        *size, fx, fy, cx, cy, tuple(distortion), tuple(made.std.tolist()), ()
-    )
+    sd = tuple(made.std.tolist())
+    camera = Calibration(*size, fx, fy, cx, cy, tuple(distortion), sd, ())
     numbers = ", ".join(
         f"{name} {value:.1f} ± {sd:.1f}"
         for name, value, sd in zip(("fx", "fy", "cx", "cy"), made.values, made.std, strict=False)

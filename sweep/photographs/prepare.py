@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from sweep.errors import ArgumentError, StoreError
+from sweep.errors import ArgumentError, PipelineError, StoreError
 from sweep.evaluation.opencv_threads import single_threaded
+from sweep.exchange.answers import Conventions, read_answers
+from sweep.experiment.document import section_of
 from sweep.experiment.photographs import (
     SUFFIX,
     PhotographRecord,
@@ -20,30 +24,46 @@ from sweep.experiment.photographs import (
     board_of,
 )
 from sweep.experiment.pipeline import Pipeline
+from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
-from sweep.messages import plain
+from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
+from sweep.messages import plain, refusal
 from sweep.model.board import Board
 from sweep.model.calibration import VIEW, Calibration
 from sweep.model.image_file import Part
-from sweep.photographs.board_view import FoundCorners, check_board, find_corners
+from sweep.model.marker import marker_corners
+from sweep.model.polygon import side_lengths
+from sweep.model.pose import transform_points
 from sweep.photographs.cameras import (
+    MIN_CORNERS,
+    FittedPose,
+    StereoCamera,
     calibrate,
     camera_of_file,
+    cameras_of,
     check_resolution,
+    covariance_of,
+    derivatives,
+    fit_pose,
+    fitted_board,
     stereo_of_file,
 )
 from sweep.photographs.folder import (
     Folder,
+    FoundCorners,
     SeenMarkers,
+    check_board,
     detect_markers,
     fault_of,
+    find_corners,
     named,
+    own_corners,
     read_folder,
     reference_detector,
 )
-from sweep.photographs.truth import board_poses, own_poses, partner_poses, poses_of_file
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
+from sweep.typing import Floats, Masks
 
 PathName = str | os.PathLike[str]
 
@@ -79,7 +99,7 @@ def prepare(
     poses: PathName | None = None,
     stereo: PathName | None = None,
     settings: Sequence[str] = (),
-    home: str | Path = "runs",
+    home: PathName = "runs",
     name: str = "",
     overwrite: bool = False,
     one_camera: bool = False,
@@ -116,43 +136,51 @@ def prepare(
     document = {} if board is None else board_document(Path(board))
     target = None if board is None else board_of(document, plain(board))
     side_by_side = stereo is not None and len(folders) == 1
-    parts = [Part.left, Part.right] if side_by_side else [Part.whole] * len(folders)
-    where = list(folders) * 2 if side_by_side else folders
-    found = [read_folder(Path(each), part) for each, part in zip(where, parts, strict=True)]
+    halves = (Part.left, Part.right) if side_by_side else (Part.whole,)
+    found = [read_folder(Path(folder), part) for folder in folders for part in halves]
     lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
     if stereo is not None:
-        _check_pairs(found)
+        _check_pairs(found[0], found[1])
+    first, place = found[0], Path(home)
     dictionary, sizes, seen = _detected(target, document, str(board), settings, found)
-    sizes_m, first = np.array(list(sizes.values())), found[0]
+    sizes_m = np.array(list(sizes.values()))
     corners = [] if target is None else [
         find_corners(each.image, target, one)
         for each, one in zip(first.photographs, seen[0], strict=True)
     ]
-    if stereo is not None:
-        rig = stereo_of_file(str(stereo), first.size)
+    rig = None if stereo is None else stereo_of_file(str(stereo), first.size)
+    if rig is not None:
         cameras = [rig.left, rig.right]
+    elif str(camera) != CALIBRATE:
+        cameras = [camera_of_file(str(camera), first.size)]
+    elif target is not None:
+        calibration, line = calibrate(first.size, corners)
+        cameras, lines = [calibration], [*lines, line]
     else:
-        calibration, said = _camera(first, camera, corners)
-        rig, cameras, lines = None, [calibration], lines + said
+        raise ArgumentError(
+            "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
+        )
     described = json.dumps(document, sort_keys=True) if document else ""
     records = [
-        _without_truth(folder, part, sizes, described, Path(home))
-        for folder, part in zip(found, parts, strict=True)
-    ][: 1 if one_camera else None]
+        _without_truth(folder, sizes, described, place)
+        for folder in (found[:1] if one_camera else found)
+    ]
     if poses is not None:
         lines += poses_of_file(records[0], Path(poses), cameras[0], sizes_m, seen[0])
     elif target is not None and (rig is None or one_camera):
-        lines += _poses_of_board(records[0], cameras[0], camera, target, corners)
+        rms_px, said = board_poses(records[0], target, cameras[0], corners)
+        if rig is None and str(camera) != CALIBRATE:
+            check_resolution(str(camera), cameras[0], records[0].size, corners, rms_px)
+        lines += said
     elif rig is None:
         own_poses(records[0], cameras[0], sizes_m, seen[0])
     else:
         for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=False)):
             partner_poses(record, one, sizes_m, seen[k], seen[1 - k])
-    lines += _summary(records, first)
-    pipeline = _write_records(
-        records, cameras, dictionary, sizes, settings, Path(home),
-        name or name_of(Path(folders[0])), first, overwrite=overwrite,
-    )
+    lines += _summary(records, first, dictionary)
+    name = name or name_of(Path(folders[0]))
+    _write_records(records, place, name, overwrite=overwrite)
+    pipeline = _experiment(records, cameras, dictionary, sizes, settings, place, name, first)
     known = sum(int(each.shown.sum()) for each in records)
     return Prepared(pipeline, tuple(lines), len(first.photographs), known)
 
@@ -186,35 +214,29 @@ def name_of(folder: Path) -> str:
 def _check_arguments(
     folders: Sequence[PathName], camera: PathName | None, poses: object, stereo: object
 ) -> None:
-    most = 1 if stereo is None else 2
-    several = ", or those of the left and the right camera" if most == 2 else ""
-    faults = (
-        (stereo is not None and poses is not None, "poses", poses,
-         "expected one truth; delete poses or stereo"),
-        (stereo is not None and camera is not None, "camera", camera,
-         "expected none beside stereo, whose file has both cameras"),
-        (stereo is None and camera is None, "camera", "none",
-         f"expected the file of a calibration, or {CALIBRATE}"),
-        (not 1 <= len(folders) <= most, "folders", ", ".join(map(str, folders)),
-         f"expected one folder{several}"),
-    )
-    for holds, argument, value, reason in faults:
-        if holds:
-            raise ArgumentError(argument, value, reason)
+    fault: tuple[str, object, str] | None = None
+    if stereo is not None and poses is not None:
+        fault = "poses", poses, "expected one truth; delete poses or stereo"
+    elif stereo is not None and camera is not None:
+        fault = "camera", camera, "expected none beside stereo, whose file has both cameras"
+    elif stereo is None and camera is None:
+        fault = "camera", "none", f"expected the file of a calibration, or {CALIBRATE}"
+    elif not 1 <= len(folders) <= (1 if stereo is None else 2):
+        fault = "folders", ", ".join(map(str, folders)), "expected one, or with stereo one or two"
+    if fault:
+        raise ArgumentError(*fault)
 
 
-def _check_pairs(found: Sequence[Folder]) -> None:
+def _check_pairs(left: Folder, right: Folder) -> None:
     """Demand photographs of the same names and sizes of both cameras."""
-    left, right = ({each.path.name for each in folder.photographs} for folder in found)
-    if left != right:
+    odd = {(each.path.name, *each.image.shape) for each in left.photographs} ^ {
+        (each.path.name, *each.image.shape) for each in right.photographs
+    }
+    if odd:
+        name, height, width = min(odd)
         raise ArgumentError(
-            "folders", plain(min(left ^ right)), "expected the same names of both cameras' "
-            "photographs; it is in one folder alone",
-        )
-    if found[0].size != found[1].size:
-        raise ArgumentError(
-            "folders", " and ".join("{} x {}".format(*folder.size) for folder in found),
-            "expected one size of both cameras' photographs",
+            "folders", f"{plain(name)} of {width} x {height}", "expected the same names and sizes "
+            "of both cameras' photographs; it is in one folder alone",
         )
 
 
@@ -250,62 +272,23 @@ def _detected(
         sizes = dict(sorted(zip(board.marker_ids, np.round(sides, 12).tolist(), strict=True)))
         return dictionary, sizes, seen
     ids = sorted({each for one in every for each in one.ids.tolist()})
-    if not ids:
-        raise ArgumentError(
-            "settings", f"dictionary={dictionary}",
-            "no photograph shows a marker of it; give the dictionary of the markers",
-        )
     return dictionary, dict.fromkeys(ids, float(fixed["size_m"])), seen
 
 
-def _camera(
-    folder: Folder, camera: PathName | None, corners: Sequence[FoundCorners]
-) -> tuple[Calibration, list[str]]:
-    """Return the camera of a file, or by a board's corners with a line on it."""
-    if str(camera) != CALIBRATE:
-        return camera_of_file(str(camera), folder.size), []
-    if not corners:
-        raise ArgumentError(
-            "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
-        )
-    calibration, line = calibrate(folder.size, corners)
-    return calibration, [line]
-
-
-def _poses_of_board(
-    record: PhotographRecord, camera: Calibration, written: PathName | None, board: Board,
-    corners: Sequence[FoundCorners],
+def _summary(
+    records: Sequence[PhotographRecord], folder: Folder, dictionary: str
 ) -> list[str]:
-    """Write the poses of a board's markers; return a line on them."""
-    boards, halves = board_poses(record, board, camera, corners)
-    if not boards:
-        return []
-    rms = float(np.median([each.rms_px for each in boards]))
-    if written is not None and str(written) != CALIBRATE:
-        check_resolution(str(written), camera, record.size, corners, rms)
-    line = f"board: {rms:.2f} px RMS of its corners in the median photograph"
-    return [line if np.isnan(halves) else (
-        f"{line}; the poses of halves of its corners differ by {halves:.2g} of what their "
-        "residuals predict"
-    )]
-
-
-def _summary(records: Sequence[PhotographRecord], folder: Folder) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
     shown = np.array([each.shown for each in records])
     if not shown.any():
         raise fault_of(
             folder.photographs[0].path.parent,
-            "no photograph shows a whole marker whose pose is known",
+            f"no photograph shows a whole marker of {dictionary} whose pose is known",
         )
     with_pose = shown.any(axis=2)
     empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
     count = int(with_pose.any(axis=0).sum())
     lines = [f"no pose of a marker is known in {named(empty)}: not counted"] if empty else []
-    if count == 1:
-        lines.append(
-            "one photograph: errors and rates have no intervals, which several photographs give"
-        )
     std, translation, sources = (
         np.array([getattr(each, name) for each in records])[shown]
         for name in ("std", "translation", "source")
@@ -322,34 +305,351 @@ def _summary(records: Sequence[PhotographRecord], folder: Folder) -> list[str]:
 
 
 # --------------------------------------------------------------------------------------------------
+# Poses of M markers in P photographs are written into their record, which has none before.
+
+def put(
+    record: PhotographRecord, place: tuple[Any, Any], rotation: Floats, translation: Floats,
+    source: TruthSource, std: Floats | float = np.nan,
+) -> None:
+    """Write the poses of photographs and markers, by their numbers, into a record."""
+    record.rotation[place], record.translation[place] = rotation, translation
+    record.std[place], record.source[place] = std, source
+
+
+def corners_px(
+    camera: Calibration, corners_m: Floats, rotation: Floats, translation: Floats
+) -> Floats:
+    """Return the images (n, 4, 2) of corners (n, 4, 3) at n poses; NaN behind the camera."""
+    return cameras_of(camera, len(corners_m)).project(
+        transform_points(corners_m, rotation, translation)
+    )
+
+
+def are_within(record: PhotographRecord, pixels: Floats) -> Masks:
+    """Return which markers (n,), of corners (n, 4, 2), are wholly in the frame."""
+    inside = (pixels >= -0.5) & (pixels <= record.size - 0.5)
+    return np.asarray(inside.all(axis=(1, 2)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Poses from markers' own corners, where no board knows better: of one image, or of two.
+#
+# Corners by OpenCV's subpix refinement, poses by IPPE: the better of the two planar solutions in
+# one image, or in two images the one that fits both of them better.
+
+#: Markers seen by both cameras from which the spread of their poses is estimated.
+MIN_PAIRS = 12
+
+#: Standard deviation over the median absolute value, of a normal variable of mean 0.
+MAD_TO_STD = 1.4826
+
+
+def own_poses(
+    record: PhotographRecord, camera: Calibration, sizes_m: Floats, seen: Sequence[SeenMarkers]
+) -> None:
+    """Write the poses of markers, of sides (M,), by their own corners."""
+    for photograph, one in enumerate(seen):
+        marker, quads = one.among(record.marker_id)
+        rotation, translation = both_planar_solutions(
+            quads, cameras_of(camera, len(quads)), sizes_m[marker]
+        )
+        good = np.isfinite(rotation[:, 0]).all(axis=(1, 2)) & (translation[:, 0, 2] > 0)
+        put(record, (photograph, marker[good]), rotation[good, 0], translation[good, 0],
+            TruthSource.none)
+
+
+def partner_poses(
+    record: PhotographRecord, stereo: StereoCamera, sizes_m: Floats, left: Sequence[SeenMarkers],
+    right: Sequence[SeenMarkers],
+) -> None:
+    """Write the poses in left photographs, from the right ones of the same moment.
+
+    Their standard deviations are computed from the differences between left and right poses, over
+    √2: robust ones over all markers, since a single marker's are not known.
+
+    Parameters
+    ----------
+    record
+        Of the left photographs.
+    stereo
+        The cameras.
+    sizes_m
+        (M,) sides of the markers.
+    left, right
+        P each.
+    """
+    differences = []
+    for photograph, (own, partner) in enumerate(zip(left, right, strict=True)):
+        (own_marker, own_quads), (marker, quads) = (
+            each.among(record.marker_id) for each in (own, partner)
+        )
+        sides = sizes_m[marker]
+        by_partner = both_planar_solutions(quads, cameras_of(stereo.right, len(quads)), sides)
+        rotation = stereo.rotation.T @ by_partner[0]
+        translation = (by_partner[1] - stereo.translation) @ stereo.rotation
+        error = _errors(stereo.right, quads, sides, *by_partner)
+        _, at_own, at = np.intersect1d(own_marker, marker, return_indices=True)
+        error[at] += _errors(
+            stereo.left, own_quads[at_own], sides[at], rotation[at], translation[at]
+        )
+        # The solution that fits both images better, of markers that have one in the frame.
+        row, best = np.arange(len(marker)), np.where(np.isnan(error), np.inf, error).argmin(axis=1)
+        rotation, translation = rotation[row, best], translation[row, best]
+        images = corners_px(stereo.left, marker_corners(sides), rotation, translation)
+        good = np.isfinite(error[row, best]) & are_within(record, images)
+        put(record, (photograph, marker[good]), rotation[good], translation[good],
+            TruthSource.stereo_partner)
+        at_own, at = at_own[good[at]], at[good[at]]
+        own_rotation, own_translation = both_planar_solutions(
+            own_quads[at_own], cameras_of(stereo.left, len(at)), sides[at]
+        )
+        for k, both, shifts in zip(at.tolist(), own_rotation, own_translation, strict=True):
+            turns = rotation_difference(both, np.repeat(rotation[k][None], 2, axis=0))
+            angle = np.linalg.norm(turns, axis=1)
+            if np.isfinite(angle).any():
+                j = int(np.nanargmin(angle))
+                differences.append([*turns[j], *(shifts[j] - translation[k])])
+    if len(differences) >= MIN_PAIRS:
+        spread = MAD_TO_STD * np.median(np.abs(np.array(differences)), axis=0) / np.sqrt(2.0)
+        record.std[record.shown] = spread
+
+
+def _errors(
+    camera: Calibration, quads: Floats, sides: Floats, rotation: Floats, translation: Floats
+) -> Floats:
+    """Return the RMS reprojection errors (k, 2) of both solutions of k markers."""
+    cameras = cameras_of(camera, len(quads))
+    return np.stack([
+        reprojection_errors_px(rotation[:, j], translation[:, j], sides, quads, cameras)
+        for j in range(2)
+    ], axis=1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Truth by a file of poses, which is checked against the markers that are detected.
+
+#: Distance of a corner to where the detected marker has it, as a share of the marker's side.
+NEAR_SHARE = 0.5
+
+#: Ratio of distances from which positions are taken for those in another unit.
+OTHER_UNIT = 1.5
+
+
+def poses_of_file(
+    record: PhotographRecord, path: Path, camera: Calibration, sizes_m: Floats,
+    seen: Sequence[SeenMarkers],
+) -> list[str]:
+    """Write a file's poses of markers wholly in their photographs; return lines on them.
+
+    Raises
+    ------
+    PipelineError, StoreError
+        If it cannot be read, is of other images or markers, or if most detected markers are not
+        where its poses have them; in lines.
+    """
+    names, faults = {Path(each).stem: k for k, each in enumerate(record.paths)}, []
+    if len(names) < len(record.paths):
+        raise refusal([f"{plain(path)}: expected photographs of different names without suffixes"])
+    try:
+        answers = read_answers(path, names, Conventions())
+    except PipelineError as error:
+        lines = [line.partition(", or pass --doubled")[0] for line in error.faults]
+        raise PipelineError(lines) from None
+    marker = pd.Index(record.marker_id).get_indexer(answers.marker_id)
+    if (marker < 0).any():
+        unknown = answers.marker_id[marker < 0].min()
+        faults.append(f"marker {unknown}: expected one of the board or the photographs")
+    if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
+        faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
+    if not faults:
+        own = copy.deepcopy(record)
+        own_poses(own, camera, sizes_m, seen)
+        put(record, (answers.image, marker), answers.rotation, answers.translation,
+            TruthSource.poses_file)
+        faults += _faults(record, own, camera, sizes_m)
+    if faults:
+        raise refusal([f"{plain(path)}: {fault}" for fault in faults])
+    given = np.nonzero(record.shown)
+    cut = ~are_within(record, _of_record(record, given, camera, sizes_m))
+    record.translation[given[0][cut], given[1][cut]] = np.nan
+    line = f"{int(cut.sum()):,} poses of markers that are not wholly in the frame: not counted"
+    return [line] if cut.any() else []
+
+
+def _of_record(
+    record: PhotographRecord, place: tuple[Any, ...], camera: Calibration, sizes_m: Floats
+) -> Floats:
+    """Return the images (n, 4, 2) of markers at their poses in a record."""
+    return corners_px(
+        camera, marker_corners(sizes_m[place[1]]), record.rotation[place], record.translation[place]
+    )
+
+
+def _faults(
+    record: PhotographRecord, own: PhotographRecord, camera: Calibration, sizes_m: Floats
+) -> list[str]:
+    """Return the fault of poses that are not where markers have their ``own``, if there is one."""
+    both = np.nonzero(record.shown & own.shown)
+    seen = _of_record(own, both, camera, sizes_m)
+    away = np.linalg.norm(_of_record(record, both, camera, sizes_m) - seen, axis=2).max(axis=1)
+    shares = np.nan_to_num(away / side_lengths(seen).mean(axis=1), nan=np.inf)
+    if not len(shares) or np.median(shares) < NEAR_SHARE:
+        return []
+    given, detected = (np.linalg.norm(each.translation[both], axis=1) for each in (record, own))
+    ratio = float(np.median(given / detected))
+    return [(
+        "most markers are not where its poses have them; expected rotation vectors and positions "
+        "from the marker's frame (x right, y up) to the camera's (x right, y down, z forward)"
+    ) if 1 / OTHER_UNIT < ratio < OTHER_UNIT else (
+        f"its positions are {ratio:.3g} times those of the detected markers; expected metres, and "
+        "the marker's true size"
+    )]
+
+
+# --------------------------------------------------------------------------------------------------
+# Truth by a board: the pose of each marker, from all corners of the board but its own.
+#
+# Its covariance is the one of least squares with the residuals' variance, and is raised where the
+# poses of two halves of the corners differ by more than it says: neighbouring residuals are not
+# independent. An error of the camera's numbers is in it as far as the marker's own corners do not
+# lead to the same change of the pose: what truth and estimates share is no error of either
+# against the other. A bent board is not in it.
+
+#: Corners in each of two halves whose poses are compared.
+MIN_HALF = 5
+
+
+def board_poses(
+    record: PhotographRecord, board: Board, camera: Calibration, found: Sequence[FoundCorners]
+) -> tuple[float, list[str]]:
+    """Write the poses of a board's markers in photographs, of markers wholly in them.
+
+    Parameters
+    ----------
+    record
+        The photographs, and all markers of the board.
+    board, camera
+        The board and the camera.
+    found
+        The board's corners in each photograph.
+
+    Returns
+    -------
+    tuple
+        The RMS in px of the corners of the median photograph, NaN if none has corners enough; and
+        a line on it.
+    """
+    camera_covariance = covariance_of(camera)
+    boards = [fitted_board(camera, each) for each in found]
+    ratio = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
+    raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
+    column = np.argsort(np.argsort(board.marker_ids)).tolist()
+    own = own_corners(board)
+    for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
+        if pose is None:
+            continue
+        same = [np.repeat(each[None], len(board), axis=0) for each in pose[:2]]
+        shown = are_within(record, corners_px(camera, board.corners_m, *same))
+        for k in np.flatnonzero(shown).tolist():
+            without = pose.used & ~np.isin(corners.number, own[k])
+            _, (axes, centre) = marker_frame(board.corners_m[k])
+            points = (corners.points - centre) @ axes
+            fitted = fit_pose(
+                camera, points, corners.pixels, pose.rotation @ axes,
+                pose.rotation @ centre + pose.translation, without,
+            ) if without.sum() >= MIN_CORNERS else None
+            if fitted is None:
+                continue
+            variance = raised**2 * np.diag(fitted.covariance)
+            if camera_covariance is not None:
+                variance = variance + unshared_variance(
+                    camera, camera_covariance, fitted, points[without],
+                    (board.corners_m[k] - centre) @ axes,
+                )
+            put(record, (photograph, column[k]), fitted.rotation, fitted.translation,
+                TruthSource.board_without_this_marker, np.sqrt(variance))
+    known = [each.rms_px for each in boards if each is not None]
+    if not known:
+        return np.nan, []
+    rms_px = float(np.median(known))
+    return rms_px, [f"board: {rms_px:.2f} px RMS of its corners in the median photograph"]
+
+
+def unshared_variance(
+    camera: Calibration, camera_covariance: Floats, pose: FittedPose, points: Floats, own: Floats
+) -> Floats:
+    """Return the variances (6,) of a pose by errors of the camera that the estimates do not share.
+
+    To first order a pose by least squares from the marker's ``own`` corners (4, 3) changes by
+    another amount than that from the board's ``points`` (n, 3): the difference counts.
+    """
+    by_points, by_own = (
+        np.linalg.lstsq(by_pose, by_camera, rcond=None)[0] for _, by_pose, by_camera in (
+            derivatives(camera, each, pose.rotation, pose.translation) for each in (points, own)
+        )
+    )
+    change = np.asarray(by_points - by_own, dtype=np.float64)
+    return np.asarray(np.diag(change @ camera_covariance @ change.T))
+
+
+def _halves_ratio(
+    camera: Calibration, boards: Sequence[FittedPose | None], found: Sequence[FoundCorners],
+    together: int,
+) -> float:
+    """Return how far the poses of two halves differ, in predicted standard deviations.
+
+    ``together`` corners of following numbers are in the same half: every other corner of a
+    chessboard's row, or every other marker of a grid.
+    """
+    squares = []
+    for pose, corners in zip(boards, found, strict=True):
+        if pose is None:
+            continue
+        first, centre = (corners.number // together) % 2 == 0, corners.points.mean(axis=0)
+        one, other = (
+            fit_pose(camera, corners.points - centre, corners.pixels, pose.rotation,
+                     pose.rotation @ centre + pose.translation, half & pose.used)
+            if (half & pose.used).sum() >= MIN_HALF else None for half in (first, ~first)
+        )
+        if one is None or other is None:
+            continue
+        turn = rotation_difference(one.rotation[None], other.rotation[None])[0]
+        difference = np.concatenate([turn, one.translation - other.translation])
+        covariance = one.covariance + other.covariance
+        squares.append(float(difference @ np.linalg.solve(covariance, difference)) / 6)
+    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
+
+
+# --------------------------------------------------------------------------------------------------
 # The record of photographs beside their store, and the pipeline that names it.
 
 def _without_truth(
-    folder: Folder, part: Part, ids: Iterable[int], board: str, home: Path
+    folder: Folder, sizes: Mapping[int, float], board: str, home: Path
 ) -> PhotographRecord:
     """Return the record, in ``home``, of photographs whose markers' poses are not known."""
-    numbers = np.array(list(ids), dtype=np.int64)
+    numbers = np.array(list(sizes), dtype=np.int64)
     grid = len(folder.photographs), len(numbers)
     return PhotographRecord(
         tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in folder.photographs),
-        tuple(each.digest for each in folder.photographs), part, *folder.size, numbers,
+        tuple(each.digest for each in folder.photographs), folder.part, *folder.size, numbers,
         np.full((*grid, 3, 3), np.nan), np.full((*grid, 3), np.nan), np.full((*grid, 6), np.nan),
         np.zeros(grid, dtype=np.uint8), board,
     )
 
 
+def _record_names(records: Sequence[PhotographRecord], name: str) -> list[str]:
+    """Return the names of the records' files."""
+    ends = [""] if len(records) == 1 else ["-left", "-right"]
+    return [f"{name}{end}{SUFFIX}" for end in ends]
+
+
 def _write_records(
-    records: Sequence[PhotographRecord], cameras: Sequence[Calibration], dictionary: str,
-    sizes: Mapping[int, float], settings: Sequence[str], home: Path, name: str, folder: Folder,
-    *, overwrite: bool,
-) -> Pipeline:
-    """Write the records, and return the experiment."""
-    names = [f"{name}{SUFFIX}"] if len(records) == 1 else [
-        f"{name}-{side}{SUFFIX}" for side in ("left", "right")
-    ]
+    records: Sequence[PhotographRecord], home: Path, name: str, *, overwrite: bool
+) -> None:
+    """Write the records of a store of that name; another record of a store is kept."""
     with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
-        for each, record in zip(names, records, strict=True):
+        for each, record in zip(_record_names(records, name), records, strict=True):
             path, content = home / each, record.content()
             used = (home / f"{name}.zarr").exists() and path.exists()
             if used and path.read_bytes() != content and not overwrite:
@@ -358,29 +658,34 @@ def _write_records(
                     "refer to; choose another store, or overwrite it"
                 )
             write_whole(path, content)
-    (width, height), shots = folder.size, folder.photographs
+
+
+def _experiment(
+    records: Sequence[PhotographRecord], cameras: Sequence[Calibration], dictionary: str,
+    sizes: Mapping[int, float], settings: Sequence[str], home: Path, name: str, folder: Folder,
+) -> Pipeline:
+    """Return the experiment on records, of the markers of some sides by their IDs."""
     columns = {
-        "photographs": names,
-        **{key: [getattr(each, key) for each in cameras[: len(names)]] for key in VIEW},
-        "distortion": [list(each.distortion) for each in cameras[: len(names)]],
+        "photographs": _record_names(records, name),
+        **{key: [getattr(each, key) for each in cameras[: len(records)]] for key in VIEW},
+        "distortion": [list(each.distortion) for each in cameras[: len(records)]],
     }
-    camera: dict[str, Any] = {"width_px": width, "height_px": height}
-    marker: dict[str, Any] = {"dictionary": dictionary}
-    scene, axes = dict[str, Any](), dict[str, Any](trial=len(shots))
+    (width, height), shots = folder.size, folder.photographs
+    values = {"width_px": width, "height_px": height, "dictionary": dictionary}
+    axes: dict[str, Any] = {"trial": len(shots)}
     if len(records) == 1:
-        scene["photographs"], *_ = columns.pop("photographs")
-        camera |= {key: values[0] for key, values in columns.items()}
-        if cameras[0].sd:
-            camera["calibration_sd"] = list(cameras[0].sd)
+        values |= {key: column[0] for key, column in columns.items()}
+        values |= {"calibration_sd": list(cameras[0].sd)} if cameras[0].sd else {}
     else:
         axes["stereo_camera"] = {"zip": columns}
     if len(set(sizes.values())) == 1:
-        marker["size_m"], axes["marker_id"] = next(iter(sizes.values())), list(sizes)
+        values["size_m"], axes["marker_id"] = next(iter(sizes.values())), list(sizes)
     else:
         axes["marker"] = {"zip": {"marker_id": list(sizes), "size_m": list(sizes.values())}}
-    document = {
-        "title": f"Photographs of {plain(shots[0].path.parent.name, 150)}", "camera": camera,
-        "marker": marker, "scene": scene, "axes": axes,
-    }
+    title = f"Photographs of {plain(shots[0].path.parent.name, 150)}"
+    document: dict[str, Any] = {"title": title}
+    for key, value in values.items():
+        document.setdefault(section_of(key), {})[key] = value
+    document["axes"] = axes
     others = [each for each in settings if setting_name(each) not in ("dictionary", "size_m")]
     return Pipeline.from_dict(document, others, name=name, source="photographs", folder=home)

@@ -7,16 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sweep.errors import ArgumentError, PluginError
-from sweep.experiment.document import MAX_BYTES, read_document
-from sweep.experiment.grid import TRIAL, parse_distribution
-from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
+from sweep.experiment.document import file_text, read_document, refusing
+from sweep.experiment.grid import TRIAL
+from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.messages import notice, plain
-from sweep.model.image_file import read_regular
 
 #: Name of the twins of photographs of a name.
 NAME = "{}-twins"
@@ -37,8 +34,8 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         The pipeline of a store of photographs.
     scene
         Parameters of the section [scene] by name, as a document has them: values, or
-        distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` has the median level of
-        ``black`` unless it is given.
+        distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` is as ``black`` unless
+        it is given.
     repeats
         How often each photograph is simulated.
 
@@ -52,35 +49,20 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
             "photographs", plain(pipeline.name),
             "expected a store of photographs, as `sweep photos` makes it",
         )
-    if repeats < 1:
-        raise ArgumentError("repeats", repeats, "expected at least 1")
-    axis = pipeline.axis(TRIAL)
+    axis, photographs = pipeline.axis(TRIAL), len(record_of(pipeline).paths)
     trials = 1 if axis is None else len(axis)
-    photographs = len(record_of(pipeline).paths)
-    if repeats > 1 and trials != photographs:
+    if repeats != 1 and (repeats < 1 or trials != photographs):
         raise ArgumentError(
-            "repeats", repeats, f"expected 1, for the {trials} first of {photographs} photographs"
+            "repeats", repeats, f"expected at least 1; 1 of the first of {photographs} photographs"
         )
     document = read_document(pipeline.to_toml())
     document["title"] = plain(f"Twins of {pipeline.heading}", 200)
-    document["scene"] = {
-        **document.get("scene", {}), SIMULATED: True, **_ground(scene.get("black")), **scene,
-    }
+    ground = {"background": scene["black"]} if "black" in scene else {}
+    document["scene"] = {**document.get("scene", {}), SIMULATED: True, **ground, **scene}
     document.setdefault("axes", {})[TRIAL] = trials * repeats
     return Pipeline.from_dict(
         document, name=NAME.format(pipeline.name), source="scene", folder=pipeline.folder
     )
-
-
-def _ground(black: Any) -> dict[str, float]:
-    """Return the background of the median level of black; nothing if black is not given."""
-    try:
-        if isinstance(black, dict):
-            drawn = parse_distribution(PARAMETERS["black"], black)
-            return {"background": float(drawn.at(np.array([0.5]))[0])}
-        return {} if black is None else {"background": float(black)}
-    except (TypeError, ValueError):
-        return {}  # the pipeline's check names its fault
 
 
 def record_of(pipeline: Pipeline) -> PhotographRecord:
@@ -114,24 +96,20 @@ def read_scene(path: str | os.PathLike[str], like: Pipeline | None = None) -> di
 
     Raises
     ------
-    ArgumentError
+    ArgumentError, PipelineError
         If it cannot be read, or has no such section.
     """
-    try:
-        document = read_document(read_regular(os.fspath(path), MAX_BYTES).decode())
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ArgumentError("scene", plain(path, 300), f"cannot be read: {reason}") from None
+    name = plain(path, 300)
+    with refusing(name):
+        document = read_document(file_text(os.fspath(path)))
     scene, camera = document.get("scene"), document.get("camera")
     if not isinstance(scene, dict):
-        raise ArgumentError("scene", plain(path, 300), "expected a section [scene]")
-    sizes = [
-        tuple(known.get(name) for name in ("width_px", "height_px"))
+        raise ArgumentError("scene", name, "expected a section [scene]")
+    own, other = (
+        "{width_px} x {height_px}".format_map({"width_px": None, "height_px": None, **known})
         for known in (camera if isinstance(camera, dict) else {}, like.fixed if like else {})
-    ]
-    if None not in sizes[0] + sizes[1] and sizes[0] != sizes[1]:
-        notice(
-            f"{plain(path, 300)}: fitted to images of {sizes[0][0]} x {sizes[0][1]}, not of "
-            f"{sizes[1][0]} x {sizes[1][1]}: its blur, noise and shifts in px are of those"
-        )
+    )
+    if own != other and "None" not in own + other:
+        notice(f"{name}: fitted to images of {own}, not of {other}: its blur, noise and shifts in "
+               "px are of those")
     return scene

@@ -12,7 +12,7 @@ from support.board_photographs import BOARD, SIZE, board, camera, toml
 from support.board_scenes import BoardPose, board_scene
 from support.reports import command
 from sweep.analysis.comparisons import GAP_STATISTICS
-from sweep.fitting.folders import REPEATS, needed
+from sweep.fitting.fit import REPEATS, needed
 from sweep.model.exposure import marker_boxes
 from sweep.model.pose import rotation_of_angles
 from sweep.model.renderers import render_all

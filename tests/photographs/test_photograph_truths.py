@@ -209,5 +209,5 @@ def test_what_is_left_out_and_converted_is_said(faulty, tmp_path):
     made = prepare([shots], faulty / "camera.json", board=faulty / "board.toml", home=tmp_path)
     said = "\n".join(made.lines)
     for words in ("left out notes.txt", "left out cut.jpg", "the same photographs again",
-                  "\\udcff.png (its name is not UTF-8", "have 16 bits", "are in colour"):
+                  "\\udcff.png: its name is not UTF-8", "have 16 bits", "are in colour"):
         assert words in said

@@ -25,7 +25,6 @@ from sweep.experiment.pipeline import Pipeline, cell
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
 from sweep.model.calibration import Calibration
-from sweep.photographs.board_view import FoundCorners
 from sweep.photographs.cameras import (
     calibrate,
     camera_of_file,
@@ -33,8 +32,8 @@ from sweep.photographs.cameras import (
     fit_pose,
     project,
 )
-from sweep.photographs.prepare import prepare
-from sweep.photographs.truth import unshared_variance
+from sweep.photographs.folder import FoundCorners
+from sweep.photographs.prepare import prepare, unshared_variance
 from sweep.photographs.twins import twin_pipeline
 
 

@@ -178,11 +178,7 @@ def require_poses(results: xr.Dataset) -> None:
 
     Of boards' markers (`sweep.analysis.per_marker`) it has detections alone.
     """
-    required = DETECTION_INPUTS if AXIS in results.dims else ERROR_INPUTS
-    lacking = [name for name in required if name not in results]
-    if lacking:
-        present = ", ".join(map(str, results.data_vars)) or "none"
-        raise DatasetError(f"no variable {', '.join(lacking)}; there are {present}")
+    pose_arrays(results, DETECTION_INPUTS if AXIS in results.dims else ERROR_INPUTS)
     empty = [name for name in axes_of(results) if results.sizes[name] == 0]
     if empty:
         raise DatasetError(f"there are no poses: {', '.join(empty)} has no values")
@@ -228,8 +224,7 @@ def parameter_value(results: xr.Dataset, name: str) -> Any:
     Raises
     ------
     DatasetError
-        If the dataset has it neither as a coordinate nor in the pipeline of its attributes, or if
-        it was drawn and the store is too old to have the draws.
+        If the dataset has it neither as a coordinate nor in the pipeline of its attributes.
     """
     if name in results.coords:
         return results[name].reset_coords(drop=True)
@@ -238,12 +233,9 @@ def parameter_value(results: xr.Dataset, name: str) -> Any:
     except (KeyError, SweepError):
         raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
                            "that has it") from None
-    if pipeline.axis(name) is not None:
+    if pipeline.axis_of(name) is not None or name in pipeline.distributions:
         raise DatasetError(f"{name}: varies in this store, but the dataset lacks its coordinate")
-    value = pipeline.fixed.get(name, pipeline.parameters[name].default)
-    if value is not None and not isinstance(value, (int, float, str)):
-        raise DatasetError(f"{name}: is drawn, so that the side is not a number of the grid")
-    return value
+    return pipeline.fixed.get(name, pipeline.parameters[name].default)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -336,6 +328,26 @@ SIZE_AXES = ("side_px", "distance_m")
 SIZE_PARAMETERS = ("side_px", "distance_m", "size_m", *VIEW_PARAMETERS)
 
 
+def focal_size_of(results: xr.Dataset) -> xr.DataArray:
+    """Return fx times the side of the black square, px · m, over the dimensions that it has.
+
+    Raises
+    ------
+    DatasetError
+        If a parameter is not known.
+    """
+    try:
+        values = {name: parameter_value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
+    except DatasetError:
+        if "side_px" not in results.coords:
+            raise
+        product = results["side_px"] * results["true_tvec_m"].isel(xyz=2, drop=True)
+    else:
+        fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+        product = xr.DataArray(fx) * values["size_m"]
+    return product.astype(np.float64).reset_coords(drop=True)
+
+
 def image_sides(results: xr.Dataset) -> xr.DataArray:
     """Return the sides as if the square were parallel to the image plane: fx · size / distance.
 
@@ -359,16 +371,14 @@ def image_sides(results: xr.Dataset) -> xr.DataArray:
         if name in results.coords and DRAWS in results[name].dims and not (
                 by_side and name == "distance_m"):
             raise DatasetError(f"{name}: is drawn, so that the side is no number of the grid")
-    value = functools.partial(parameter_value, results)
     if by_side:
         sides = results["side_px"]
-    elif (distance := value("distance_m")) is None:
+    elif (distance := parameter_value(results, "distance_m")) is None:
         raise DatasetError(
             "distance_m: is no number of this store, whose poses are given in the world; a "
             "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
     else:
-        fx = xr.DataArray(intrinsics(*map(value, VIEW_PARAMETERS))[0])
-        sides = fx * value("size_m") / distance
+        sides = focal_size_of(results) / distance
     sides = sides.astype(np.float64)
     if not (np.isfinite(sides) & (sides > 0)).all():
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
@@ -1011,7 +1021,6 @@ def _decoded(variable: xr.DataArray) -> xr.DataArray:
         return labels[np.where(values[at] == flags, at, -1)]
 
     words: xr.DataArray = xr.apply_ufunc(
-        look_up, variable, dask="parallelized", output_dtypes=[labels.dtype]
-    )
+        look_up, variable, dask="parallelized", output_dtypes=[labels.dtype])
     words.attrs = attributes
     return words

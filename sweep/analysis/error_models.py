@@ -19,10 +19,10 @@ from sweep.analysis.dataset import (
     Poses,
     axes_of,
     bearing_of,
+    focal_size_of,
     in_sight_frame,
     is_grid_axis,
     kept_dimensions,
-    parameter_value,
     pose_arrays,
     sight_rotation,
     viewing_angle_of,
@@ -33,7 +33,6 @@ from sweep.analysis.intervals import DEVIATIONS
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -534,26 +533,6 @@ def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights
 
 # --------------------------------------------------------------------------------------------------
 # Bins of a dataset, and the joint region of the conditions that was seen.
-
-def focal_size_of(results: xr.Dataset) -> xr.DataArray:
-    """Return fx times the side of the black square, px · m, over the dimensions that it has.
-
-    Raises
-    ------
-    DatasetError
-        If a parameter is not known.
-    """
-    try:
-        values = {name: parameter_value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
-    except DatasetError:
-        if "side_px" not in results.coords:
-            raise
-        product = results["side_px"] * results["true_tvec_m"].isel(xyz=2, drop=True)
-    else:
-        fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
-        product = xr.DataArray(fx) * values["size_m"]
-    return product.astype(np.float64).reset_coords(drop=True)
-
 
 def bins_and_cells(
     found: Mapping[str, Floats], poses: int, *, collinear: bool

@@ -1230,19 +1230,16 @@ def _column(
     ``order`` are the indices of the trials by replicate, if they have such.
     """
     # Of dimensions that make an axis together an array has all, or is repeated along all.
-    own = [part if set(part) & set(array.dims) else () for part in axes.values()]
+    own = {axis: part for axis, part in axes.items() if set(part) & set(array.dims)}
     inner = {str(dim): size for dim, size in array.sizes.items() if dim not in sizes}
+    shape = {axis: math.prod(sizes[name] for name in part) for axis, part in axes.items()}
     try:
-        read = array.to_numpy()
+        variable: Any = xr.Variable(array.dims, array.to_numpy())
     except (RuntimeError, ValueError) as error:  # Zarr's, of a chunk that is damaged
         raise DatasetError(
             f"a store cannot be read: {error}; `sweep verify` names what is damaged") from None
-    variable: Any = xr.Variable(array.dims, read)
-    variable = variable.set_dims({name: sizes[name] for part in own for name in part} | inner)
-    values: NDArray[Any] = variable.to_numpy().reshape(
-        [math.prod(sizes[name] for name in part) for part in own] + [*inner.values()])
-    shape = {axis: math.prod(sizes[name] for name in part) for axis, part in axes.items()}
-    values = np.broadcast_to(values, (*shape.values(), *inner.values()))
+    whole = variable.set_dims({name: sizes[name] for part in own.values() for name in part} | inner)
+    values: NDArray[Any] = whole.stack(own).set_dims(shape | inner).to_numpy()
     if order is None:
         return values
     points = shape["draws"] // REPLICATES * shape["settings"]  # of a replicate, together

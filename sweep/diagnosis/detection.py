@@ -14,8 +14,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sweep.analysis.dataset import bearing_of, sight_rotation, viewing_angle_of
-from sweep.analysis.error_models import FRONTAL_DEG, differences, focal_size_of, hat_basis
+from sweep.analysis.dataset import bearing_of, focal_size_of, sight_rotation, viewing_angle_of
+from sweep.analysis.error_models import FRONTAL_DEG, differences, hat_basis
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.messages import to_json

@@ -16,8 +16,8 @@ from support.pose_errors import (
     reader_of_the_guide,
 )
 from sweep.analysis import error_models, model_covariance, model_errors
-from sweep.analysis.dataset import in_sight_frame, sight_rotation, viewing_angle_of
-from sweep.analysis.error_models import Use, focal_size_of
+from sweep.analysis.dataset import focal_size_of, in_sight_frame, sight_rotation, viewing_angle_of
+from sweep.analysis.error_models import Use
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.messages import to_json

@@ -14,26 +14,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sweep.analysis.dataset import (
-    ESTIMATE_INPUTS,
-    Poses,
-    as_names,
-    configuration_axes,
-    describes,
-    is_sampling_stopped,
-    kept_dimensions,
-    pose_arrays,
-    stacked,
-)
-from sweep.analysis.estimator import (
-    TAIL_SHARE,
-    Bins,
-    Count,
-    Rate,
-    Statistic,
-    aggregates,
-    scaled_to_draws,
-)
+from sweep.analysis import dataset, estimator
+from sweep.analysis.dataset import Poses
+from sweep.analysis.estimator import Bins, Count, Rate, Statistic
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.summaries import FLIPPED, SOLVED
 from sweep.errors import ArgumentError
@@ -48,7 +31,7 @@ THRESHOLDS = (
 MAX_THRESHOLDS = 200
 
 RATIO_INPUTS = (
-    *ESTIMATE_INPUTS, "reprojection_error_px", "alternative_reprojection_error_px")
+    *dataset.ESTIMATE_INPUTS, "reprojection_error_px", "alternative_reprojection_error_px")
 
 
 class ThresholdChoice(Flag):
@@ -97,7 +80,7 @@ class AmbiguousPoses(Poses):
             self["reprojection_error_px"], self["alternative_reprojection_error_px"])
 
 
-@describes
+@dataset.describes
 def ambiguity(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None, *,
     thresholds: Iterable[float] = THRESHOLDS, flip_rate: float = 0.01, min_kept: float = 0.05,
@@ -175,20 +158,21 @@ def ambiguity(
             "flip_rate", flip_rate, "expected a number above 0 and below 1, such as 0.01")
     if not 0.0 <= min_kept <= 1.0:
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
-    kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
+    kept = dataset.kept_dimensions(
+        results, (*dataset.as_names(per), *dataset.configuration_axes(results)))
     counts: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution", lambda poses:
               poses.solved & np.isnan(poses["alternative_reprojection_error_px"]))]
     levels = np.unique([*tried, np.inf])
-    table, *at_levels = aggregates(
-        results, pose_arrays(results, RATIO_INPUTS), kept, [counts, *map(_rates, levels)],
+    table, *at_levels = estimator.aggregates(
+        results, dataset.pose_arrays(results, RATIO_INPUTS), kept, [counts, *map(_rates, levels)],
         AmbiguousPoses, bins)
-    table = table.assign(stacked(at_levels, "threshold")).assign_coords(
+    table = table.assign(dataset.stacked(at_levels, "threshold")).assign_coords(
         threshold=("threshold", levels, cf_attributes(
             "largest ratio of both reprojection errors that is kept", "1")))
-    tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
+    tail = TAIL * estimator.TAIL_SHARE if dataset.is_sampling_stopped(results) else TAIL
     return _with_choice(table, flip_rate, min_kept, tail)
 
 
@@ -229,7 +213,8 @@ def _with_choice(
     table: xr.Dataset, flip_rate: float, min_kept: float, tail: float
 ) -> xr.Dataset:
     """Return the table with the chosen threshold of each group."""
-    _, most = scaled_to_draws(*(table[name].values for name in ("kept_flipped", "kept", "draws")))
+    _, most = estimator.scaled_to_draws(*(
+        table[name].values for name in ("kept_flipped", "kept", "draws")))
     level = 1.0 - 2.0 * tail / table.sizes["threshold"]
     bound = table["kept"].copy(data=clopper_pearson(most, table["draws"], level)[1])
     useful = (table["kept_rate"] >= min_kept) | np.isinf(table["threshold"])

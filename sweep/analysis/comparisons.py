@@ -14,66 +14,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.dataset import (
-    ALL_QUANTITIES,
-    DETECTION_INPUTS,
-    DRAWS,
-    ERROR_INPUTS,
-    INSIDE,
-    NOT_AVAILABLE,
-    QUANTITIES,
-    Labelled,
-    Poses,
-    Quantity,
-    as_names,
-    axes_of,
-    configuration_axes,
-    describes,
-    each_cell,
-    fingerprint_of,
-    image_sides,
-    is_fixed,
-    is_grid_axis,
-    is_sampling_stopped,
-    kept_dimensions,
-    largest_cell,
-    norm_squared,
-    of_photographs,
-    parameter_value,
-    pose_arrays,
-    require_dimension,
-    require_poses,
-    stored_pipeline,
-)
-from sweep.analysis.estimator import (
-    INTERVAL,
-    Arrays,
-    Bins,
-    Columns,
-    Count,
-    Design,
-    Mean,
-    Output,
-    Rate,
-    RootMeanSquare,
-    RootMeanSquareRatio,
-    Sample,
-    Statistic,
-    aggregate,
-    aggregates,
-    arranged,
-    newcombe_and_mcnemar,
-    quantile_intervals,
-    read_bins,
-    with_interval,
-)
-from sweep.analysis.intervals import (
-    LEVEL,
-    MIN_UNITS,
-    percentile_interval,
-    resampled_quantiles,
-    unit_counts,
-)
+from sweep.analysis import dataset, estimator, intervals
+from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quantity, axes_of
+from sweep.analysis.estimator import INTERVAL, Bins, Columns, Count, Design, Mean, Output, Statistic
+from sweep.analysis.intervals import LEVEL, MIN_UNITS
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
@@ -106,7 +50,7 @@ class Pair:
         Arrays of `paired_arrays`, (groups, cells, draws, settings, ...).
     """
 
-    def __init__(self, arrays: Arrays) -> None:
+    def __init__(self, arrays: estimator.Arrays) -> None:
         self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
         self._arrays = arrays
 
@@ -137,17 +81,17 @@ def paired_arrays(
     """Return variables of two datasets by the names that `Pair` gives them."""
     return {f"{side} {name}": array.reset_coords(drop=True)
             for side, results in (("first", first), ("second", second))
-            for name, array in pose_arrays(results, names).items()}
+            for name, array in dataset.pose_arrays(results, names).items()}
 
 
 def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
     """Raise DatasetError unless two datasets are of the same scenes and draws."""
     for name, value in first.coords.items():
-        if is_grid_axis(name, first) and not value.dims and not second.get(name, value).dims:
-            values = value.item(), second.get(name, value).item()
-            if values[0] != values[1]:
-                raise DatasetError(f"not the same scenes: {name} is {values[0]} and {values[1]}, "
-                                   "with other draws")
+        other = second.get(name, value)
+        if dataset.is_grid_axis(name, first) and not value.dims and not other.dims and (
+                value.item() != other.item()):
+            raise DatasetError(f"not the same scenes: {name} is {value.item()} and {other.item()}, "
+                               "with other draws")
     axes, others = axes_of(first), axes_of(second)
     if set(axes) != set(others):
         raise DatasetError(f"not the same scenes: dimensions {', '.join(axes) or 'none'} "
@@ -156,7 +100,7 @@ def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
         if not np.array_equal(first[name].values, second[name].values):
             raise DatasetError(f"not the same scenes: the values of {name} differ")
     for key, unsaid, words in (("seed", None, "seeds"), ("sampling", "independent", "sampling")):
-        ours, theirs = (fingerprint_of(side).get(key, unsaid) for side in (first, second))
+        ours, theirs = (dataset.fingerprint_of(side).get(key, unsaid) for side in (first, second))
         if None not in (ours, theirs) and ours != theirs:
             raise DatasetError(f"not the same draws: {words} {ours} and {theirs}")
 
@@ -169,7 +113,7 @@ PairStatistic = Statistic[Pair]
 ROTATION, _DEPTH = QUANTITIES[:2]
 
 
-@describes
+@dataset.describes
 def compare(
     first: xr.Dataset, second: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:
@@ -231,8 +175,8 @@ def compare(
     >>> table["rotation_rmse_ratio"].round(3).item()
     2.0
     """
-    kept = kept_dimensions(first, per)
-    kept_dimensions(second, per)
+    kept = dataset.kept_dimensions(first, per)
+    dataset.kept_dimensions(second, per)
     table, = paired_tables(first, second, kept, bins)
     return table.drop_vars([
         name for name in table if name == "drawn" or f"_{OLDER}_" in str(name)])
@@ -247,7 +191,7 @@ def paired_tables(
     Beside it there are whether any cell has two draws, ``drawn``, and of each kind the mean
     absolute error of the first configuration, such as ``rotation_older_deg``.
     """
-    stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
+    stopped = dataset.is_sampling_stopped(first) or dataset.is_sampling_stopped(second)
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
         first, second = xr.align(
             first, second, join="inner", exclude={*first.dims, *second.dims} - {DRAWS})
@@ -275,7 +219,7 @@ def paired_tables(
               lambda pair: pair.compared & pair.differing),
         *(statistic for quantity in quantities for statistic in _differences(quantity)),
     ]
-    return aggregates(first, inputs, kept, [
+    return estimator.aggregates(first, inputs, kept, [
         [replace(each, level=level) for each in statistics] for level in levels],
         Pair, bins, stopped=stopped)
 
@@ -296,7 +240,7 @@ class RateDifference(Statistic[Pair]):
         return [
             *(Output(f"{name}_{ending}", f"compared poses, {ending} in {name.replace('_', ' ')}",
                      "1", "i8") for name in ("both", "only_first", "only_second", "neither")),
-            *with_interval(f"{rate}_difference", f"{rate} rate, second minus first", "1"),
+            *estimator.with_interval(f"{rate}_difference", f"{rate} rate, second minus first", "1"),
             Output(f"{rate}_p_value", "chance that the discordant counts differ so much if the "
                    f"{rate} rates are equal (McNemar, exact)", "1")]
 
@@ -307,23 +251,22 @@ class RateDifference(Statistic[Pair]):
             return [pair.compared & each for each in (
                 first & second, first & ~second, ~first & second, ~first & ~second, True)]
 
-        *cases, compared = map(Sample, columns.by_draw(pairs))
+        *cases, compared = map(estimator.Sample, columns.by_draw(pairs))
         counts = [each.n for each in cases]
-        return [*counts, *newcombe_and_mcnemar(
+        return [*counts, *estimator.newcombe_and_mcnemar(
             counts, compared.draws, compared.drawn, design.level(self.level))]
-
-
-def _both_squares(quantity: Quantity, pair: Pair) -> Floats:
-    """Return the squared absolute errors (..., 2) of both poses."""
-    return np.concatenate([quantity.squares(pair.first), quantity.squares(pair.second)], axis=-1)
 
 
 def _differences(quantity: Quantity) -> list[PairStatistic]:
     """Return the mean difference and the ratio of a kind of error, of poses that both solved."""
-    squares, words = functools.partial(_both_squares, quantity), quantity.words
+    words = quantity.words
+
+    def squares(pair: Pair) -> Floats:
+        """Return the squared absolute errors (..., 2) of both poses."""
+        return np.concatenate([quantity.squares(each) for each in (pair.first, pair.second)], -1)
 
     def ratio(ending: str, also: str, used: Callable[[Pair], Masks]) -> PairStatistic:
-        return RootMeanSquareRatio(
+        return estimator.RootMeanSquareRatio(
             f"{quantity.name}_rmse{ending}_ratio", f"second RMS {words} over the first{also}",
             squares, used)
 
@@ -347,7 +290,7 @@ def _differences(quantity: Quantity) -> list[PairStatistic]:
 CORNER_VARIABLES = ("corner_error_px", "marker_corner_error_px", "chessboard_corner_error_px")
 
 
-@describes
+@dataset.describes
 def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     """Return each renderer's changes against ``reference``, paired scene by scene.
 
@@ -392,7 +335,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     >>> renderer_bias(both)["detection_disagreement"].values.tolist()
     [0.0, 0.0]
     """
-    require_dimension(results, "renderer")
+    dataset.require_dimension(results, "renderer")
     renderers = [str(name) for name in results["renderer"].values]
     if reference not in renderers:
         raise ArgumentError("reference", reference, f"the renderers are {', '.join(renderers)}")
@@ -405,11 +348,11 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     single, of_boards, _ = CORNER_VARIABLES
     corners, whose = of_boards if of_boards in results else single, "minus the reference's"
     of_detections: list[PairStatistic] = [
-        Rate("detection_disagreement", "differing of compared",
+        estimator.Rate("detection_disagreement", "differing of compared",
              lambda pair: pair.first.detected != pair.second.detected, lambda pair: pair.compared,
              counts=(("compared", "poses that were looked for with both renderers"),
                      ("differing", "poses detected with one of both renderers only"))),
-        RootMeanSquare(
+        estimator.RootMeanSquare(
             "corner_shift_rms_px", f"RMS of a corner's coordinate {whose}",
             lambda pair: _corner_shift(pair, corners),
             lambda pair: pair.compared & pair.first.detected & pair.second.detected, units="px")]
@@ -418,17 +361,17 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
              f"mean depth error {whose}, of the true depth, both solved",
              lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
              lambda pair: pair.both_solved, units=_DEPTH.units),
-        RootMeanSquare(
+        estimator.RootMeanSquare(
             "rotation_shift_deg",
             f"RMS of the rotation error {whose}, both solved and not flipped",
-            lambda pair: norm_squared(np.degrees(np.subtract(
+            lambda pair: dataset.norm_squared(np.degrees(np.subtract(
                 pair.second["rotation_error_rad"], pair.first["rotation_error_rad"],
                 dtype=np.float64)))[..., None],
             lambda pair: pair.first.unflipped & pair.second.unflipped, units=ROTATION.units)]
-    detections = aggregate(
-        results, paired_arrays(others, results, *DETECTION_INPUTS, corners), kept("detection"),
-        of_detections, Pair)
-    return detections.drop_vars("draws").assign(aggregate(
+    detections = estimator.aggregate(
+        results, paired_arrays(others, results, *dataset.DETECTION_INPUTS, corners),
+        kept("detection"), of_detections, Pair)
+    return detections.drop_vars("draws").assign(estimator.aggregate(
         results, paired_arrays(others, results, *ERROR_INPUTS), kept("estimate"), of_poses, Pair))
 
 
@@ -509,11 +452,11 @@ def regressions(
     ArgumentError, DatasetError
         As in `sweep.analysis.compare`.
     """
-    quantities = [each for each in ALL_QUANTITIES.values() if any(
+    quantities = [each for each in dataset.ALL_QUANTITIES.values() if any(
         name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}") for name in variables)]
     quantities = quantities or list(QUANTITIES[:2])
-    configuration = configuration_axes(new)
-    kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
+    configuration = dataset.configuration_axes(new)
+    kept = dataset.kept_dimensions(new, (*configuration, *dataset.as_names(per)))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
     table, = paired_tables(old, new, kept, None, quantities, [level])
@@ -534,8 +477,8 @@ def regressions(
         columns = table[[f"{name}{end}" for end in INTERVAL]].assign(
             worse=worse, excess=excess.fillna(-np.inf).where(
                 worse | ~worse.any(conditions), -np.inf))
-        for at, one in each_cell(columns, configuration):
-            cell = largest_cell(one, one["excess"].transpose(*conditions))
+        for at, one in dataset.each_cell(columns, configuration):
+            cell = dataset.largest_cell(one, one["excess"].transpose(*conditions))
             difference, low, high = (float(cell[f"{name}{end}"]) for end in INTERVAL)
             found.append(Regression(
                 quantity, at, {dim: cell[dim].item() for dim in conditions},
@@ -572,7 +515,7 @@ DIFFERENCES = {
 }
 
 
-@describes
+@dataset.describes
 def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     """Return how detections, corners and poses of two stores of one pipeline differ.
 
@@ -632,14 +575,14 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     once, *detections = _by_flags(DetectionStatus, "detection", sides, scene)
     _, _, *estimates = _by_flags(EstimateStatus, "estimate", sides, scene)
     computed = ~functools.reduce(operator.or_, (
-        side["detection"].fillna(0).isin(NOT_AVAILABLE) for side in sides))
+        side["detection"].fillna(0).isin(dataset.NOT_AVAILABLE) for side in sides))
     corners = _apart([[side[name].where(computed) for name in CORNER_VARIABLES if name in read]
                       for side in sides], "xy", scene, _distance)
     shared, _, *moved = _apart([
         [xr.concat([side["translation_error_m"], side["rotation_error_rad"]], "xyz").where(
             side["estimate"] == EstimateStatus.solved)] for side in sides],
         "xyz", scene, _distance, _turn)
-    changes = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
+    changes = list(_fingerprint_differences(*map(dataset.fingerprint_of, (first, second))))
     fingerprint = xr.DataArray(
         np.array([pair for _, *pair in changes], dtype=object).reshape(-1, 2),
         dims=("entry", "store"))
@@ -724,11 +667,11 @@ def _turn(first: Floats, second: Floats) -> Floats:
 def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:
     """Raise DatasetError unless two datasets are of one pipeline."""
     for side in (first, second):
-        require_poses(side)
-        pose_arrays(side, ERROR_INPUTS)  # raises for the markers of boards
+        dataset.require_poses(side)
+        dataset.pose_arrays(side, ERROR_INPUTS)  # raises for the markers of boards
     require_pairs(first, second)
     try:
-        ours, theirs = (_parameters(stored_pipeline(side)) for side in (first, second))
+        ours, theirs = (_parameters(dataset.stored_pipeline(side)) for side in (first, second))
     except (KeyError, SweepError):
         return  # they were cut or joined: their coordinates have been compared
     for name in sorted({*ours, *theirs}):
@@ -751,13 +694,13 @@ def _parameters(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _fingerprint_differences(
-    first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = ""
+    first: Mapping[str, Any], second: Mapping[str, Any], *, prefix: str = ""
 ) -> Iterator[tuple[str, str, str]]:
     """Yield name and both values of each entry in which two fingerprints differ."""
     for key in sorted({*first, *second}):
         ours, theirs = first.get(key, {}), second.get(key, {})
         if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-            yield from _fingerprint_differences(ours, theirs, f"{prefix}{key}.")
+            yield from _fingerprint_differences(ours, theirs, prefix=f"{prefix}{key}.")
         elif ours != theirs:
             yield f"{prefix}{key}", plain(ours or "none"), plain(theirs or "none")
 
@@ -809,8 +752,8 @@ class Sides(NamedTuple):
             inside = xr.DataArray(True)
             for name, edges in self.bins.items():
                 inside = inside & (side[name] >= edges[0]) & (side[name] < edges[-1])
-            inputs = pose_arrays(side, ERROR_INPUTS) | {INSIDE: inside}
-            found.append(Poses(arranged(side, inputs, self.kept, stopped=False)[0]))
+            inputs = dataset.pose_arrays(side, ERROR_INPUTS) | {dataset.INSIDE: inside}
+            found.append(Poses(estimator.arranged(side, inputs, self.kept, stopped=False)[0]))
         return found
 
 
@@ -830,12 +773,12 @@ def matched_sides(
             "simulations are compared by sweep.analysis.compare"
         )
     for side in (photographs, simulated):
-        require_poses(side)
-    paired, single = is_twin(simulated), not of_photographs(simulated)
+        dataset.require_poses(side)
+    paired, single = is_twin(simulated), not dataset.of_photographs(simulated)
     first, second, kept = _same_configurations(photographs, simulated, paired=paired)
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
-    read_bins(first, kept, bins)
+    estimator.read_bins(first, kept, bins)
     scene = [name for name in axes_of(second, Stage.scene) if name not in kept]
     std = second.get(TRUTH_STD)
     first, second = (
@@ -858,12 +801,12 @@ def matched_sides(
 
 def is_measured(results: xr.Dataset) -> bool:
     """Return whether a dataset is measured in photographs."""
-    return of_photographs(results) and not is_twin(results)
+    return dataset.of_photographs(results) and not is_twin(results)
 
 
 def is_twin(results: xr.Dataset) -> bool:
     """Return whether a dataset is simulated at the poses of photographs."""
-    return of_photographs(results) and SIMULATED in results.coords and bool(results[SIMULATED])
+    return dataset.of_photographs(results) and bool(results.coords.get(SIMULATED, False))
 
 
 def _same_configurations(
@@ -873,7 +816,8 @@ def _same_configurations(
 
     Twins are also at their common values of the scene; axes of it that they alone have are kept.
     """
-    names = [*dict.fromkeys([*configuration_axes(first), *configuration_axes(second)])]
+    names = [*dict.fromkeys(
+        name for side in (first, second) for name in dataset.configuration_axes(side))]
     for name in names:
         first, second = _with_axis(first, second, name), _with_axis(second, first, name)
     scenes = [[name for name in axes_of(side, Stage.scene) if name != DRAWS and paired]
@@ -896,7 +840,7 @@ def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
     """Return a dataset with an axis of its one value, if it has none and the other has one."""
     if name in results.dims:
         return results
-    value = parameter_value(results, name) if name in PARAMETERS else None
+    value = dataset.parameter_value(results, name) if name in PARAMETERS else None
     value = value.item() if isinstance(value, xr.DataArray) else value
     if value is None:
         raise DatasetError(f"{name}: one of both does not have this axis; measure both with it")
@@ -923,7 +867,7 @@ def _trials_of(first: xr.Dataset, second: xr.Dataset) -> Integers:
     return np.array([some + [-1] * (most - len(some)) for some in trials])
 
 
-def _gathered(results: Labelled, trials: xr.DataArray) -> Labelled:
+def _gathered(results: dataset.Labelled, trials: xr.DataArray) -> dataset.Labelled:
     """Return the trials (photographs, repeats) of a twin; of -1 all is NaN: not run."""
     return results.drop_vars(DRAWS, errors="ignore").isel(
         {DRAWS: trials.clip(0)}).where(trials >= 0)
@@ -947,10 +891,10 @@ def _with_uncertain_truth(
 
 def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
     """Return the binned quantity of a dataset: a variable, or one computed from others."""
-    if name in results.variables and not is_fixed(results[name]):
+    if name in results.variables and not dataset.is_fixed(results[name]):
         return results[name].reset_coords(drop=True)
     if name == SIDE:
-        return image_sides(results)
+        return dataset.image_sides(results)
     if name == "distance_m":
         return results["true_tvec_m"].isel(xyz=2, drop=True)
     raise DatasetError(f"{name}: both datasets need it for bins; one has "
@@ -974,7 +918,7 @@ SOURCES = ("photographs", "simulated")
 PERCENTS = {"median": 50, "p90": 90}
 
 
-class ComparedRate(Rate[Poses]):
+class ComparedRate(estimator.Rate[Poses]):
     """A rate that is compared by its difference."""
 
     ratio = False
@@ -1022,11 +966,11 @@ class SolvedQuantile(Statistic[Poses]):
         errors = errors.reshape(len(errors), errors.shape[2], errors.shape[1] * errors.shape[3])
         used = ~np.isnan(errors)
         units = used.any(axis=2).sum(axis=1)
-        interval = quantile_intervals(
+        interval = estimator.quantile_intervals(
             errors[:, None], used.sum(axis=2)[:, None], [self.percent], design)[:, 0]
         interval[units < MIN_UNITS, 1:] = np.nan
-        counts = None if self.single else unit_counts(errors.shape[1])
-        replicates = [resampled_quantiles(*each, counts, self.percent / 100.0)
+        counts = None if self.single else intervals.unit_counts(errors.shape[1])
+        replicates = [intervals.resampled_quantiles(*each, counts, self.percent / 100.0)
                       for each in zip(errors, used, strict=True)]
         return [*interval.T, units, np.array(replicates)]
 
@@ -1037,7 +981,7 @@ class SolvedQuantile(Statistic[Poses]):
                              for name in (self.name, f"{self.name}_replicates"))
         units = np.minimum(first[f"{self.name}_units"], second[f"{self.name}_units"])
         return (value, *xr.apply_ufunc(
-            percentile_interval, replicates, units, input_core_dims=[["replicate"], []],
+            intervals.percentile_interval, replicates, units, input_core_dims=[["replicate"], []],
             output_core_dims=[[], []], vectorize=True))
 
 
@@ -1065,7 +1009,7 @@ COUNTS: tuple[Statistic[Poses], ...] = (
 )
 
 
-@describes
+@dataset.describes
 def simulation_gap(
     photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
 ) -> xr.Dataset:
@@ -1129,7 +1073,7 @@ def simulation_gap(
     """
     sides = matched_sides(photographs, simulated, bins)
     tables = [
-        aggregate(side, pose_arrays(side, ERROR_INPUTS), sides.kept, [
+        estimator.aggregate(side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept, [
             *COUNTS, *GAP_RATES, *(replace(each, single=single) for each in GAP_QUANTILES)],
             Poses, sides.bins, stopped=False)
         for side, single in zip(sides.datasets, (False, sides.single), strict=True)]
@@ -1138,7 +1082,7 @@ def simulation_gap(
     gaps: dict[str, xr.DataArray] = {}
     for each in GAP_STATISTICS:
         words = "simulated over photographs" if each.ratio else "simulated minus photographs"
-        outputs = with_interval(f"{each.name}_gap", f"{words}: {each.meaning}",
+        outputs = estimator.with_interval(f"{each.name}_gap", f"{words}: {each.meaning}",
                                 "1" if each.ratio else each.units)
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps |= {output.name: array.assign_attrs(output.attributes())

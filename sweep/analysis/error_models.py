@@ -13,21 +13,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sweep.analysis.dataset import (
-    DRAWS,
-    SIGNED_INPUTS,
-    Poses,
-    axes_of,
-    bearing_of,
-    focal_size_of,
-    in_sight_frame,
-    is_grid_axis,
-    kept_dimensions,
-    pose_arrays,
-    sight_rotation,
-    viewing_angle_of,
-    with_sampling,
-)
+from sweep.analysis import dataset
+from sweep.analysis.dataset import DRAWS, Poses, axes_of, bearing_of, in_sight_frame, sight_rotation
 from sweep.analysis.estimator import INTERVAL, Columns, arranged
 from sweep.analysis.intervals import DEVIATIONS
 from sweep.errors import ArgumentError, DatasetError
@@ -87,8 +74,8 @@ class BinSums:
 
     @classmethod
     def of(cls, moments: Floats, quantity: int) -> BinSums:
-        """Return the sums of an error; ``moments`` (bins, columns) are those of `moments_of`."""
-        some = moments[moments[:, 0] > 0]
+        """Return the sums of an error; ``moments`` (*bins, columns) are those of `moments_of`."""
+        some = moments[moments[..., 0] > 0]
         start, count = 4 + POWERS * quantity, some[:, :1]
         return cls(count[:, 0], some[:, 1:4] / count, some[:, start : start + POWERS] / count)
 
@@ -185,24 +172,28 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     A⁻¹ M A⁻¹ with the bins' own fourth moments, so that tails need not be normal: White, "Maximum
     likelihood estimation of misspecified models", Econometrica 50, 1982.
     """
-    count, mean = sums.count, sums.means[:, 0]
+    count, mean, none = sums.count, sums.means[:, 0], np.zeros(len(penalty))
 
     def squares(bias: Floats) -> Floats:
         return sums.about(basis @ bias, 2)
 
-    bias = _weighted(basis, penalty, count, mean)
-    log_variance = _weighted(basis, penalty, count, np.log(squares(bias)))
+    bias, _ = _solved(basis, penalty, count, mean, none)
+    log_variance, bread = _solved(basis, penalty, count, np.log(squares(bias)), none)
     for _ in range(ITERATIONS):
         ratio = squares(bias) * np.exp(-(basis @ log_variance))
-        step = np.clip(_weighted(basis, penalty, count, ratio - 1.0, log_variance), -2.0, 2.0)
+        step = np.clip(
+            _solved(basis, penalty, count, ratio - 1.0, log_variance)[0], -2.0, 2.0)
         log_variance = log_variance + step
-        bias, bias_covariance = _bias(basis, penalty, count, mean, log_variance)
+        # In units of the knots' standard deviations, so that the penalty is as weak at all.
+        scale = np.exp(0.5 * log_variance)
+        bias, covariance = _solved(
+            basis * scale, penalty, count * np.exp(-(basis @ log_variance)), mean, none)
+        bias, covariance = scale * bias, covariance * scale[:, None] * scale
         if np.abs(step).max() < CONVERGED:
             break
     fitted = basis @ log_variance
     kurtosis = sums.about(basis @ bias, 4) * np.exp(-2.0 * fitted)
     ratio = squares(bias) * np.exp(-fitted)
-    bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
     # Mean of (residual² / variance - 1)². A bin's own is too small as often as it has not seen
     # its tails: it is at least the variance of all.
     spread = np.maximum(kurtosis - 2.0 * ratio + 1.0, 0.0)
@@ -212,39 +203,23 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     few = 1.0 + 2.0 / max(total / free - 2.0, 1.0)  # variance of Student's t of a knot's poses
     return Fit(
         bias, log_variance + np.log(total / max(total - free, 1.0)),
-        np.asarray(bias_covariance * few), np.asarray(bread @ meat @ bread * few))
+        np.asarray(covariance * few), np.asarray(bread @ meat @ bread * few))
 
 
-def _bias(
-    basis: Floats, penalty: Floats, count: Floats, mean: Floats, log_variance: Floats
+def _solved(
+    basis: Floats, penalty: Floats, weight: Floats, values: Floats, present: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the coefficients of the bias and their covariance, by weighted least squares.
+    """Return weighted least-squares coefficients, as a step from present ones, and a covariance.
 
-    In units of the knots' standard deviations, so that the penalty is as weak at all.
+    A small penalty, on the coefficients and not on the step, makes the equations regular. The
+    covariance is for weights that are inverse variances.
     """
-    scale = np.exp(0.5 * log_variance)
-    design, weight = basis * scale, count * np.exp(-(basis @ log_variance))
-    covariance = np.linalg.inv(_normal(design, penalty, weight)).astype(np.float64)
-    coefficients = covariance @ ((design * weight[:, None]).T @ mean)
-    return scale * coefficients, covariance * scale[:, None] * scale
-
-
-def _normal(basis: Floats, penalty: Floats, weight: Floats) -> Floats:
-    """Return the matrix of the normal equations, made regular by a small penalty."""
-    matrix = (basis * weight[:, None]).T @ basis
+    weighted = (basis * weight[:, None]).T
+    matrix = weighted @ basis
     scale = max(float(np.trace(matrix)) / len(matrix), 1e-300)
-    return np.asarray(matrix + scale * (RIDGE * penalty + REGULAR * np.eye(len(matrix))))
-
-
-def _weighted(
-    basis: Floats, penalty: Floats, weight: Floats, values: Floats, present: Floats | None = None,
-) -> Floats:
-    """Return the weighted least-squares coefficients; a step from ``present`` ones if given."""
-    right = (basis * weight[:, None]).T @ values
-    matrix = _normal(basis, penalty, weight)
-    if present is not None:  # the penalty is on the coefficients, not on the step
-        right -= (matrix - (basis * weight[:, None]).T @ basis) @ present
-    return np.asarray(np.linalg.solve(matrix, right))
+    ridge = scale * (RIDGE * penalty + REGULAR * np.eye(len(matrix)))
+    covariance = np.linalg.inv(matrix + ridge).astype(np.float64)
+    return np.asarray(covariance @ (weighted @ values - ridge @ present)), covariance
 
 
 def choose_knots(values: Floats, count: int) -> Floats:
@@ -469,7 +444,7 @@ class Sights:
                 "rotation_error_rad"))
         distance = position[:, 2]
         at = np.stack([condition.scaled(values) for condition, values in zip(
-            CONDITIONS.values(), (distance, focal_size / distance, viewing_angle_of(
+            CONDITIONS.values(), (distance, focal_size / distance, dataset.viewing_angle_of(
                 rotation, position), bearing_of(position)), strict=True)], axis=-1)
         errors = np.concatenate([in_sight_frame(each, position) for each in (
             moved / distance[:, None], turned)], axis=-1)
@@ -481,43 +456,37 @@ class Sights:
         return self.solved & ~self.flipped
 
 
-@dataclass(frozen=True)
-class Bins:
-    """Edges of bins along the scaled conditions, of all four or without the bearing."""
-
-    edges: tuple[Floats, ...]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Numbers of bins."""
-        return tuple(len(each) - 1 for each in self.edges)
-
-    def sums(self, poses: Sights, used: Masks, columns: Iterable[ArrayLike] = (1.0,)) -> Floats:
-        """Return sums (halves, bins, columns) of columns (n,) over the used poses in each bin."""
-        inside, at = used.copy(), poses.half
-        for values, edges, count in zip(poses.at.T, self.edges, self.shape, strict=False):
-            number = np.searchsorted(edges, values, side="right") - 1
-            inside &= (number >= 0) & (number < count)
-            at = at * count + np.clip(number, 0, count - 1)
-        size = math.prod(self.shape)
-        found = [np.bincount(at[inside], np.broadcast_to(column, at.shape)[inside], HALVES * size)
-                 for column in columns]
-        return np.stack(found, axis=-1).reshape(HALVES, size, -1).astype(np.float64)
+#: Edges of bins along the scaled conditions, of all four or without the bearing.
+Edges = tuple[Floats, ...]
 
 
-def moments_of(bins: Bins, poses: Sights) -> Floats:
-    """Return sums (halves, bins, columns): poses, coordinates, and powers 1 to 4 of each error."""
+def binned(
+    edges: Edges, poses: Sights, used: Masks, columns: Iterable[ArrayLike] = (1.0,)
+) -> Floats:
+    """Return sums (halves, *bins, columns) of columns (n,) over the used poses in each bin."""
+    inside, at, shape = used.copy(), poses.half, (HALVES, *(len(each) - 1 for each in edges))
+    for values, ends, count in zip(poses.at.T, edges, shape[1:], strict=False):
+        number = np.searchsorted(ends, values, side="right") - 1
+        inside &= (number >= 0) & (number < count)
+        at = at * count + np.clip(number, 0, count - 1)
+    found = [np.bincount(at[inside], np.broadcast_to(column, at.shape)[inside], math.prod(shape))
+             for column in columns]
+    return np.stack(found, axis=-1).reshape(*shape, -1).astype(np.float64)
+
+
+def moments_of(bins: Edges, poses: Sights) -> Floats:
+    """Return sums (halves, *bins, columns): poses, coordinates, powers 1 to 4 of each error."""
     def columns() -> Iterable[ArrayLike]:
         yield 1.0
         yield from poses.at[:, :3].T
         for error in poses.errors.T:
             yield from (error, error**2, error**2 * error, (error**2) ** 2)
 
-    return bins.sums(poses, poses.used, columns())
+    return binned(bins, poses, poses.used, columns())
 
 
-def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights) -> Floats:
-    """Return sums (halves, bins, 10) of how many errors lie within two sigma of the bias.
+def within_of(cells: Edges, knots: Sequence[Floats], fitted: Floats, poses: Sights) -> Floats:
+    """Return sums (halves, *cells, 10) of how many errors lie within two sigma of the bias.
 
     The first four columns are poses looked for, solved, flipped and judged; then follow those
     within, for each error. Each half of the trials is judged by the model of the other: ``fitted``
@@ -526,9 +495,9 @@ def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights
     basis = hat_basis(poses.at[:, :3], knots)
     of_halves = np.tensordot(basis, fitted, axes=(1, 1))[np.arange(len(basis)), 1 - poses.half]
     within = np.abs(poses.errors - of_halves[..., 0]) <= 2.0 * np.exp(0.5 * of_halves[..., 1])
-    counts = [bins.sums(poses, mask) for mask in (
+    counts = [binned(cells, poses, mask) for mask in (
         np.ones_like(poses.solved), poses.solved, poses.flipped, poses.used)]
-    return np.concatenate([*counts, bins.sums(poses, poses.used, within.T)], axis=-1)
+    return np.concatenate([*counts, binned(cells, poses, poses.used, within.T)], axis=-1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -536,7 +505,7 @@ def within_of(bins: Bins, knots: Sequence[Floats], fitted: Floats, poses: Sights
 
 def bins_and_cells(
     found: Mapping[str, Floats], poses: int, *, collinear: bool
-) -> tuple[Bins, Bins]:
+) -> tuple[Edges, Edges]:
     """Return the bins that models are fitted to, and the wider cells in which they are judged.
 
     Few distinct values, of an axis, have a bin and a cell each; others, which were drawn, have some
@@ -558,18 +527,17 @@ def bins_and_cells(
     many = max(2, int((poses / (POSES_A_CELL * math.prod(few))) ** (
         1.0 / max(len(varying) - len(few), 1))))
 
-    def bins(count: Callable[[Condition], int]) -> Bins:
-        return Bins(tuple(
-            CONDITIONS[name].edges(
-                found[name], count(CONDITIONS[name]), single=name not in varying)
-            for name in PREDICTORS))
+    def bins(count: Callable[[Condition], int]) -> Edges:
+        return tuple(CONDITIONS[name].edges(
+            found[name], count(CONDITIONS[name]), single=name not in varying)
+            for name in PREDICTORS)
 
     return bins(lambda each: each.bins), bins(lambda each: min(many, each.cells))
 
 
 def region_cells(
     found: Mapping[str, Floats], poses: int, trials: int
-) -> tuple[Bins, tuple[int, ...]]:
+) -> tuple[Edges, tuple[int, ...]]:
     """Return the cells of conditions that poses are in or not, and which conditions were drawn.
 
     Few distinct values, of an axis, have a cell each, also those that jitter spreads a little;
@@ -583,10 +551,10 @@ def region_cells(
     many = poses / (POSES_A_REGION_CELL * others)
     count = min(max(1, int(many ** (1.0 / max(len(drawn), 1)))), MAX_REGION_CELLS)
     shares = np.linspace(0.0, 1.0, count + 1)[1:-1]
-    return Bins(tuple(
+    return tuple(
         np.concatenate([[-np.inf], np.unique(np.quantile(values, shares))
                         if middle is None else middle, [np.inf]])
-        for middle, values in zip(middles, found.values(), strict=True))), drawn
+        for middle, values in zip(middles, found.values(), strict=True)), drawn
 
 
 def region_directions(found: Mapping[str, Floats]) -> Floats:
@@ -604,17 +572,16 @@ def region_directions(found: Mapping[str, Floats]) -> Floats:
     return np.stack(rows)
 
 
-def knot_values(bins: Bins, moments: Floats) -> list[Floats]:
+def knot_values(bins: Edges, moments: Floats) -> list[Floats]:
     """Return the values that may be knots: of each axis the means of its bins, and both ends.
 
-    Where a bin is a single value that is the value itself. ``moments`` (bins, 4) are the numbers of
+    Where a bin is a single value that is the value itself. ``moments`` (*bins, 4) are numbers of
     poses and the sums of their coordinates.
     """
     knots = []
-    columns = moments.reshape(*bins.shape, 4)
-    for axis, edges in enumerate(bins.edges):
-        others = tuple(k for k in range(len(bins.shape)) if k != axis)
-        count, total = np.moveaxis(columns[..., [0, 1 + axis]].sum(axis=others), -1, 0)
+    for axis, edges in enumerate(bins):
+        others = tuple(k for k in range(len(bins)) if k != axis)
+        count, total = np.moveaxis(moments[..., [0, 1 + axis]].sum(axis=others), -1, 0)
         middle = total[count > 0] / count[count > 0]
         if len(middle) > 1:
             middle = np.unique([edges[0], *middle[1:-1], edges[-1]])
@@ -748,11 +715,11 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     ['too_narrow', 'rarely_solved', 'rarely_solved']
     """
     kept = [name for name in axes_of(results)
-            if name != DRAWS and (name == "dictionary" or not is_grid_axis(name, results))]
-    kept_dimensions(results, kept)
-    inputs = pose_arrays(results, SIGNED_INPUTS)
+            if name != DRAWS and (name == "dictionary" or not dataset.is_grid_axis(name, results))]
+    dataset.kept_dimensions(results, kept)
+    inputs = dataset.pose_arrays(results, dataset.SIGNED_INPUTS)
     _check_drawn(results)
-    focal_size = focal_size_of(results)
+    focal_size = dataset.focal_size_of(results)
     halves = (results[DRAWS] % HALVES).astype(np.int64).reset_coords(drop=True).drop_vars(DRAWS)
     columns = arranged(results, {**inputs, HALF: halves, FOCAL_SIZE: focal_size}, kept)[0]
     models = [
@@ -787,7 +754,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         whole = sums.sum(axis=0)
         tables.append({
             **_of_knots(_at_knots(whole, own, knots), knots), **_exponents(whole),
-            **_of_cells(np.asarray(judged), cells), **_of_region(model, region, drawn, directions),
+            **_of_cells(np.asarray(judged)), **_of_region(model, region, drawn, directions),
             "knots": np.array([[*map(len, each)] for each in own])})
     variables: dict[str, Any] = {"direction_weight": (
         ("direction", "condition"), directions,
@@ -806,17 +773,17 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
     parts = [(name, name, at, "knots") for name, at in zip(PREDICTORS, knots, strict=True)]
-    for name, edges in zip(PREDICTORS, cells.edges, strict=True):
+    for name, edges in zip(PREDICTORS, cells, strict=True):
         parts += [(f"cell_{name}_low", name, edges[:-1], "low end of cells"),
                   (f"cell_{name}_high", name, edges[1:], "high end of cells")]
     parts += [(f"region_{name}", name, edges[:-1], "low end of cells of the region")
-              for name, edges in zip(CONDITIONS, region.edges, strict=True)]
+              for name, edges in zip(CONDITIONS, region, strict=True)]
     for coordinate, name, at, words in parts:
         condition = CONDITIONS[name]
         coordinates[coordinate] = (
             coordinate.removesuffix("_low").removesuffix("_high"), condition.unscaled(at),
             {"units": condition.units, "long_name": f"{words} of {condition.words}"})
-    return with_sampling(xr.Dataset(variables, coordinates, attrs={
+    return dataset.with_sampling(xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),
         "focal_size_varies": int(most > least * (1 + 1e-9)),
     }), results)
@@ -851,7 +818,7 @@ def _check_drawn(results: xr.Dataset) -> None:
 
 def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:
     """Raise DatasetError if a configuration has too few solved poses."""
-    solved = moments[..., 0].sum(axis=2).min(axis=1).astype(int) * HALVES
+    solved = moments[..., 0].sum(axis=(2, 3, 4)).min(axis=1).astype(int) * HALVES
     for number, count in enumerate(solved.tolist()):
         if count < MIN_POSES:
             index = np.unravel_index(number, [results.sizes[name] for name in kept])
@@ -869,7 +836,7 @@ def _metres(distance_m: Floats) -> Floats:
 
 
 def _of_region(
-    model: Sequence[Sights], region: Bins, drawn: tuple[int, ...], directions: Floats
+    model: Sequence[Sights], region: Edges, drawn: tuple[int, ...], directions: Floats
 ) -> Values:
     """Return the joint region of the conditions that was seen.
 
@@ -878,8 +845,7 @@ def _of_region(
     the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
     """
     cells = np.asarray(sum(
-        region.sums(block, np.ones_like(block.solved)).sum(axis=(0, 2)) for block in model))
-    cells = cells.reshape(region.shape)
+        binned(region, block, np.ones_like(block.solved)).sum(axis=(0, -1)) for block in model))
     of_grid = cells.sum(axis=drawn)
     projected = np.concatenate([block.at for block in model]) @ directions.T
     low, high = projected.min(axis=0), projected.max(axis=0)
@@ -911,29 +877,29 @@ def _of_knots(fit: Floats, knots: Sequence[Floats]) -> Values:
     return values
 
 
-def _of_cells(judged: Floats, bins: Bins) -> Values:
-    """Return whether a model may be used in cells; ``judged`` (halves, cells, columns)."""
-    looked_for, solved, flipped, n = np.rint(judged[..., :4].sum(axis=0)).astype(np.int64).T
+def _of_cells(judged: Floats) -> Values:
+    """Return whether a model may be used in cells; ``judged`` (halves, *cells, columns)."""
+    looked_for, solved, flipped, n = np.moveaxis(
+        np.rint(judged[..., :4].sum(axis=0)).astype(np.int64), -1, 0)
     within, of_halves = judged[..., 4:], judged[..., [3]]
     with np.errstate(invalid="ignore", divide="ignore"):
-        coverage, of_half = within.sum(axis=0) / n[:, None], within / of_halves
+        coverage, of_half = within.sum(axis=0) / n[..., None], within / of_halves
         flip_rate, solved_rate = flipped / solved, solved / looked_for
         spread, spread_of_half = (
-            np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[:, None], of_halves))
+            np.sqrt(NOMINAL * (1.0 - NOMINAL) / count) for count in (n[..., None], of_halves))
     # Limits are wider by a standard error, of each half by two.
     low, high = (
         (sign * (coverage - limit) > spread) | (
             sign * (of_half - limit) > 2.0 * spread_of_half).any(axis=0)
         for sign, limit in zip((-1.0, 1.0), COVERAGE, strict=True))
     use = np.select(
-        [*(each[:, None] for each in (
+        [*(each[..., None] for each in (
             looked_for == 0, solved_rate < MIN_DETECTION, flip_rate > MAX_FLIPS, n < MIN_JUDGED)),
          low, high],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
         Use.holds).astype(np.uint8)
-    values = {"coverage": coverage.T, "use": use.T, "judged": n, "looked_for": looked_for,
-              "solved_rate": solved_rate, "flip_rate": flip_rate}
-    return {name: each.reshape(*each.shape[:-1], *bins.shape) for name, each in values.items()}
+    return {"coverage": np.moveaxis(coverage, -1, 0), "use": np.moveaxis(use, -1, 0), "judged": n,
+            "looked_for": looked_for, "solved_rate": solved_rate, "flip_rate": flip_rate}
 
 
 def _exponents(moments: Floats) -> Values:
@@ -1081,16 +1047,14 @@ def model_covariance(
     position = np.atleast_2d(np.asarray(position_m, dtype=np.float64))
     values = model_errors(
         model, position[:, 2], viewing_angle_deg, side_px, bearing_of(position))
-    turn = sight_rotation(position)
-    covariance = np.zeros((len(position), 6, 6))
-    bias = np.zeros((len(position), 6))
-    for part in (slice(0, 3), slice(3, 6)):
-        variance = values["sigma"].values[:, part] ** 2
-        covariance[:, part, part] = np.einsum("nij,nj,nkj->nik", turn, variance, turn)
-        bias[:, part] = np.einsum("nij,nj->ni", turn, values["bias"].values[:, part])
+    turn = np.kron(np.eye(2), sight_rotation(position))  # of position and rotation each
+    sigma, bias = (values[name].values for name in ("sigma", "bias"))
     return xr.Dataset({
-        "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
-        "bias": (("pose", "row"), bias, {"units": "m, radian"}), "use": values["use"],
+        "covariance": (
+            ("pose", "row", "column"), np.einsum("nij,nj,nkj->nik", turn, sigma**2, turn),
+            {"units": "m2, m rad, rad2"}),
+        "bias": (("pose", "row"), np.einsum("nij,nj->ni", turn, bias), {"units": "m, radian"}),
+        "use": values["use"],
     })
 
 

@@ -165,10 +165,8 @@ def execute(
             if overwrite and exists(url):
                 lifecycle.remove_store(url)
             begun = lifecycle.create_store(url, pipeline, cut.extents)
-        if stricter:
-            begun = tighten(begun, pipeline)
-        if again:  # once nothing refuses the run
-            begun, again = status.drop_failed(begun)
+        if stricter or again:  # once nothing refuses the run
+            begun = lifecycle.reopen(begun, pipeline if stricter else None, again)
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
@@ -225,22 +223,6 @@ def _matching_sources(
 
 
 # The blocks, and the end
-
-
-def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
-    """Give a store a pipeline of the same cells and another rule of stopping; return it then.
-
-    Blocks that were committed under the former rule are decided again when the store is continued,
-    each from what it has.
-
-    Raises
-    ------
-    StoreError
-        If another process writes the store, or it cannot be written.
-    """
-    with changing(store.url, store.storage):
-        lifecycle.reopen(store, pipeline)
-    return lifecycle.open_store(store.url, "r+")
 
 
 def _compute_and_close(

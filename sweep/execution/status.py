@@ -21,8 +21,8 @@ from sweep.messages import plain, quoted
 from sweep.processor import differing_processors
 from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
-from sweep.store.lifecycle import open_store, reopen, write_groups
-from sweep.store.lock import changing, is_written
+from sweep.store.lifecycle import open_store, write_groups
+from sweep.store.lock import is_written
 from sweep.typing import Integers
 
 if TYPE_CHECKING:
@@ -305,30 +305,6 @@ def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict
         number: count for number, receipt in blocks.receipts(store, chosen)
         if (count := sum(lost_counts(receipt.detection, receipt.estimate).values()))
     }
-
-
-def drop_failed(store: RunStore) -> tuple[RunStore, dict[int, int]]:
-    """Drop the committed blocks in which cells failed or crashed, so that a run computes them.
-
-    A finished store is marked unfinished before. A kill at any instant leaves a store that another
-    run continues: a block is either as it was, or computed anew as a whole.
-
-    Returns
-    -------
-    The store as it is then; what was dropped, as :func:`failed_blocks` returns it.
-
-    Raises
-    ------
-    StoreError
-        If a receipt is damaged, another process writes the store, or it cannot be written.
-    """
-    with changing(store.url, store.storage):
-        failed = failed_blocks(store)
-        if failed and store.finished:
-            reopen(store)
-        for number in failed:
-            blocks.drop_block(store, store.blocks[number])
-    return open_store(store.url, "r+"), failed
 
 
 # --------------------------------------------------------------------------------------------------

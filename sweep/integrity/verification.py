@@ -31,7 +31,7 @@ from sweep.messages import nearest, plain, refusal
 from sweep.plugins.loading import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
-from sweep.store import blocks, files, lifecycle, lock
+from sweep.store import blocks, files, lifecycle
 from sweep.store.blocks import Receipt, RunStore
 from sweep.store.provenance import differences, excerpt
 
@@ -432,15 +432,11 @@ def repair(
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
     pipeline = computable(store) if numbers else store.pipeline
-    with lock.changing(url, store.storage):
-        lifecycle.reopen(store)
-        store = lifecycle.open_store(url, "r+")
-        for number in numbers:
-            blocks.drop_block(store, store.blocks[number])
-        if before.finished and not numbers:
-            close(store)
+    store = lifecycle.reopen(store, drop=numbers)
     if before.finished and numbers:
         execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
+    elif before.finished:
+        close(store)
     after = report_on(lifecycle.open_unchecked(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.unstable, after.damage = before.unstable, after.damage + lasting

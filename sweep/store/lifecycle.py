@@ -550,23 +550,35 @@ def _only_committed(
 #
 # Two processes may close a store at once: they write the same files.
 
-def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
-    """Mark a store unfinished, so that blocks of it can be computed again.
+def reopen(
+    store: RunStore, pipeline: Pipeline | None = None, drop: Iterable[int] = ()
+) -> RunStore:
+    """Mark a store unfinished, so that a run computes what it lacks then; return it opened again.
 
     Its metadata and coordinates are written again. Its groups go, since they sum the blocks up. A
-    ``pipeline`` of the same cells is its own from then on. A kill at any instant leaves a store
-    with one of the two.
+    ``pipeline`` of the same cells, such as one of another rule of stopping, is its own from then
+    on: blocks are decided again, each from what it has. Blocks to ``drop`` are computed anew. A
+    kill at any instant leaves a store with one of the two pipelines and whole blocks, which a run
+    continues.
+
+    Raises
+    ------
+    StoreError
+        If another process writes the store, or it cannot be written.
     """
     contents = planned_files(planned_arrays(store.pipeline, store.blocks.extents))
-    metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline)) | {
-        "finished": False, "files": checksums(contents)}
-    for ended in ("finished_at", "counts"):
-        metadata.pop(ended, None)
-    with locations.translate_errors(store.url, "written"):
+    with changing(store.url, store.storage), locations.translate_errors(store.url, "written"):
+        metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline)) | {
+            "finished": False, "files": checksums(contents)}
+        for ended in ("finished_at", "counts"):
+            metadata.pop(ended, None)
         files.write_files(store.storage, contents)
         write_root(store, metadata, pipeline)
         for name in TABLES:
             files.delete_folder(store.storage, name)
+        for number in drop:
+            blocks.drop_block(store, store.blocks[number])
+    return open_store(store.url, "r+")
 
 
 def write_groups(

@@ -20,10 +20,9 @@ from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
-from sweep.execution.status import drop_failed
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
-from sweep.store.lifecycle import create_store, open_store, remove_store
+from sweep.store.lifecycle import create_store, open_store, remove_store, reopen
 from sweep.store.locations import exists
 from sweep.store.lock import is_written, writing
 
@@ -102,7 +101,7 @@ def test_server_refuses_changes_while_a_process_writes(monkeypatch):
         time.sleep(1.8)  # its key is renewed
         assert is_written(store.storage)
         for change in (
-            lambda: remove_store(url), lambda: drop_failed(store),
+            lambda: remove_store(url), lambda: reopen(store),
             lambda: execute(pipeline, url, overwrite=True),
         ):
             with pytest.raises(StoreError, match="is writing it"):

@@ -7,12 +7,12 @@ import pytest
 from support.here import calls_here
 from support.stores import by_hand, in_waves, same
 from sweep.errors import OtherExperimentError
-from sweep.execution.runner import execute, tighten
+from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import repair, verify
 from sweep.store.blocks import committed, drop_block, receipts
-from sweep.store.lifecycle import open_store
+from sweep.store.lifecycle import open_store, reopen
 
 TEXT = """
 seed = 3
@@ -44,7 +44,7 @@ def test_tightened_twice_and_interrupted_is_as_asked_for_at_once(at_once, tmp_pa
     needed = [sum(r.scenes_needed for _, r in receipts(store, committed(store)))]
     for width in WIDTHS[1:]:
         pipeline = precise(width)
-        store = tighten(store, pipeline)
+        store = reopen(store, pipeline)
         assert store.pipeline.stopping == pipeline.stopping
         in_waves(store, most=1)
         in_waves(store)  # as a run that continues
@@ -61,7 +61,7 @@ def test_verify_finds_blocks_that_do_not_follow_from_the_rule(at_once, tmp_path)
     assert verify(at_once, 1).damage == []
     assert status(at_once).settled == 3
     # Under another precision, the same flags are wrong; an open run computes them again.
-    tighten(by_hand(url, precise(WIDTHS[-1]), (3, 50)), precise("0.05"))
+    reopen(by_hand(url, precise(WIDTHS[-1]), (3, 50)), precise("0.05"))
     assert verify(url, 0).damage == []
     close(open_store(url, "r+"))
     damage = verify(url, 0).damage

@@ -11,11 +11,11 @@ from zarr.storage import MemoryStore
 
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
-from sweep.execution.status import drop_failed, status
+from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
 from sweep.store.files import files_in, write_files, write_whole
-from sweep.store.lifecycle import create_store, open_store, remove_store
+from sweep.store.lifecycle import create_store, open_store, remove_store, reopen
 from sweep.store.lock import changing, is_written, writing
 
 TEXT = "axes.trial = 4\n[pose]\njitter_px = 0.5\nside_px = 40"
@@ -36,7 +36,7 @@ def test_writers_exclude_nobody_who_writes_and_refuse_all_changes(store, pipelin
     with writing(store.url, store.storage), writing(store.url, store.storage):
         assert status(store.url).being_written
         for change in (
-            lambda: remove_store(store.url), lambda: drop_failed(store),
+            lambda: remove_store(store.url), lambda: reopen(store),
             lambda: execute(pipeline, store.url, overwrite=True),
         ):
             with pytest.raises(StoreError, match="is writing it"):

@@ -20,9 +20,9 @@ import zarr.storage._local as local
 
 from sweep.evaluation.block import run_cells
 from sweep.execution.block_task import compute_block
-from sweep.execution.status import close, drop_failed
+from sweep.execution.status import close, failed_blocks
 from sweep.experiment.pipeline import Pipeline
-from sweep.store.lifecycle import create_store, open_store
+from sweep.store.lifecycle import create_store, open_store, reopen
 from sweep.store.provenance import fingerprint
 
 PATIENCE_S = 300
@@ -41,8 +41,9 @@ def closing(folder, _, number):
 
 def dropping(folder, _, number):
     """Drop the blocks with failed cells of a copy of a complete store."""
-    drop_failed(open_store(
-        shutil.copytree(f"{folder}/complete.zarr", f"{folder}/{number}.zarr"), "r+"))
+    store = open_store(
+        shutil.copytree(f"{folder}/complete.zarr", f"{folder}/{number}.zarr"), "r+")
+    reopen(store, drop=failed_blocks(store))
 
 
 def creating(folder, file, number):

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from sweep.messages import nearest, plain, shown, similar_names
+from sweep.messages import nearest, plain, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,10 +26,8 @@ class Declared:
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
-    named in place of a choice. ``abbreviated`` choices are known by their number and the letters
-    before it, such as ``36h11`` and ``tag36h11`` of ``DICT_APRILTAG_36h11``. ``reads`` returns a
-    value that is no choice in its type, or raises ValueError with what was expected, in place of
-    the checks by type.
+    named in place of a choice. ``reads`` returns a value that is no choice in its type, or raises
+    ValueError with what was expected, in place of the checks by type.
     """
 
     name: str
@@ -47,7 +45,6 @@ class Declared:
     lengths: tuple[int, ...] = ()
     list_text: str = ""
     plugin: str = ""
-    abbreviated: bool = False
     reads: Callable[[Any], Any] | None = None
 
     def range_text(self) -> str:
@@ -75,15 +72,7 @@ class Declared:
         if word in self.choices:
             return word
         wanted = self._letters(word.strip().replace("::", ".").rpartition(".")[2])
-        spelled = {self._letters(choice): choice for choice in self.choices}
-        if wanted in spelled or not self.abbreviated or not re.search("[a-z]", wanted):
-            return spelled.get(wanted)
-        # The one choice that ends so, and has its number whole.
-        found = [
-            choice for letters, choice in spelled.items()
-            if letters.endswith(wanted) and re.search("[0-9]", wanted)
-            and not re.search("[0-9]", letters.removesuffix(wanted))]
-        return found[0] if len(found) == 1 else None
+        return next((each for each in self.choices if self._letters(each) == wanted), None)
 
     def _letters(self, word: str) -> str:
         """Return the letters and digits by which a choice is known."""
@@ -131,8 +120,7 @@ class Declared:
     def _hint(self, value: Any) -> str:
         """Return the choice that a wrong value may stand for."""
         if isinstance(value, str) and self.choices:
-            bare = value.removeprefix(self.prefix)
-            return similar_names(bare, self.choices) or nearest(bare, self.choices)
+            return nearest(value.removeprefix(self.prefix), self.choices)
         name = next((name for name, constant in self.numbers if constant == value), None)
         return f"; OpenCV's constant {value} is {name}" if name else ""
 

@@ -66,7 +66,7 @@ def notice(line: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """Return a value as TOML, cut if it is long; most of the rest is not even formatted.
+    """Return a value as TOML, cut if it is long.
 
     >>> shown({"uniform": [0, 4.5]})
     '{uniform = [0, 4.5]}'
@@ -75,23 +75,15 @@ def shown(value: Any) -> str:
 
 
 def _toml(value: Any) -> str:
-    # No more than so many items are shown.
     if isinstance(value, dict):
-        items = itertools.islice(value.items(), MAX_QUOTE_LENGTH)
-        return "{" + ", ".join(f"{_key(str(key))} = {_toml(item)}" for key, item in items) + "}"
-    if isinstance(value, (list, tuple)):
+        return f"{{{', '.join(f'{key} = {_toml(item)}' for key, item in value.items())}}}"
+    if isinstance(value, (list, tuple)):  # no more than so many items are shown
         return f"[{', '.join(map(_toml, value[:MAX_QUOTE_LENGTH]))}]"
-    if isinstance(value, str):
-        return json.dumps(value[:MAX_QUOTE_LENGTH], ensure_ascii=False)
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int) and value.bit_length() >= 10_000:
-        return f"{value:#x}"  # Python writes no more than 4300 decimal digits
-    return value.isoformat().replace("+00:00", "Z") if hasattr(value, "isoformat") else str(value)
-
-
-def _key(key: str) -> str:
-    return key if key.isascii() and key.replace("-", "_").isidentifier() else _toml(key)
+    if isinstance(value, (str, bool)):
+        return json.dumps(value, ensure_ascii=False)
+    # Python writes no more than 4300 decimal digits.
+    large = isinstance(value, int) and value.bit_length() >= 10_000
+    return f"{value:#x}" if large else str(value)
 
 
 def label(value: Any) -> str:
@@ -113,7 +105,7 @@ MAX_WORD_LENGTH = 60
 
 
 def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
-    """Return the most similar known word, or "" if none is similar.
+    """Return the known word that a word is a part of, else the most similar one; "" without.
 
     Letters' cases, underscores and hyphens do not count. ``cutoff``: least share of equal letters.
     The word itself is never suggested: it is known, and wrong for another reason.
@@ -121,7 +113,7 @@ def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
     if len(word) > MAX_WORD_LENGTH:
         return ""
     letters, simple = _letters(word), {_letters(name): name for name in known if name != word}
-    longer = [each for each in simple if letters and each.startswith(letters)]
+    longer = [each for each in simple if len(letters) > 1 and letters in each]
     close = longer or difflib.get_close_matches(letters, list(simple), n=1, cutoff=cutoff)
     return simple[min(close, key=len)] if close else ""
 
@@ -129,29 +121,11 @@ def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
 def nearest(word: str, known: Collection[str]) -> str:
     """Return "; did you mean ...?" with the most similar known word, or "".
 
-    >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
-    ('; did you mean tilt_deg?', '; did you mean marker_id?')
+    >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("4x4", ["DICT_5X5_50", "DICT_4X4_50"])
+    ('; did you mean tilt_deg?', '; did you mean DICT_4X4_50?')
     """
     close = similar(word, known)
     return f"; did you mean {close}?" if close else ""
-
-
-#: Names of which a word may be a part that are listed.
-MAX_SIMILAR = 6
-
-
-def similar_names(word: str, known: Sequence[str]) -> str:
-    """Return "; did you mean A, B or C?" with the known names that a word is a part of, or "".
-
-    >>> similar_names("4x4", ["DICT_4X4_100", "DICT_4X4_50", "DICT_5X5_50"])
-    '; did you mean DICT_4X4_50 or DICT_4X4_100?'
-    """
-    part = _letters(word)
-    names = {name.casefold(): name for name in known if part in _letters(name)}
-    if len(part) < 2 or len(names) < 2:
-        return ""
-    *others, last = sorted(names.values(), key=lambda name: (len(name), name))[:MAX_SIMILAR]
-    return f"; did you mean {', '.join(others)} or {last}?"
 
 
 def nearest_file(path: str | os.PathLike[str]) -> str:
@@ -167,12 +141,8 @@ def nearest_file(path: str | os.PathLike[str]) -> str:
         names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
     except (OSError, ValueError):
         return ""
-    if below is not None:
-        return f"; did you mean {plain(below, 300)}?"
-    stems = {Path(name).stem: name for name in names
-             if Path(name).suffix.lower() == wanted.suffix.lower()}
-    close = stems.get(similar(wanted.stem, stems)) or similar(wanted.name, names, 0.8)
-    return f"; did you mean {plain(wanted.with_name(close), 300)}?" if close else ""
+    near = below or wanted.with_name(similar(wanted.name, names, 0.8) or wanted.name)
+    return "" if near == wanted else f"; did you mean {plain(near, 300)}?"
 
 
 def _letters(word: str) -> str:

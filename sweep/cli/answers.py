@@ -415,7 +415,7 @@ def fit(
         lines += ["", "Half of the photographs, simulated with the scene of the others:", held_out]
     store = f"runs/{fitted.pipeline.name}.zarr"
     then = f"sweep run {quoted(output)}", "simulates this camera"
-    if library.locations.exists(store):
+    if path.suffix.lower() == ".toml" and library.locations.exists(store):
         then = quoted("sweep", "compare", store, output), "simulates the photographs with it"
     return findings(lines, {
         "scene": found.scene, "photographs": found.photographs, "markers": found.markers,

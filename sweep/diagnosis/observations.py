@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike
 
 from sweep.declaration import check_table
 from sweep.errors import ArgumentError
+from sweep.experiment.document import file_text
 from sweep.experiment.parameters import PARAMETERS
 from sweep.experiment.pipeline import parse_settings
 from sweep.measure.detectors import DetectorSetting, make_detector
 from sweep.measure.solver import both_planar_solutions
 from sweep.messages import nearest, plain, refusal
 from sweep.model.calibration import MAX_BYTES, Calibration
-from sweep.model.image_file import decode_grey, read_regular
+from sweep.model.image_file import decode_grey
 from sweep.model.pose import mirrored, rotation_of_vector, vector_of_rotation
 from sweep.photographs.cameras import camera_of_file, cameras_of
 from sweep.photographs.folder import detect_markers
@@ -282,11 +283,10 @@ def _cells(source: str | os.PathLike[str] | Mapping[str, Sequence[Any]]) -> pd.D
     try:
         if isinstance(source, Mapping):
             return pd.DataFrame(dict(source))
-        text = read_regular(os.fspath(source), MAX_BYTES).decode("utf-8-sig")
-    except (OSError, ValueError) as error:
+        text = file_text(source, MAX_BYTES)
+    except ValueError as error:
         given = "" if isinstance(source, Mapping) else plain(source)
-        problem = getattr(error, "strerror", None) or error
-        raise ArgumentError("observations", given, plain(problem)) from None
+        raise ArgumentError("observations", given, plain(error)) from None
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines)] or [[]]
     faults = [f"row {number} has {len(row)} cells, the header {len(header)}: expected commas "

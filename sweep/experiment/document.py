@@ -52,10 +52,10 @@ def refusing(source: str) -> Iterator[None]:
         raise refusal([f"{source}: {line}" for line in str(error).split("\n")]) from None
 
 
-def file_text(path: str | Path) -> str:
-    """Return the text of a TOML file; ValueError says why it cannot be read."""
+def file_text(path: str | os.PathLike[str], most: int = MAX_BYTES) -> str:
+    """Return the text of a file of at most so many bytes; ValueError says why it cannot be read."""
     try:
-        return read_regular(Path(path), MAX_BYTES).decode().removeprefix("\ufeff")
+        return read_regular(Path(path), most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"expected UTF-8: byte {error.start} is not") from None
     except (OSError, ValueError) as error:

@@ -20,6 +20,7 @@ from sweep.errors import ArgumentError
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, quoted
+from sweep.plugins.recording import is_recording
 from sweep.report.figure import Figure
 from sweep.report.table import (
     UNDECIDED,
@@ -237,10 +238,12 @@ def needs(each: Cause) -> str:
 
 
 def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str:
-    """Return the command that makes about as many draws as are needed."""
+    """Return the command that makes about as many draws as are needed, of simulated images."""
+    given = "photograph" in results.coords or any(
+        map(is_recording, np.ravel(results.get("detector", "")).tolist()))
     factor = max((each.draws_needed / each.draws for each in found
                   if each.draws > 0 and math.isfinite(each.draws_needed)), default=0.0)
-    if factor <= 1.0:
+    if factor <= 1.0 or given:
         return f"sweep report {quoted(store)}"
     unit = REPLICATES if is_replicated(results) else 1
     count = math.ceil(results.sizes.get(DRAWS, 1) * factor / unit) * unit
@@ -484,8 +487,9 @@ def limit_figure(limits: xr.Dataset) -> Figure:
                   key=lambda name: limits[name].dtype.kind in "fiu")
     limits = limits.isel({name: 0 for name in names if name not in dims})
     # At no value there is no limit, and no interval is drawn.
-    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never).drop_vars(along)
-    drawn = drawn.rename({"low": "value_low", "high": "value_high"})
+    drawn = limits[["value", "low", "high"]].where(limits["reach"] != Reach.never)
+    drawn = drawn.drop_vars(along, errors="ignore").rename(
+        {"low": "value_low", "high": "value_high"})
     column = Column(f"limit of {axis_label(limits, along)}", "value")
     title = f"Limit of {' and '.join(map(str, limits.attrs['require']))}"
     *others, x = [axis_label(limits, name) for name in dims] or [""]

@@ -77,7 +77,7 @@ def write_report(
     --------
     >>> found = sweep.write_report(folder / "two_sizes.zarr", folder / "report.html")
     >>> found.numbers["figures"], (folder / "report.html").exists()
-    (4, True)
+    (3, True)
     """
     for name, value in (("output", output), ("figures", figures)):
         if value is not None and not os.fspath(value).strip():

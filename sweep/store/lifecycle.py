@@ -26,7 +26,7 @@ from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
 from sweep.errors import StoreError, SweepError
-from sweep.experiment.document import MAX_BYTES, read_document
+from sweep.experiment.document import file_text, read_document
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
@@ -39,7 +39,7 @@ from sweep.experiment.schema import (
     with_description,
 )
 from sweep.messages import plain, refusal
-from sweep.model.image_file import IMAGE_SUFFIXES, read_regular
+from sweep.model.image_file import IMAGE_SUFFIXES
 from sweep.plugins.loading import RECORDED, recorded_plugins
 from sweep.store import blocks, files, locations
 from sweep.store.blocks import RunStore
@@ -709,7 +709,7 @@ def document_of(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any] | N
     """Return the document of a pipeline, its file or its store; None if it cannot be read."""
     try:
         found = _pipeline_or_file(source)
-        text = read_regular(found, MAX_BYTES).decode() if isinstance(found, str) else found.text
+        text = file_text(found) if isinstance(found, str) else found.text
         return read_document(text)
     except (OSError, ValueError, SweepError):
         return None

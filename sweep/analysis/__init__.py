@@ -7,7 +7,6 @@ solvers at three sides, eight draws each.
 
 from __future__ import annotations
 
-from sweep.analysis.ambiguities import ambiguity
 from sweep.analysis.camera_calibration import calibration_summary, camera_calibrations
 from sweep.analysis.comparisons import compare, renderer_bias, simulation_gap, store_differences
 from sweep.analysis.dataset import per_marker
@@ -19,6 +18,7 @@ from sweep.analysis.requirements import (
     requirement_limits,
 )
 from sweep.analysis.summaries import (
+    ambiguity,
     covariance_trust,
     detection_rate,
     efficiency,

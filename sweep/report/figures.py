@@ -9,10 +9,9 @@ import numpy as np
 import xarray as xr
 
 from sweep import analysis
-from sweep.analysis.ambiguities import ThresholdChoice
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Reached
-from sweep.analysis.summaries import ERROR_HEADINGS
+from sweep.analysis.summaries import ERROR_HEADINGS, ThresholdChoice
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.report import report_data

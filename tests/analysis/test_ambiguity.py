@@ -8,7 +8,7 @@ from scipy import stats
 
 from support.small_datasets import perfect
 from sweep.analysis import ambiguity
-from sweep.analysis.ambiguities import THRESHOLDS, ThresholdChoice
+from sweep.analysis.summaries import THRESHOLDS, ThresholdChoice
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 

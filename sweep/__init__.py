@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.fit import fit
-    from sweep.report.cost_tables import measure_tradeoff
-    from sweep.report.decisions import require
+    from sweep.report.findings import measure_tradeoff, require
     from sweep.report.reference import reference
     from sweep.report.table import Findings
     from sweep.report.write_report import write_report
@@ -81,7 +80,7 @@ experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported 
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
     "diagnose": "diagnosis", "error_model": "detection", "fit": "fit",
-    "measure_tradeoff": "cost_tables", "reference": "reference", "require": "decisions",
+    "measure_tradeoff": "findings", "reference": "reference", "require": "findings",
     "write_report": "write_report",
 }
 
@@ -532,4 +531,4 @@ def compare(
         for name, value, unset in (("store", store, None), ("repeats", repeats, 1)):
             if value != unset:
                 raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
-    return library.comparison_tables.compare(one, other, bins=bins or None, output=figure)
+    return library.findings.compare(one, other, bins=bins or None, output=figure)

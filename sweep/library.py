@@ -25,10 +25,9 @@ if TYPE_CHECKING:
     from sweep.photographs import prepare, twins
     from sweep.plugins import loading
     from sweep.report import (
-        comparison_tables,
-        decisions,
         error_model_file,
         figure,
+        findings,
         output_file,
         report_data,
         scenes,

@@ -37,7 +37,7 @@ from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.report.comparison_tables import gap_table
+from sweep.report.findings import gap_table
 from sweep.store.lifecycle import read_pipeline
 
 FOLDER = Path(__file__).parent

@@ -141,7 +141,7 @@ def size(
         choice = sweep.size(
             read, store=store_of(pipeline, store), limit_s=limit_s, progress=bar,
             workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
-    return library.decisions.choice_findings(choice)
+    return library.findings.choice_findings(choice)
 
 
 @command("answers", "pipelines/limits/README.md", {
@@ -192,8 +192,8 @@ def limit(
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if figure is not None:
-        library.figure.write_figure([library.decisions.limit_figure(limits)], figure)
-    return library.decisions.limit_findings(limits)
+        library.figure.write_figure([library.findings.limit_figure(limits)], figure)
+    return library.findings.limit_findings(limits)
 
 
 @command("answers", "sweep/tradeoff/README.md", {
@@ -282,7 +282,7 @@ def error_model(
     for output in outputs:
         library.error_model_file.check_error_model_file(output)
     data = library.report_data.read_report_data(store)
-    results = library.decisions.selected(data.results, at, data.pipeline)
+    results = library.findings.selected(data.results, at, data.pipeline)
     data = dataclasses.replace(data, results=results)
     return library.error_model_file.model_findings(data, outputs)
 
@@ -314,7 +314,7 @@ def calibration(
     found = library.camera_calibration.camera_calibrations(
         library.lifecycle.open_dataset(store), views, points=points,
         coefficients=coefficients, target_m=target_m)
-    return library.comparison_tables.calibration_findings(
+    return library.findings.calibration_findings(
         library.camera_calibration.calibration_summary(found), quoted(store))
 
 
@@ -410,7 +410,7 @@ def fit(
         f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph",
         ("term", "parameter", "value", ""), rows, stub=2, words=True),
         *(f"- {line}" for line in found.lines)]
-    held_out = None if gap is None else library.comparison_tables.gap_table(gap)
+    held_out = None if gap is None else library.findings.gap_table(gap)
     if held_out is not None:
         lines += ["", "Half of the photographs, simulated with the scene of the others:", held_out]
     store = f"runs/{fitted.pipeline.name}.zarr"

@@ -20,6 +20,7 @@ from sweep.analysis.error_models import (
     error_models,
 )
 from sweep.analysis.estimator import INTERVAL
+from sweep.analysis.requirements import described
 from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
@@ -93,7 +94,7 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
                    for name in ("looked_for", "solved_rate", "flip_rate", "judged")},
                 "quantities": {name: _quantity(model.sel(quantity=name)) for name in QUANTITIES},
             }
-            for configuration, model in models_apart(models)
+            for configuration, _, model in models_apart(models)
         ],
     }
 
@@ -129,22 +130,17 @@ def _quantity(model: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def models_apart(models: xr.Dataset) -> list[tuple[dict[str, Any], xr.Dataset]]:
-    """Return the values of the axes by which models are kept apart, and each model."""
-    return list(each_cell(models, [
-        str(dim) for dim in models["exponent"].dims if dim != "quantity"]))
-
-
-def names_apart(models: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Return the configuration in words, and each model."""
-    return [(", ".join(f"{name} = {value}" for name, value in at.items()) or "the configuration",
-             model) for at, model in models_apart(models)]
+def models_apart(models: xr.Dataset) -> list[tuple[dict[str, Any], str, xr.Dataset]]:
+    """Return the values of the axes by which models are kept apart, these in words, and each."""
+    dims = [str(dim) for dim in models["exponent"].dims if dim != "quantity"]
+    return [(at, described(at, " = ") or "the configuration", model)
+            for at, model in each_cell(models, dims)]
 
 
 def warnings_of(models: xr.Dataset) -> list[str]:
     """Return sentences on where the models must not be used, beside the flags of the cells."""
     lines = []
-    for name, model in names_apart(models):
+    for _, name, model in models_apart(models):
         use = model["use"].values
         counted = use[:, (use != Use.no_poses).any(axis=0)]
         parts = [f"{100 * float((counted == flag).mean()):.0f} % {flag.name}" for flag in Use
@@ -164,10 +160,8 @@ def warnings_of(models: xr.Dataset) -> list[str]:
     return [*lines, *ALWAYS]
 
 
-def written_error_models(
-    data: ReportData, paths: Sequence[str]
-) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Write the error models of a store; return them, and the content of the files.
+def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
+    """Write the error models of a store; return their table and warnings.
 
     Parameters
     ----------
@@ -197,12 +191,6 @@ def written_error_models(
     })
     for path in paths:
         write_output_file(Path(path), f"{to_json(content, indent=1)}\n".encode())
-    return models, content
-
-
-def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
-    """Write the error models of a store into files; return their table and warnings."""
-    models, content = written_error_models(data, paths)
     return Findings(
         [error_model_table(models),
          *(f"- {line}" for line in (*exponent_lines(models), *warnings_of(models)))],
@@ -257,7 +245,7 @@ def exponent_lines(models: xr.Dataset) -> list[str]:
     """Return, for each configuration, with which power of the distance sigma of z goes."""
     of = "distance" if models.sizes["distance_m"] > 1 else "side"
     lines = []
-    for name, model in names_apart(models):
+    for _, name, model in models_apart(models):
         z = model.sel(quantity="z")
         power = Value(*(float(z[f"exponent{end}"]) for end in INTERVAL))
         fits = (z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all()

@@ -23,7 +23,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
 
 from sweep.report.output_file import write_output_file
-from sweep.report.table import Bin, Column, Table, Value, cell_text, coordinates
+from sweep.report.table import Bin, Column, Table, Value, cell_text, coordinate, coordinates
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -115,8 +115,6 @@ class Figure:
     by
         Column whose values have a line each; the other columns that name a row tell panels apart.
         Rows of dots differ by it if it names no row.
-    rows
-        Rows of dots that are drawn at most.
     labels
         Column whose texts stand beside points; those are joined of which ``by`` says yes.
     covers
@@ -130,7 +128,6 @@ class Figure:
     curves: Sequence[Column]
     x: str = ""
     by: str = ""
-    rows: int = MAX_DOTS
     labels: str = ""
     covers: Sequence[str] = ()
 
@@ -139,19 +136,17 @@ class Figure:
         """Its drawings."""
         curves = [each for each in self.curves if each.heading in self.table.headings]
         stub = self.table.headings[: self.table.stub]
-        rows = self.table.frame.to_dict("records")
+        rows, x, names = self.table.frame.to_dict("records"), self.x, []
+        apart = [name for name in stub if name not in (x, self.by, self.labels)]
         by = [self.by] if self.by else []
-        if not self.x or any(isinstance(row[self.x], str) for row in rows):
-            rows = rows[: self.rows]
-            names = [", ".join(cell_text(row[name]) for name in stub) for row in rows]
-            dots = [{**row, PLACE: k} for k, row in enumerate(rows)]
+        if not x or any(isinstance(row[x], str) for row in rows):
+            rows, x, apart = [{**row, PLACE: k} for k, row in enumerate(rows[:MAX_DOTS])], PLACE, []
+            names = [", ".join(coordinate(row[name]) for name in stub) for row in rows]
             by = [] if self.by in stub else by
-            return [Panel(heading_title(curve), self._lines(curve, dots, PLACE, by), "", curve,
-                          names) for curve in curves]
-        parts = _groups(rows, [name for name in stub if name not in (self.x, self.by, self.labels)])
-        return [Panel(heading_title(curve) + (f", {words}" if words else ""),
-                      self._lines(curve, part, self.x, by), self.x, curve)
-                for curve in curves for words, part in itertools.islice(parts.items(), MAX_PANELS)]
+        parts = list(_groups(rows, apart).items())[:MAX_PANELS]
+        return [Panel(", ".join(filter(None, (heading_title(curve), words))),
+                      self._lines(curve, part, x, by), "" if names else x, curve, names)
+                for curve in curves for words, part in parts]
 
     def _lines(
         self, curve: Column, rows: Sequence[dict[str, Any]], x: str, by: Sequence[str]
@@ -206,7 +201,7 @@ def _named(heading: str, cell: Any) -> str:
     if isinstance(cell, str):
         return cell
     words, _, unit = heading.rpartition(", ")
-    return f"{words or heading} {cell_text(cell)}" + "\u00b0" * (unit == "deg")
+    return f"{words or heading} {coordinate(cell)}" + "\u00b0" * (unit == "deg")
 
 
 def position(cell: Any) -> float:

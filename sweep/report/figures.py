@@ -11,36 +11,33 @@ import xarray as xr
 from sweep import analysis
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Reached
-from sweep.analysis.summaries import ERROR_HEADINGS, ThresholdChoice
+from sweep.analysis.summaries import ThresholdChoice
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.report import report_data
-from sweep.report.comparison import trade_lines
-from sweep.report.cost_tables import trade_figure
 from sweep.report.figure import MAX_DOTS, MAX_LINES, Figure, caption_of, sentences
-from sweep.report.report_data import AREA, CONFIGURATION, IDS, Groups, ReportData, grouped
+from sweep.report.findings import trade_figure
+from sweep.report.report_data import AREA, CARDS, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.table import Column, Table, table_of
 
 # --------------------------------------------------------------------------------------------------
 # Columns that several figures share.
 
+DETECTED, SOLVED, ROTATION_MEDIAN, _, _, RANGE_BIAS, _ = CARDS
 LOOKED_FOR = Column("looked for", "looked_for")
 SOLVED_COUNT = Column("n solved", "solved")
-DETECTED = Column("detected, %", "detection_rate", 100)
-SOLVED = Column("solved, %", "solved_rate", 100)
 FLIPS = Column("flips, % of the solved", "flip_rate", 100)
-ROTATION_MEDIAN = Column("rotation median, deg", "rotation_median_deg")
 ROTATION_P95 = Column("rotation p95, deg", "rotation_p95_deg")
 RANGE_MEDIAN = Column("range median, %", "range_median_percent")
 RANGE_P95 = Column("range p95, %", "range_p95_percent")
-RANGE_BIAS = Column("range bias without flips, %", "range_bias_percent", level=0.0)
 RATES = (LOOKED_FOR, DETECTED)
 ERROR_CURVES = (ROTATION_MEDIAN, ROTATION_P95, RANGE_MEDIAN, RANGE_P95)
 ERRORS = (
     SOLVED, ROTATION_MEDIAN, ROTATION_P95,
     Column("rotation RMSE without flips, deg", "rotation_rmse_unflipped_deg"),
     RANGE_MEDIAN, RANGE_P95, Column("range RMSE without flips, %", "range_rmse_unflipped_percent"),
-    RANGE_BIAS, FLIPS)
+    RANGE_BIAS, Column("position median, mm", "position_median_m", 1000.0),
+    Column("position p95, mm", "position_p95_m", 1000.0), FLIPS)
 #: Kinds of errors, as `sweep.analysis.error_statistics` takes them.
 SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
 
@@ -147,7 +144,7 @@ def _trade(data: ReportData) -> Figure | None:
     if data.trade is None:
         return None
     budget = data.trade.attrs.get("budget_ms")
-    return trade_figure(data.trade, lines=trade_lines(data, data.trade, budget))
+    return trade_figure(data.trade, lines=report_data.trade_lines(data, data.trade, budget))
 
 
 def _outcomes(data: ReportData) -> Figure:
@@ -203,7 +200,8 @@ def _bound(data: ReportData) -> Figure | None:
     groups = data.along(along) if along else {}
     return figure(
         data, grouped(data, analysis.efficiency, groups), groups, "bound",
-        "Errors relative to the accuracy bound", caption_of("bound"), EFFICIENCIES, EFFICIENCIES)
+        "Efficiency: the accuracy bound over the errors", caption_of("bound"),
+        EFFICIENCIES, EFFICIENCIES)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -220,18 +218,13 @@ def figures_of(data: ReportData) -> list[Figure]:
     """Return the figures of a store, such that one shows each axis and drawn parameter."""
     made = [figure for make in FIGURES if (figure := make(data)) is not None]
     covered = {name for figure in made for name in figure.covers}
-    return made + [
-        _along(data, name)
-        for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters)
-        if name not in covered]
+    drawn = [name for name in data.pipeline.distributions if name in data.results.variables]
+    return made + [_along(data, name) for name in (*data.scene_axes, *data.setting_axes, *drawn)
+                   if name not in covered]
 
 
 # --------------------------------------------------------------------------------------------------
-# Tables of errors, of boards' markers, of thresholds, and of the precision that was reached.
-
-#: Quantity in the names of errors -> its name in words, and its unit in those names.
-QUANTITIES = {"rotation": ("rotation, deg", "deg"), "range": ("range (depth), %", "percent"),
-              "position": ("position, m", "m")}
+# Tables of signed errors, of boards' markers, of thresholds, and of the precision that was reached.
 
 #: The threshold on the ambiguity that many programs use, and what it keeps.
 USUAL = 0.2
@@ -249,20 +242,11 @@ KEPT_AT_USUAL = (
 MAX_SIZES = 8
 
 
-def tables_of(data: ReportData, errors: xr.Dataset, name: str) -> list[Table]:
-    """Return the tables below a report's figures.
-
-    Parameters
-    ----------
-    data
-        The store.
-    errors, name
-        The statistics of the errors of the configuration that is named, and its label.
-    """
+def tables_of(data: ReportData) -> list[Table]:
+    """Return the tables below a report's figures."""
     rule, boards = data.pipeline.stopping, "marker_detection" in data.results
     return [
         *([board_table(data)] if boards else []),
-        errors_table(errors, name),
         configuration_table(
             data, grouped(data, signed_error_statistics), (),
             "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
@@ -281,19 +265,6 @@ def board_table(data: ReportData) -> Table:
     return table_of(
         rates, "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
         data.results)
-
-
-def errors_table(errors: xr.Dataset, name: str) -> Table:
-    """Return the statistics of a configuration's errors over the whole grid."""
-    rows = [
-        [heading, *(
-            Column("", variable).cells(errors)[0] if variable in errors else None
-            for quantity, (_, unit) in QUANTITIES.items()
-            for variable in [f"{quantity}_{statistic}_{unit}"])]
-        for heading, statistic in ERROR_HEADINGS.items()]
-    whose = f", with {name}" if name else ""
-    return Table.of(f"Errors over the whole grid{whose}, with 95 % intervals",
-                    ["statistic", *(words for words, _ in QUANTITIES.values())], rows)
 
 
 def signed_error_statistics(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
 
 import pandas as pd
 
@@ -17,7 +16,7 @@ from sweep.experiment.parameters import PARAMETERS, SECTIONS, Parameter
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import Flag
-from sweep.messages import label, nearest
+from sweep.messages import nearest, shown
 from sweep.model.effects import EFFECTS
 from sweep.report.table import Findings, Table
 
@@ -48,19 +47,17 @@ def reference(*names: str) -> Findings:
     chosen = [name for name in names if name not in TABLES]
     for name in chosen:
         if name not in PARAMETERS:
-            raise ArgumentError(
-                "names", name,
-                f"expected {', '.join(TABLES)}, or a parameter"
-                + nearest(name, [*TABLES, *PARAMETERS]))
+            raise ArgumentError("names", name, f"expected {', '.join(TABLES)}, or a parameter"
+                                + nearest(name, [*TABLES, *PARAMETERS]))
     tables = [TABLES[name]() for name in names if name in TABLES]
     if chosen:
         tables.append(_parameters("parameters", [PARAMETERS[name] for name in chosen]))
     if not names:
         tables = [_table("subjects", ({"subject": name, "rows": str(len(make().frame))}
                                       for name, make in TABLES.items()))]
-    numbers = {table.caption: table.as_json()["rows"] for table in tables}
-    return Findings(tables, numbers, then=("sweep reference NAME", "prints a table, or a parameter")
-                    if not names else ("", ""))
+    then = ("", "") if names else ("sweep reference NAME", "prints a table, or a parameter")
+    return Findings(
+        tables, {table.caption: table.as_json()["rows"] for table in tables}, then=then)
 
 
 def _table(caption: str, rows: Iterable[dict[str, str]]) -> Table:
@@ -71,18 +68,11 @@ def _table(caption: str, rows: Iterable[dict[str, str]]) -> Table:
 def _parameters(caption: str, parameters: Iterable[Parameter]) -> Table:
     """Return parameters with default, unit, values and meaning."""
     return _table(caption, ({
-        "parameter": each.name, "default": _default(each.default), "unit": each.unit,
+        "parameter": each.name, "unit": each.unit,
+        "default": "-" if each.default is None else shown(each.default),
         "values": ("a predefined dictionary of the installed OpenCV" if each.name == "dictionary"
                    else each.expected()) + "; can be drawn" * each.drawable,
         "meaning": each.meaning} for each in parameters))
-
-
-def _default(value: Any) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else label(value)
 
 
 def _section(section: str) -> Table:

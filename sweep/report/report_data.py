@@ -1,32 +1,33 @@
-"""The data of a report: results, roles of axes, analyses computed once, groups."""
+"""The data of a report: roles of axes, analyses computed once, configurations compared."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
-import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
-from sweep.analysis.dataset import SIZE_AXES, is_grid_axis, of_photographs
-from sweep.analysis.requirements import SIZES_BESIDE, conditions, parse_requirements
+from sweep.analysis.comparisons import paired_tables
+from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs
+from sweep.analysis.intervals import LEVEL
+from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
 from sweep.errors import StoreError, SweepError
 from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
-from sweep.experiment.grid import TRIAL, Axis
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.flags import DetectionStatus, uncounted_values
-from sweep.report.table import axis_label
+from sweep.report.table import Column, Table, Value, axis_label, number
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
-from sweep.tradeoff.pareto import WRONG, configuration_label
+from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -34,9 +35,6 @@ from sweep.typing import Floats
 
 BOTH = (Stage.detection, Stage.estimation)
 AREA = "marker_area_px"
-#: Axes along which the marker is turned away.
-ANGLES = ("tilt_deg", "view_angle_deg")
-
 IDS = "marker_id"
 #: Dimension of tables that have a row for each configuration.
 CONFIGURATION = "configuration"
@@ -122,18 +120,13 @@ class ReportData:
     @property
     def angle_axis(self) -> str | None:
         """The axis along which the marker is turned away: the tilt, or the viewing angle."""
-        return next((name for name in ANGLES if self.results.sizes.get(name, 1) > 1), None)
+        return next((name for name in ANGLE_AXES if self.results.sizes.get(name, 1) > 1), None)
 
     @functools.cached_property
     def areas(self) -> Floats:
-        """Areas, px², of the poses looked for (n,), by the first of the detector's settings."""
-        first = {axis.name: 0 for axis in self.pipeline.axes_of(Stage.detection)}
-        detection, area = (self.results[name].isel(first, missing_dims="ignore")
-                           for name in ("detection", AREA))
-        with store_errors(self.store):
-            counted = ~detection.isin(uncounted_values(DetectionStatus)) & (area > 0)
-            values = np.ravel(area.where(counted)).astype(np.float64)
-        return np.asarray(values[np.isfinite(values)])
+        """Areas, px², of the poses that are seen (n,)."""
+        values = np.ravel(self.results[AREA]).astype(np.float64)
+        return np.asarray(values[np.isfinite(values) & (values > 0)])
 
     @property
     def size(self) -> str | None:
@@ -148,26 +141,12 @@ class ReportData:
         return tuple(axis.name for axis in self.pipeline.axes_of(*BOTH) if len(axis) > 1)
 
     @property
-    def effect_axes(self) -> tuple[Axis, ...]:
-        """Axes of the scene whose values see the same draws, such as noise or JPEG quality."""
-        if of_photographs(self.results):
-            return ()
-        return tuple(axis for axis in self.pipeline.axes
-                     if axis.name in self.scene_axes and not is_grid_axis(axis.name, self.results))
-
-    @property
     def scene_axes(self) -> tuple[str, ...]:
         """Axes of the scene that have several values, without the draws."""
         return tuple(
             axis.name for axis in self.pipeline.axes_of(Stage.scene)
             if len(axis) > 1 and axis.name != TRIAL
         )
-
-    @property
-    def drawn_parameters(self) -> tuple[str, ...]:
-        """Parameters that are drawn from a distribution, and whose draws the store has."""
-        return tuple(name for name in self.pipeline.distributions
-                     if name in self.results.variables)
 
     def label(self, name: str) -> str:
         """Return an axis' name with its unit, as on the axes of charts: ``distance, m``."""
@@ -205,9 +184,8 @@ class ReportData:
     def once(self, key: Any, make: Callable[[], T]) -> T:
         """Return the result of ``make``, a dataset loaded; it is called once for each key."""
         if key not in self.made:
-            with store_errors(self.store):
-                made = make()
-                self.made[key] = made.compute() if isinstance(made, xr.Dataset) else made
+            made = make()
+            self.made[key] = made.compute() if isinstance(made, xr.Dataset) else made
         found: T = self.made[key]
         return found
 
@@ -223,9 +201,9 @@ def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
     conditions = [name for name in data.per if name not in data.setting_axes]
     numeric = {axis.name for axis in data.pipeline.axes if axis.is_numeric} & {*data.scene_axes}
     along = min((name for name in conditions if name in numeric), default=None, key=lambda name: (
-        name != data.size_axis, name not in SIZES_BESIDE, name in ANGLES))
+        name != data.size_axis, name not in SIZES_BESIDE, name in ANGLE_AXES))
     others = (name for name in conditions if name != along)
-    return along, tuple(sorted(others, key=lambda name: name not in ANGLES))
+    return along, tuple(sorted(others, key=lambda name: name not in ANGLE_AXES))
 
 
 @contextlib.contextmanager
@@ -319,13 +297,18 @@ class Configurations:
     axes: Mapping[str, list[int]]
     combinations: list[dict[str, int]]
     names: list[str]
-    wrong: NDArray[np.bool_]
+    wrong: list[bool]
     summary: xr.Dataset
 
     @property
     def several(self) -> bool:
         """Whether there is more than one."""
         return len(self.names) > 1
+
+
+#: What tells configurations apart, and whether more of it is better.
+RANKS = {"detection_rate": False, "solved_rate": False, "rotation_rmse_deg": True,
+         "range_rmse_percent": True}
 
 
 def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
@@ -341,58 +324,53 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
 def _configurations(data: ReportData, *, targets: bool) -> Configurations:
     settings = [axis for axis in data.pipeline.axes_of(*BOTH) if len(axis) > 1]
     several = [*(data.pipeline.experiment.target_axes if targets else ()), *settings]
-    if targets and not several:
-        # Nothing else varies on the same draws: the values of an effect are compared.
-        several = list(data.effect_axes)
+    if targets and not several and not of_photographs(data.results):
+        # Nothing else varies on the same draws: the values of an effect, such as noise or JPEG
+        # quality, are compared.
+        several = [axis for axis in data.pipeline.axes if axis.name in data.scene_axes
+                   and not is_grid_axis(axis.name, data.results)]
     counts = {axis.name: len(axis) for axis in several}
     while math.prod(counts.values()) > MAX_CONFIGURATIONS and max(counts.values()) > 2:
         counts[max(counts, key=counts.__getitem__)] -= 1
     axes = {axis.name: np.linspace(0, len(axis) - 1, counts[axis.name]).round().astype(int).tolist()
             for axis in several}
-    every = [dict(zip(axes, index, strict=True))
-             for index in itertools.product(*map(range, counts.values()))]
-    kept, summary = _of_each(data, axes, every, error_statistics, {})
+    kept, summary = _of_each(data, axes, error_statistics, {})
     flags = np.reshape(wrong_configurations(data.pipeline, settings), list(map(len, settings)))
-    wrong = np.array([flags[tuple(axes[axis.name][each[axis.name]] for axis in settings)]
-                      for each in kept])
-    names = [str(label) + WRONG * bool(flag)
-             for label, flag in zip(summary[CONFIGURATION].values, wrong, strict=True)]
-
-    def column(name: str, missing: float) -> NDArray[np.float64]:
-        return np.asarray(summary[name].fillna(missing), dtype=np.float64)
-
-    order = np.lexsort((
-        column("range_rmse_percent", np.inf), column("rotation_rmse_deg", np.inf),
-        -column("solved_rate", -1.0), -column("detection_rate", -1.0), wrong)).tolist()
+    wrong = [bool(flags[tuple(axes[axis.name][each[axis.name]] for axis in settings)])
+             for each in kept]
+    names = [label + WRONG * flag
+             for label, flag in zip(summary[CONFIGURATION].values.tolist(), wrong, strict=True)]
+    ranked = summary[[*RANKS]].to_dataframe().reset_index().assign(wrong=wrong)
+    order = ranked.sort_values(
+        ["wrong", *RANKS], ascending=[True, *RANKS.values()], kind="stable").index.tolist()
     return Configurations(
-        axes, [kept[k] for k in order], [names[k] for k in order], wrong[order],
+        axes, [kept[k] for k in order], [names[k] for k in order], [wrong[k] for k in order],
         summary.assign_coords({CONFIGURATION: names}).isel({CONFIGURATION: order}))
 
 
 def _of_each(
-    data: ReportData, axes: Mapping[str, list[int]], combinations: list[dict[str, int]],
-    analysis: Analysis, groups: Groups,
+    data: ReportData, axes: Mapping[str, list[int]], analysis: Analysis, groups: Groups,
 ) -> tuple[list[dict[str, int]], xr.Dataset]:
     """Return the combinations that differ in settings that they use, and an analysis of each.
 
     It has the dimension ``configuration``, by label, in place of the axes; it is computed once.
     """
+    every = [dict(zip(axes, index, strict=True)) for index in np.ndindex(*map(len, axes.values()))]
     values = {name: data.results[name].values[some].tolist() for name, some in axes.items()}
-    every = [{name: values[name][k] for name, k in each.items()} for each in combinations]
-    kept = distinct(data.pipeline, every)
-    labels = [configuration_label(used_settings(data.pipeline, every[k])) for k in kept]
+    settings = [{name: values[name][k] for name, k in each.items()} for each in every]
+    kept = distinct(data.pipeline, settings)
+    labels = [configuration_label(used_settings(data.pipeline, settings[k])) for k in kept]
     per = [*axes, *(name for name, edges in groups.items() if edges is None)]
     bins = {name: edges for name, edges in groups.items() if edges is not None}
     table = data.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
         data.results.isel(axes), per=per, bins=bins))
     # Axes of settings with a single value tell nothing apart.
-    places: dict[str, Any] = {
-        axis.name: 0 for axis in data.pipeline.axes_of(*BOTH) if len(axis) == 1}
-    places |= {name: xr.DataArray([combinations[k][name] for k in kept], dims=CONFIGURATION)
-               for name in axes}
-    flat = table.isel(places, missing_dims="ignore").drop_vars([*places], errors="ignore")
-    flat = flat if axes else flat.expand_dims(CONFIGURATION)
-    return [combinations[k] for k in kept], flat.assign_coords(
+    single = [axis.name for axis in data.pipeline.axes_of(*BOTH) if len(axis) == 1]
+    table = table.isel(dict.fromkeys(single, 0), missing_dims="ignore", drop=True)
+    flat = table.stack({CONFIGURATION: [*axes]}, create_index=False) if axes else (
+        table.expand_dims(CONFIGURATION))
+    flat = flat.drop_vars([*axes], errors="ignore").isel({CONFIGURATION: kept})
+    return [every[k] for k in kept], flat.assign_coords(
         {CONFIGURATION: labels}).transpose(CONFIGURATION, *groups, ...)
 
 
@@ -422,9 +400,12 @@ def grouped(
     compared = {axis.name for axis in (
         *data.pipeline.experiment.target_axes, *data.pipeline.axes_of(*stages))} - groups.keys()
     axes = {name: some for name, some in known.axes.items() if name in compared}
-    places = dict.fromkeys(tuple(each[name] for name in axes) for each in known.combinations)
-    combinations = [dict(zip(axes, each, strict=True)) for each in places]
-    return _of_each(data, axes, combinations, analysis, groups)[1]
+    combinations, table = _of_each(data, axes, analysis, groups)
+    # In the order of the configurations, the best first.
+    ranks = {tuple(each[name] for name in axes): k
+             for k, each in reversed([*enumerate(known.combinations)])}
+    order = sorted(range(len(combinations)), key=lambda k: ranks[tuple(combinations[k].values())])
+    return table.isel({CONFIGURATION: order})
 
 
 def notes_of(data: ReportData, groups: Groups) -> str:
@@ -435,3 +416,252 @@ def notes_of(data: ReportData, groups: Groups) -> str:
         if len(some) < data.results.sizes[name] and name not in groups), *(
         f"Values of {name} are grouped into {len(edges) - 1} bins of about as many each."
         for name, edges in groups.items() if edges is not None)])
+
+
+# --------------------------------------------------------------------------------------------------
+# The configurations compared on the same images, and the one that is named best.
+
+#: Poses flipped in one of two configurations alone from which an RMSE with flips is compared.
+MIN_FLIPPED = 10
+
+#: Numbers of each configuration, and of the named one in the report's cards.
+CARDS = (
+    Column("detected, %", "detection_rate", 100), Column("solved, %", "solved_rate", 100),
+    Column("rotation median, deg", "rotation_median_deg"),
+    Column("rotation RMSE, deg", "rotation_rmse_deg"),
+    Column("range RMSE, %", "range_rmse_percent"),
+    Column("range bias without flips, %", "range_bias_percent", level=0.0),
+    Column("flips, %", "flip_rate", 100))
+
+#: Differences, of two equal configurations 0, where large is good; and ratios, of these 1.
+PAIRED = (
+    Column("detection difference, points", "detection_difference", 100.0, 0.0),
+    Column("solved difference, points", "solved_difference", 100.0, 0.0),
+    Column("rotation RMSE ratio", "rotation_rmse_ratio", 1.0, 1.0),
+    Column("range RMSE ratio", "range_rmse_ratio", 1.0, 1.0))
+UNFLIPPED = Column("rotation RMSE ratio without flips", "rotation_rmse_unflipped_ratio", 1.0, 1.0)
+
+#: Level of the intervals that decide: two equal configurations are told apart by any of the four
+#: quantities with a probability of 5 % at most (Bonferroni). Intervals of 95 % are shown.
+DECIDING_LEVEL = 1.0 - (1.0 - LEVEL) / len(PAIRED)
+
+VERDICTS = {1: "better", 0: "not decided", -1: "worse"}
+
+
+class Difference(NamedTuple):
+    """One quantity of the best configuration against another one, on the images of both.
+
+    Attributes
+    ----------
+    column, numbers
+        The quantity, and its value with its 95 % interval, NaN without one.
+    verdict
+        1: the best one is better; -1: it is worse; 0: not decided.
+    """
+
+    column: Column
+    numbers: Value
+    verdict: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        words, _, unit = self.column.heading.partition(", ")
+        return {"quantity": words, **self.numbers._asdict(), "unit": unit,
+                "verdict": VERDICTS[self.verdict]}
+
+    def __str__(self) -> str:
+        words, _, unit = self.column.heading.partition(", ")
+        return f"{words} {self.numbers}{f' {unit}' if unit else ''}: {VERDICTS[self.verdict]}"
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The configurations, and the best of them against each.
+
+    Attributes
+    ----------
+    known
+        The n configurations.
+    best
+        Number of the configuration that is named best.
+    differences
+        (n,) the best one against each: detection, solved, rotation, range; none against itself.
+    """
+
+    known: Configurations
+    best: int
+    differences: list[tuple[Difference, ...]]
+
+    @property
+    def name(self) -> str:
+        """Label of the configuration that is named best."""
+        return self.known.names[self.best]
+
+    def verdict(self, k: int) -> int:
+        """Return whether the best one is better than another: by the first decided quantity."""
+        return overall(self.differences[k])
+
+    @property
+    def line(self) -> str:
+        """The best configuration against the one that comes nearest to it, in one line."""
+        names, wrong = self.known.names, self.known.wrong
+        others = [k for k in range(len(names)) if k != self.best]
+        if not others:
+            return ""
+        # The cost of a wrong belief is the question if nothing else varies.
+        others = [k for k in others if not wrong[k]] or others
+        rival = min(others, key=self.verdict)
+        pair = self.differences[rival]
+        shown = [each for each in pair if each.verdict] or [
+            next((each for each in pair[2:] if not np.isnan(each.numbers.value)), pair[0])]
+        line = f"{self.name} against {names[rival]}: {'; '.join(map(str, shown))}"
+        counts = Counter(map(self.verdict, others))
+        words = ", ".join(f"{word} {counts[verdict]}" for verdict, word in VERDICTS.items()
+                          if counts[verdict])
+        return line if len(others) == 1 else f"{line} (of {len(others)} others: {words})"
+
+    def table(self) -> Table:
+        """Return a row for each configuration, with the best one's paired differences."""
+        known, columns = self.known, [Column("n", "looked_for"), *CARDS]
+        caption, headings = "Configurations, with 95 % intervals", [CONFIGURATION]
+        cells = [each.cells(known.summary) for each in columns]
+        if known.several:
+            verdicts = [verdict_words(pair) for pair in self.differences]
+            verdicts[self.best] = "best" if all(
+                self.verdict(k) > 0 or known.wrong[k] for k in range(len(known.names))
+                if k != self.best) else "named"
+            pairs: list[list[Any]] = [
+                [each.numbers for each in pair] or [None] * len(PAIRED)
+                for pair in self.differences]
+            headings.append("verdict")
+            cells = [verdicts, *cells, *map(list, zip(*pairs, strict=True))]
+            columns += PAIRED
+            few = any(each.column is UNFLIPPED for pair in self.differences for each in pair)
+            caption += (
+                f"; differences, ratios and verdict: {self.name} against each, on the same images"
+                + "; rotation without flips where few poses differ by them" * few)
+        return Table.of(caption, [*headings, *(each.heading for each in columns)],
+                        list(zip(known.names, *cells, strict=True)), stub=len(headings))
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Return the differences of the best configuration from each, as JSON values."""
+        return [{"configuration": self.name, "against": name,
+                 "verdict": VERDICTS[self.verdict(k)],
+                 "differences": [each.as_json() for each in self.differences[k]]}
+                for k, name in enumerate(self.known.names) if k != self.best]
+
+
+def verdict_words(differences: Sequence[Difference]) -> str:
+    """Return by what one configuration is better or worse: ``better: detection; worse: range``."""
+    first = overall(differences)
+    parts = [f"{VERDICTS[verdict]}: {', '.join(names)}" for verdict in (first, -first) if (
+        names := [each.column.heading.split()[0] for each in differences
+                  if each.verdict == verdict])]
+    return "; ".join(parts) if first else VERDICTS[0]
+
+
+def overall(differences: Sequence[Difference]) -> int:
+    """Return the verdict of the first quantity that is decided; 0 if none is."""
+    return next((each.verdict for each in differences if each.verdict), 0)
+
+
+def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparison:
+    """Return the comparison of the configurations of a store.
+
+    Targets along an axis are told apart, too; their scenes may be draws of their own, which makes
+    the intervals of differences wider. The best configuration is one that no other is better than
+    on the same images; it is looked for from the highest detection rate on, then the smallest RMSE
+    of the rotation and of the range. None with a wrong belief is the best if there is another.
+
+    Parameters
+    ----------
+    data
+        The store.
+    among
+        Numbers of the configurations, with targets pooled, of which one may be the best, such as
+        those that reach as far in what is required; by default all, by target.
+    """
+    known = configurations(data, targets=among is None)
+    left = [k for k in range(len(known.names)) if among is None or k in among]
+    results, usable = data.results.isel(known.axes), left[:]
+
+    def differences(k: int, best: int) -> tuple[Difference, ...]:
+        one, other = (results.isel(known.combinations[at], drop=True) for at in (k, best))
+        return () if k == best else data.once(
+            ("differences", *known.axes, k, best), lambda: differences_of(one, other))
+
+    tried: dict[int, list[tuple[Difference, ...]]] = {}
+    beaten: dict[int, int] = {}
+    while left and 0 not in beaten.values():
+        best = left.pop(0)
+        tried[best] = [differences(k, best) for k in range(len(known.names))]
+        better = {k for k in usable
+                  if overall(tried[best][k]) < 0 and known.wrong[k] <= known.wrong[best]}
+        beaten[best] = len(better)
+        left.sort(key=lambda k: k not in better)
+    # In a circle each is worse than another one: the one that is worse than the fewest.
+    best = min(beaten, key=beaten.__getitem__)
+    return Comparison(known, best, tried[best])
+
+
+def differences_of(first: xr.Dataset, second: xr.Dataset) -> tuple[Difference, ...]:
+    """Return how the second of two configurations differs from the first, on the same images.
+
+    If few poses are flipped in one of the two alone, the rotation is compared without flips.
+    """
+    shown, deciding = paired_tables(
+        first, second, (), None, QUANTITIES[:2], (LEVEL, DECIDING_LEVEL))
+    flipped = int(shown["only_first_flipped"]) + int(shown["only_second_flipped"])
+    few = 0 < flipped < MIN_FLIPPED
+    out = []
+    for each in (*PAIRED[:2], UNFLIPPED if few else PAIRED[2], PAIRED[3]):
+        (numbers,), (ends,) = each.cells(shown), each.cells(deciding)
+        verdict = int(ends.low > each.level) - int(ends.high < each.level)
+        out.append(Difference(each, numbers, -verdict if each.level else verdict))
+    return tuple(out)
+
+
+# --------------------------------------------------------------------------------------------------
+# Which configuration a measured trade recommends: the comparison, and what each costs.
+
+
+def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = None) -> list[str]:
+    """Return a line for each condition: the best configuration, and the cheapest as good.
+
+    Parameters
+    ----------
+    data
+        The store that was measured.
+    trade
+        With ``cost_ms`` by condition and configuration.
+    budget_ms
+        Most milliseconds a frame that a recommendation may take.
+    """
+    results = data.results
+    if "renderer" in results.dims:
+        results = results.isel(renderer=[results["renderer"].values.tolist().index("exact")])
+    lines = []
+    for label, at, part in conditions_of(trade):
+        keep = {name: np.flatnonzero(results[name].values == value) for name, value in at.items()}
+        here = dataclasses.replace(data, results=results.isel(keep), made={})
+        known = configurations(here, targets=False)
+        names, cost = known.names, part["cost_ms"].reindex(treatment=known.names).values.tolist()
+        usable = [k for k in range(len(names)) if not known.wrong[k] and np.isfinite(cost[k])]
+        within = [k for k in usable if budget_ms is None or cost[k] <= budget_ms]
+        line = f"{label}: " if label else ""
+        if within:
+            found = comparison(here, tuple(within))
+            cheapest = min((k for k in within if k == found.best or found.verdict(k) <= 0),
+                           key=cost.__getitem__)
+            line += "" if budget_ms is None else f"within {budget_ms:g} ms a frame: "
+            line += f"{found.name}, {number(cost[found.best])} ms a frame"
+            if cheapest != found.best:
+                line += (f"; not shown to be worse and cheaper is {names[cheapest]}, "
+                         f"{number(cost[cheapest])} ms")
+            line += f"; {found.line}" if found.line else ""
+        else:
+            line += f"nothing fits {budget_ms or 0:g} ms a frame"
+            for near in sorted(usable, key=cost.__getitem__)[:1]:
+                line += f"; the nearest is {names[near]}, {number(cost[near])} ms"
+        lines.append(line)
+    return lines

@@ -25,7 +25,7 @@ from sweep.experiment.pipeline import cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.messages import exception_line, quoted
-from sweep.report.report_data import AREA, ReportData, store_errors
+from sweep.report.report_data import AREA, ReportData
 from sweep.report.table import Table, coordinate, number, plural
 
 # --------------------------------------------------------------------------------------------------
@@ -264,10 +264,9 @@ class Scene(NamedTuple):
 def scenes_of(data: ReportData) -> list[Scene]:
     """Return the scenes of a store's gallery; kinds with the same scene share it."""
     chosen: dict[tuple[tuple[str, int], ...], list[str]] = {}
-    with store_errors(data.store):
-        for title, index in select_scenes(data.results):
-            chosen.setdefault(tuple(index.items()), []).append(title)
-        return [_scene(data, dict(key), titles) for key, titles in chosen.items()]
+    for title, index in select_scenes(data.results):
+        chosen.setdefault(tuple(index.items()), []).append(title)
+    return [_scene(data, dict(key), titles) for key, titles in chosen.items()]
 
 
 def _scene(data: ReportData, index: Index, titles: Sequence[str]) -> Scene:

@@ -74,7 +74,7 @@ def coordinates(values: Sequence[Any]) -> list[str]:
     if short or not all(isinstance(value, float) for value in values):
         return texts
     rounded = ([f"{value:.{figures}g}" for value in values] for figures in range(3, 6))
-    return next((each for each in rounded if len(set(each)) == len(each)), texts)
+    return next((each for each in rounded if len(set(each)) == len(set(texts))), texts)
 
 
 def plural(count: int, noun: str, plural_noun: str = "") -> str:
@@ -87,10 +87,7 @@ def plural(count: int, noun: str, plural_noun: str = "") -> str:
 
 
 #: Coordinates whose names are no words.
-WORDS = {
-    "marker_area_px": "area of the marker", "side_px": "side of the marker",
-    "frame_u_percent": "from the left, %", "frame_v_percent": "from the top, %",
-}
+WORDS = {"marker_area_px": "area of the marker", "side_px": "side of the marker"}
 
 ENDINGS = ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s")
 #: Unit of an attribute -> as headings have it.
@@ -192,32 +189,12 @@ def cell_text(cell: Any) -> str:
 
 
 def group_cells(table: xr.Dataset, name: str) -> list[Any]:
-    """Return the groups along a dimension: words, coordinates as numbers, or bins."""
+    """Return the groups along a dimension: words, numbers, or bins."""
     if f"{name}_low" in table.coords:
-        ends = (table[f"{name}_{end}"].to_numpy().tolist() for end in ("low", "high"))
-        return [Bin(*each) for each in zip(*ends, strict=True)]
+        return list(map(Bin, *(table[f"{name}_{end}"].to_numpy().tolist() for end in (
+            "low", "high"))))
     values: list[Any] = table[name].to_numpy().tolist()
-    if any(isinstance(value, bool) for value in values):
-        return list(map(str, values))
-    return [Coordinate(value, text) if isinstance(value, int | float) else text
-            for value, text in zip(values, coordinates(values), strict=True)]
-
-
-class Coordinate(NamedTuple):
-    """A value of an axis, as text that tells it from the others."""
-
-    value: float
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
-
-
-def json_cell(cell: Any) -> Any:
-    """Return a cell as JSON has it: an object with the ends of an interval, a number, or text."""
-    if isinstance(cell, Coordinate):
-        return cell.value
-    return cell._asdict() if isinstance(cell, Value | Bin) else cell
+    return [str(value) if isinstance(value, bool) else value for value in values]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -233,8 +210,7 @@ class Table:
     caption
         Subject of the table.
     frame
-        Cells: words, numbers, `Value`, `Coordinate`, `Bin`, or None; the columns' names are
-        headings with units.
+        Cells: words, numbers, `Value`, `Bin`, or None; the columns' names are headings with units.
     stub
         Number of leading columns that name a row.
     words
@@ -263,7 +239,11 @@ class Table:
     @property
     def rows(self) -> list[list[str]]:
         """The texts of all rows."""
-        return [list(map(cell_text, row)) for row in self.frame.to_numpy().tolist()]
+        texts = self.frame.map(cell_text)
+        for k in range(self.stub):
+            texts.isetitem(k, coordinates(self.frame.iloc[:, k].tolist()))
+        rows: list[list[str]] = texts.to_numpy().tolist()
+        return rows
 
     @property
     def shown_rows(self) -> list[list[str]]:
@@ -319,15 +299,15 @@ class Table:
 
     def html(self) -> str:
         """Return it as an HTML table, for a notebook."""
-        table: str = self.frame.map(cell_text).to_html(index=False, border=0, max_rows=MAX_ROWS)
+        table: str = pd.DataFrame(self.rows, columns=self.headings).to_html(
+            index=False, border=0, max_rows=MAX_ROWS)
         return f"<p>{escape(self.full_caption)}</p>{table}"
 
     def as_json(self) -> dict[str, Any]:
         """Return its caption, and its rows by heading as numbers."""
-        headings = self.headings
-        return {"caption": self.caption, "rows": [
-            dict(zip(headings, map(json_cell, row), strict=True))
-            for row in self.frame.to_numpy().tolist()]}
+        cells = self.frame.map(
+            lambda cell: cell._asdict() if isinstance(cell, Value | Bin) else cell)
+        return {"caption": self.caption, "rows": cells.to_dict("records")}
 
 
 #: Exit status where draws are too few to tell.

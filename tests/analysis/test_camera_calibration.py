@@ -10,7 +10,7 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline, cell
-from sweep.report.comparison_tables import calibration_findings
+from sweep.report.findings import calibration_findings
 from sweep.store.lifecycle import open_dataset
 
 PIPELINE = {

@@ -17,7 +17,7 @@ import numpy as np
 import sweep
 from sweep.analysis.requirements import Decision, check_requirements
 from sweep.experiment.pipeline import Pipeline
-from sweep.report.decisions import headline
+from sweep.report.findings import headline
 from sweep.tradeoff.choice_search import search_choice
 
 SIZES = Path(__file__).parents[2] / "pipelines" / "sizes"

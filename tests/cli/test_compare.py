@@ -10,7 +10,7 @@ from support.board_photographs import POSES, write_set
 from support.photograph_results import results_of, twins
 from support.reports import command
 from sweep.analysis import simulation_gap
-from sweep.report.comparison_tables import gap_lines, gap_table
+from sweep.report.findings import gap_lines, gap_table
 
 
 def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():

@@ -6,7 +6,7 @@ from scipy.stats import binom
 
 from support.pose_errors import poses_with_law, power_law
 from sweep.measure.flags import EstimateStatus
-from sweep.report.comparison import differences_of, overall
+from sweep.report.report_data import differences_of, overall
 
 DRAWS = {
     "normal": None,

@@ -6,11 +6,10 @@ import re
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweep.report.answer import Answer
 from sweep.report.figure import Figure as ReportFigure
 from sweep.report.scenes import Scene
-from sweep.report.table import MAX_ROWS, Bin, Column, Coordinate, Findings, Table, Value
-from sweep.report.write_report import page
+from sweep.report.table import MAX_ROWS, Bin, Column, Findings, Table, Value
+from sweep.report.write_report import Answer, page
 
 HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
 
@@ -25,7 +24,7 @@ def hostile_page():
         [Column("n", "n")])
     scenes = [Scene([HOSTILE], HOSTILE, HOSTILE, HOSTILE, picture) for picture in (b"png", None)]
     origin = {"facts": {"Store": HOSTILE, "Report": HOSTILE}, "commands": [HOSTILE],
-              "axes": hostile_table(), "drawn": HOSTILE, "pipeline": HOSTILE, "file": HOSTILE}
+              "pipeline": HOSTILE, "file": HOSTILE}
     tile = dict.fromkeys(("name", "text", "detail"), HOSTILE)
     numbers = Answer(HOSTILE, HOSTILE, HOSTILE, [tile],
                      (hostile_table(),), (hostile_table(),))
@@ -66,7 +65,7 @@ def test_every_printer_keeps_hostile_text_in_its_cell():
 
 def test_a_cell_is_the_same_number_in_text_and_json():
     table = Table.of("Cells", ["x, m", "bin", "rate", "n", "yes", "none"], [
-        [Coordinate(0.5, "0.5"), Bin(1.0, 4.0), Value(0.25, 0.125, np.inf), 1200, True, None]])
+        [0.5, Bin(1.0, 4.0), Value(0.25, 0.125, np.inf), 1200, True, None]])
     assert table.rows == [["0.5", "1\u20134", "0.250 (0.125 to \u221e)", "1,200", "yes", ""]]
     assert table.as_json()["rows"] == [{
         "x, m": 0.5, "bin": {"low": 1.0, "high": 4.0}, "n": 1200, "yes": True, "none": None,
@@ -87,7 +86,7 @@ def drawn(table, x="", by="", **options):
 
 def test_numbers_are_lines_with_a_panel_for_what_is_neither_x_nor_line():
     table = Table.of("Rates", ["configuration", "tilt, deg", "side, px", RATE.heading], [
-        [name, Coordinate(tilt, str(tilt)), Bin(side, 2 * side), Value(side, side - 1, side + 1)]
+        [name, tilt, Bin(side, 2 * side), Value(side, side - 1, side + 1)]
         for name in ("none", "subpix") for tilt in (0, 60) for side in (40, 10, 20)], stub=3)
     titles, panels = drawn(table, "side, px", "configuration")
     assert titles == ["Rate, tilt 0\u00b0", "Rate, tilt 60\u00b0"]

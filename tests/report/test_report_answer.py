@@ -14,9 +14,9 @@ from support.small_datasets import perfect, with_detected
 from sweep.analysis import compare, error_statistics
 from sweep.analysis.requirements import Decision
 from sweep.experiment.pipeline import Pipeline
-from sweep.report.answer import answer
 from sweep.report.report_data import ReportData
 from sweep.report.table import number
+from sweep.report.write_report import answer
 from sweep.store.lifecycle import open_dataset
 
 GUIDE = (Path(__file__).parents[2] / "pipelines" / "README.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from sweep.report.cost_tables import headlines, trade_figure, tradeoff_table
 from sweep.report.figure import panels_file
+from sweep.report.findings import headlines, trade_figure, tradeoff_table
 from sweep.report.table import MAX_WIDTH
 from sweep.tradeoff.pareto import UNITS, mark_front, pareto_front
 

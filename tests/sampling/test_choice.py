@@ -11,7 +11,7 @@ from sweep.analysis.requirements import Decision, ErrorShares, answers, choice_c
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.report import decisions as size_lines
+from sweep.report import findings as size_lines
 from sweep.sampling.rules import make_rule
 from sweep.sampling.searches import group_dataset, store_cells
 from sweep.tradeoff import choice_search

@@ -10,7 +10,7 @@ from support.searches import searched, true_limits
 from sweep.analysis.intervals import looks_factor
 from sweep.analysis.requirements import Decision
 from sweep.experiment.sampling import wave_ends
-from sweep.report.decisions import limit_table, limits_as_json
+from sweep.report.findings import limit_table, limits_as_json
 from sweep.sampling.searches import BEYOND, wanted_values
 
 SIDES = np.geomspace(60, 8, 20)

@@ -26,8 +26,10 @@ class Declared:
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
-    named in place of a choice. ``reads`` returns a value that is no choice in its type, or raises
-    ValueError with what was expected, in place of the checks by type.
+    named in place of a choice. ``abbreviated`` choices are known by their number and the letters
+    before it, such as ``36h11`` and ``tag36h11`` of ``DICT_APRILTAG_36h11``. ``reads`` returns a
+    value that is no choice in its type, or raises ValueError with what was expected, in place of
+    the checks by type.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Declared:
     lengths: tuple[int, ...] = ()
     list_text: str = ""
     plugin: str = ""
+    abbreviated: bool = False
     reads: Callable[[Any], Any] | None = None
 
     def range_text(self) -> str:
@@ -72,7 +75,12 @@ class Declared:
         if word in self.choices:
             return word
         wanted = self._letters(word.strip().replace("::", ".").rpartition(".")[2])
-        return next((each for each in self.choices if self._letters(each) == wanted), None)
+        spelled = {self._letters(choice): choice for choice in self.choices}
+        if wanted in spelled or not self.abbreviated or wanted.isdigit():
+            return spelled.get(wanted)
+        # The one choice that ends so, with its number whole.
+        found = [spelled[each] for each in spelled if re.fullmatch(f"[a-z]*{wanted}", each)]
+        return found[0] if len(found) == 1 else None
 
     def _letters(self, word: str) -> str:
         """Return the letters and digits by which a choice is known."""

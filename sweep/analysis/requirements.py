@@ -10,7 +10,7 @@ import math
 import operator
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -19,44 +19,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.dataset import (
-    DRAWS,
-    ESTIMATE_INPUTS,
-    QUANTITIES,
-    SIGNED,
-    SIZE_AXES,
-    Poses,
-    as_names,
-    axes_of,
-    computed_scenes,
-    configuration_axes,
-    describes,
-    each_cell,
-    image_sides,
-    is_replicated,
-    kept_dimensions,
-    largest_cell,
-    parameter_value,
-    pose_arrays,
-    require_poses,
-    stacked,
-    stopping_rule,
-)
-from sweep.analysis.estimator import (
-    INTERVAL,
-    PERCENTS,
-    Bins,
-    Count,
-    Mean,
-    Quantiles,
-    Rate,
-    RootMeanSquare,
-    Statistic,
-    aggregate,
-    draws_to_see,
-    guarded,
-    stopped_level,
-)
+from sweep.analysis import dataset, estimator
+from sweep.analysis.dataset import DRAWS, Poses, as_names, axes_of, describes, each_cell, stacked
+from sweep.analysis.estimator import INTERVAL, Bins, Count, Quantiles, Rate, Statistic, aggregates
 from sweep.analysis.intervals import LEVEL, clopper_pearson, looks_factor
 from sweep.analysis.summaries import LOOKED_FOR, NEES_MEAN, RATIOS, quantiles_of, registered
 from sweep.errors import ArgumentError, DatasetError
@@ -66,7 +31,7 @@ from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.messages import label, nearest, plain, shown
 from sweep.model.marker import module_count
-from sweep.typing import Floats, Masks
+from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # Quantities that can be required: every output of a statistic that has an interval.
@@ -123,29 +88,24 @@ class Requirable:
     @property
     def signed(self) -> bool:
         """Whether the value has a sign: its absolute value is required."""
-        return type(self.statistic) is Mean
+        return type(self.statistic) is estimator.Mean
 
     def level(self, share: float = 1.0) -> float:
         """Return the level of the interval by which it is decided with a share of the error."""
         return 1.0 - (1.0 - (EXACT_LEVEL if self.exact else MEAN_LEVEL)) * share
 
-    def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
-        """Return the statistics for it, its poses and draws; variables' names begin with a prefix.
+    def statistics(self, level: float) -> list[Statistic[Poses]]:
+        """Return the statistics for it, its poses (``used``) and their ``draws``.
 
         Rates have Clopper and Pearson's interval.
         """
         changes: dict[str, Any] = {"exact": True} if self.is_rate else {}
-        return [
-            dataclasses.replace(
-                self.statistic, name=f"{prefix}{self.statistic.name}", level=level, **changes),
-            Count(f"{prefix}used", "poses that count", self.statistic.used, f"{prefix}draws",
-                  f"{prefix}drawn")]
+        return [dataclasses.replace(self.statistic, level=level, **changes),
+                Count("used", "poses that count", self.statistic.used, "draws", "drawn")]
 
-    def interval(
-        self, table: xr.Dataset, prefix: str
-    ) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
-        """Return value, low and high from the table of `computed`."""
-        value, low, high = (table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high"))
+    def interval(self, table: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
+        """Return value, low and high from the table of `statistics`."""
+        value, low, high = (table[f"{self.name}{end}"] for end in INTERVAL)
         if not self.signed:
             return value, low, high
         nearest, farthest = (xr.apply_ufunc(end, abs(low), abs(high))
@@ -154,7 +114,7 @@ class Requirable:
 
 
 def requirable_arrays(
-    results: xr.Dataset, required: Iterable[Requirable]
+    results: xr.Dataset, required: Sequence[Requirable]
 ) -> dict[str, xr.DataArray]:
     """Return the arrays that the statistics of some requirables read, by name.
 
@@ -163,16 +123,13 @@ def requirable_arrays(
     DatasetError
         If the dataset lacks a variable, one line for each requirable.
     """
-    required = list(required)
-    lacking = {each.name: missing for each in required
-               if (missing := [name for name in each.statistic.inputs if name not in results])}
+    lacking = [f"{each.name}: cannot be computed, for this store lacks {', '.join(missing)}"
+               for each in required
+               if (missing := [name for name in each.statistic.inputs if name not in results])]
     if lacking:
-        raise DatasetError("\n".join(
-            f"{name}: cannot be computed, for this store lacks {', '.join(missing)}"
-            for name, missing in lacking.items()))
-    return pose_arrays(
-        results, [*ESTIMATE_INPUTS, *(
-            name for each in required for name in each.statistic.inputs)])
+        raise DatasetError("\n".join(dict.fromkeys(lacking)))
+    return dataset.pose_arrays(results, [
+        *dataset.ESTIMATE_INPUTS, *(name for each in required for name in each.statistic.inputs)])
 
 
 @functools.cache
@@ -184,8 +141,8 @@ def requirables() -> dict[str, Requirable]:
     >>> requirables()["rotation_p95_deg"].units, requirables()["detection_rate"].largest
     ('degree', 1.0)
     """
-    signed = [each for group in SIGNED.values() for each in group]
-    quantities = [*QUANTITIES, *signed]
+    signed = [each for group in dataset.SIGNED.values() for each in group]
+    quantities = [*dataset.QUANTITIES, *signed]
     found = {}
     for statistic in (*registered(quantities), *map(quantiles_of, signed), NEES_MEAN, *RATIOS):
         outputs = {output.name: output for output in statistic.outputs()}
@@ -194,7 +151,8 @@ def requirables() -> dict[str, Requirable]:
                 continue  # it has no interval
             largest = next((each.bound for each in quantities if each.bound is not None and (
                 name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}"))), math.inf)
-            percent = next((PERCENTS[part] for part in name.split("_") if part in PERCENTS), None)
+            percent = next((percent for part, percent in estimator.PERCENTS.items()
+                            if part in name.split("_")), None)
             found[name] = Requirable(
                 name, output.units, statistic, 1.0 if isinstance(statistic, Rate) else largest,
                 percent)
@@ -207,12 +165,6 @@ def requirables() -> dict[str, Requirable]:
 #: Units that names end with.
 UNITS = {"deg": "degrees", "rad": "radians", "m": "metres", "mm": "millimetres", "percent": "%",
          "px": "pixels", "cm": "centimetres"}
-
-#: Middle parts of the names of statistics of errors.
-STATISTICS = (*PERCENTS, "bias", "sd", "rmse")
-
-#: Endings of names that may be left out.
-ENDINGS = ("_rate", "_mean")
 
 
 def named(name: str) -> Requirable:
@@ -230,18 +182,15 @@ def named(name: str) -> Requirable:
     """
     known = requirables()
     short = re.sub("_errors?(?=_|$)", "", name.lower())
-    for candidate in (short, *(f"{short}{ending}" for ending in ENDINGS)):
+    for candidate in (short, f"{short}_rate", f"{short}_mean"):
         if candidate in known:
             return known[candidate]
-    head, _, tail = short.rpartition("_")
-    stem = head if tail in UNITS else short
-    ending = next((other.rpartition("_")[2] for other in known
-                   if other.rpartition("_")[0] == stem), "")
-    kinds = [other for other in known if other.startswith(f"{stem}_") and any(
-        f"_{each}_" in other for each in STATISTICS)]
-    if ending in UNITS:
-        raise ValueError(f"its unit is {UNITS[ending]}: write {stem}_{ending}")
-    if kinds:
+    stem = re.sub(f"_({'|'.join(UNITS)})$", "", short)
+    unit = next((other.removeprefix(f"{stem}_") for other in known
+                 if other.rpartition("_")[0] == stem), "")
+    if unit in UNITS:
+        raise ValueError(f"its unit is {UNITS[unit]}: write {stem}_{unit}")
+    if kinds := [other for other in known if other.startswith(f"{stem}_")]:
         raise ValueError(f"which statistic of it? There are {', '.join(kinds)}")
     hint = nearest(short, [*known]) or (
         f"; there are {', '.join(EXAMPLES)} and the other variables of error_statistics, in "
@@ -273,18 +222,14 @@ def fault_of(what: Requirable, given: RequirementText) -> str:
     return f"expected a limit above 0{below}{share}{sign}"
 
 
-def contradictions(given: Sequence[Requirement]) -> list[tuple[str, str]]:
-    """Return the requirements on one quantity that cannot hold together, each a text and a line."""
-    faults = []
-    for one, other in itertools.combinations(given, 2):
-        if one.variable != other.variable:
-            continue
-        least, most = (one, other) if one.at_least else (other, one)
-        if one.at_least == other.at_least:
-            faults.append((other.text, f"{other.variable} has another such limit; delete one"))
-        elif least.limit >= most.limit:
-            faults.append((least.text, f"contradicts {most.text}: no result can be both"))
-    return faults
+def contradictions(given: Sequence[Requirement]) -> Iterator[tuple[str, str]]:
+    """Yield the requirements on one quantity that cannot hold together, each a text and a line."""
+    # Of two requirements on a quantity the lower limit comes first.
+    for one, other in itertools.combinations(sorted(given, key=lambda each: not each.at_least), 2):
+        if one.what == other.what and one.at_least == other.at_least:
+            yield other.text, f"{other.what.name} has another such limit; delete one"
+        elif one.what == other.what and one.limit >= other.limit:
+            yield one.text, f"contradicts {other.text}: no result can be both"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -357,10 +302,8 @@ class Requirement:
 
     Attributes
     ----------
-    text
-        As it is shown: "detection_rate >= 0.99".
-    variable
-        The quantity's name: a variable of `sweep.analysis.error_statistics`, of `efficiency` or of
+    what
+        The quantity: a variable of `sweep.analysis.error_statistics`, of `efficiency` or of
         `covariance_trust`. Of a bias with a sign the absolute value is required.
     relation
         One of ``>=``, ``<=``, ``>``, ``<``.
@@ -368,15 +311,14 @@ class Requirement:
         The number, in the quantity's units.
     """
 
-    text: str
-    variable: str
+    what: Requirable
     relation: str
     limit: float
 
     @property
-    def requirable(self) -> Requirable:
-        """The requirement in words."""
-        return requirables()[self.variable]
+    def text(self) -> str:
+        """As it is shown: "detection_rate >= 0.99"."""
+        return f"{self.what.name} {self.relation} {self.limit:.12g}"
 
     @property
     def at_least(self) -> bool:
@@ -423,9 +365,8 @@ def parse_requirements(
     if not given:
         faults.append(("[]", "expected at least one, such as 'detection >= 0.95'"))
     if faults:
-        first, *others = faults
-        raise ArgumentError("requirements", first[0], "\n".join(
-            [first[1], *(f"{text}: {problem}" for text, problem in others)]))
+        raise ArgumentError("requirements", faults[0][0], "\n".join(
+            [faults[0][1], *map(": ".join, faults[1:])]))
     return tuple(requirements)
 
 
@@ -438,16 +379,12 @@ def read_requirements(
         try:
             given = read_requirement(text)
             what = named(given.name)
-            problem = fault_of(what, given)
+            if problem := fault_of(what, given):
+                raise ValueError(problem)
+            requirements.append(Requirement(what, given.relation, given.limit))
         except ValueError as error:
-            problem = str(error)
-        if problem:
-            faults.append((plain(text), problem))
-        else:
-            requirements.append(Requirement(
-                f"{what.name} {given.relation} {given.limit:.12g}", what.name, given.relation,
-                given.limit))
-    return requirements, faults + contradictions(requirements)
+            faults.append((plain(text), str(error)))
+    return requirements, [*faults, *contradictions(requirements)]
 
 
 @describes
@@ -517,19 +454,15 @@ def check_requirements(
     """
     required = parse_requirements(requirements)
     table = decide(results, required, per, bins)
-    solved = (table["solved"] / table["looked_for"]).where(table["looked_for"] > 0)
-    needed = [draws_needed(each, table.isel(requirement=number), solved)
-              for number, each in enumerate(required)]
-    return table.drop_vars(["looked_for", "solved"]).assign(
-        draws_needed=stacked(needed, "requirement").assign_attrs(
-            long_name="draws that would decide it, if the value stays", units="1"))
+    return table.drop_vars(["looked_for", "solved", "keeps"]).assign(
+        draws_needed=draws_needed(table, required))
 
 
 def decide(
     results: xr.Dataset, required: Sequence[Requirement], per: Sequence[str] = (),
     bins: Bins | None = None, shares: ErrorShares | None = None,
 ) -> xr.Dataset:
-    """Return decisions as `check_requirements`, without ``draws_needed``, at other levels.
+    """Return decisions as `check_requirements`, without ``draws_needed``.
 
     Parameters
     ----------
@@ -542,43 +475,41 @@ def decide(
     Returns
     -------
     xr.Dataset
-        As there, with ``looked_for`` and ``solved``: poses of the condition (without
-        ``requirement``).
+        As there, with ``keeps``: whether the value keeps its limit, and ``looked_for`` and
+        ``solved``: poses of the condition (without ``requirement``).
     """
-    configuration = configuration_axes(results)
-    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *as_names(per)))))
+    configuration = dataset.configuration_axes(results)
+    kept = dataset.kept_dimensions(results, (*configuration, *as_names(per)))
     require_draws(results, kept)
-    bin_counts = [len(edges) - 1 for edges in (bins or {}).values()]
-    count = len(required) * math.prod(
-        [*bin_counts, *(results.sizes[name] for name in kept if name not in configuration)])
+    count = len(required) * math.prod([
+        *(len(edges) - 1 for edges in (bins or {}).values()),
+        *(results.sizes[name] for name in kept if name not in configuration)])
     spent = shares or ErrorShares(not_met=1.0 / count)
-    inputs = requirable_arrays(results, [each.requirable for each in required])
-    statistics = [
-        Count("looked_for", "", lambda poses: poses.looked_for),
-        Count("solved", "", lambda poses: poses.solved),
-        *(guarded(statistic) for number, each in enumerate(required) for prefix, share in (
-            (f"{number} one ", spent.met), (f"{number} all ", spent.not_met))
-          for statistic in each.requirable.computed(prefix, each.requirable.level(share))),
-    ]
-    stopped = None if shares is None else False
-    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped)
-    lacking = [each.variable for number, each in enumerate(required)
-               if not table[f"{number} one used"].any() and table["solved"].any()]
+    quantities = [each.what for each in required]
+    poses, *tables = aggregates(
+        results, requirable_arrays(results, quantities), kept, [
+            [Count("looked_for", "", lambda poses: poses.looked_for),
+             Count("solved", "", lambda poses: poses.solved)],
+            *([*map(estimator.guarded, each.statistics(each.level(share)))]
+              for each in quantities for share in (spent.met, spent.not_met)),
+        ], Poses, bins, stopped=None if shares is None else False)
+    lacking = [each.name for each, table in zip(quantities, tables[::2], strict=True)
+               if not table["used"].any() and poses["solved"].any()]
     if lacking and shares is None:
         raise DatasetError("\n".join(
             f"{name}: no pose of this store has such a number; require something else, or give the "
             "pipeline what computes it" for name in lacking))
-    judged = [_judged(table, number, each, is_replicated(results))
-              for number, each in enumerate(required)]
+    judged = [_judged(*parts, poses, dataset.is_replicated(results))
+              for parts in zip(required, tables[::2], tables[1::2], strict=True)]
     out = stacked(judged, "requirement").assign_coords(
         requirement=xr.DataArray([each.text for each in required], dims="requirement", attrs={
             "long_name": "what is required"}),
-        variable=("requirement", [each.variable for each in required]),
+        variable=("requirement", [each.name for each in quantities]),
         relation=("requirement", [each.relation for each in required]),
         limit=("requirement", [each.limit for each in required]),
-        units=("requirement", [each.requirable.units for each in required]))
-    out.attrs["configuration_dims"] = [name for name in configuration if name in out.dims]
-    return out.assign(looked_for=table["looked_for"], solved=table["solved"])
+        units=("requirement", [each.units for each in quantities]))
+    return out.assign(looked_for=poses["looked_for"], solved=poses["solved"]).assign_attrs(
+        configuration_dims=configuration)
 
 
 def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
@@ -593,23 +524,29 @@ def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
 
 
 def _judged(
-    table: xr.Dataset, number: int, requirement: Requirement, replicated: bool
+    requirement: Requirement, one: xr.Dataset, every: xr.Dataset, poses: xr.Dataset,
+    replicated: bool,
 ) -> xr.Dataset:
-    """Return value, ends and decision of one requirement."""
-    what = requirement.requirable
-    value, low, high = what.interval(table, f"{number} one ")
-    _, joint_low, joint_high = what.interval(table, f"{number} all ")
+    """Return value, ends and decision of one requirement.
+
+    ``one`` and ``every`` have its statistics at the level of one decision, and of all together.
+    """
+    what = requirement.what
+    value, low, high = what.interval(one)
     # The end that shows it is met is of one decision, the other of all together.
-    low, high = (low, joint_high) if requirement.at_least else (joint_low, high)
-    shows, refutes = (low, high) if requirement.at_least else (high, low)
-    draws, drawn = table[f"{number} one draws"], table[f"{number} one drawn"]
-    enough = drawn if what.exact or replicated else drawn & (draws >= MIN_DRAWS)
-    met = requirement.holds(shows) & enough
-    not_met = ~requirement.holds(refutes) & refutes.notnull() & enough
-    no_number = (table[f"{number} one used"] == 0) & (
-        (table["looked_for"] == 0) | (table["solved"] > 0))
+    if requirement.at_least:
+        high = refutes = what.interval(every)[2]
+        shows = low
+    else:
+        low = refutes = what.interval(every)[1]
+        shows = high
+    enough = one["drawn"] if what.exact or replicated else one["drawn"] & (
+        one["draws"] >= MIN_DRAWS)
+    no_number = (one["used"] == 0) & ((poses["looked_for"] == 0) | (poses["solved"] > 0))
     decision = value.copy(data=np.select(
-        [no_number, met, not_met], [Decision.not_applicable, Decision.met, Decision.not_met],
+        [no_number, requirement.holds(shows) & enough,
+         ~requirement.holds(refutes) & refutes.notnull() & enough],
+        [Decision.not_applicable, Decision.met, Decision.not_met],
         Decision.undecided).astype(np.uint8))
     return xr.Dataset({
         name: array.assign_attrs(long_name=meaning, units=units)
@@ -617,8 +554,8 @@ def _judged(
             ("value", value, "value", ""),
             ("low", low, "lower end of the interval by which it is decided", ""),
             ("high", high, "upper end of the interval by which it is decided", ""),
-            ("draws", draws, "random draws that the value is worth", "1"))
-    } | {"decision": decision.assign_attrs(
+            ("draws", one["draws"], "random draws that the value is worth", "1"))
+    } | {"keeps": requirement.holds(value), "decision": decision.assign_attrs(
         cf_attributes("whether the requirement is met", flags=Decision))})
 
 
@@ -628,11 +565,14 @@ def _judged(
 #: More draws than this are none that anyone waits for.
 MAX_DRAWS = 1e9
 
+#: Numbers of draws of which the first that decides a rate is taken.
+POWERS = np.unique(np.ceil(1.1 ** np.arange(1, 218))).tolist()
+
 
 def draws_needed(
-    requirement: Requirement, table: xr.Dataset, solved: xr.DataArray | float, share: float = 1.0
+    table: xr.Dataset, required: Sequence[Requirement], share: float = 1.0
 ) -> xr.DataArray:
-    """Return about how many draws would decide a requirement, infinite if no number would.
+    """Return about how many draws would decide requirements, infinite if no number would.
 
     NaN where it is decided, and without a value. For a rate it is the least n at which Clopper and
     Pearson's end for n times the rate reaches the limit. Other intervals narrow with the root of
@@ -642,65 +582,70 @@ def draws_needed(
 
     Parameters
     ----------
-    requirement, table
-        The requirement, and its decisions (`decide`).
-    solved
-        Share of the solved poses.
+    table, required
+        The decisions (`decide`), and the requirements.
     share
-        Share of the error probability that the decision may spend.
+        Share of the error probability that a decision may spend.
     """
-    what, limit = requirement.requirable, requirement.limit
-    level = what.level(share)
+    found = [xr.apply_ufunc(
+        np.vectorize(functools.partial(_needed, each, each.what.level(share)),
+                     otypes=[float]),
+        cells["value"].where(cells["decision"] == Decision.undecided), cells["low"], cells["high"],
+        cells["draws"].astype(np.float64),
+        (cells["solved"] / cells["looked_for"]).where(cells["looked_for"] > 0),
+    ) for each, cells in zip(required, (
+        table.isel(requirement=k) for k in range(len(required))), strict=True)]
+    needed: xr.DataArray = stacked(found, "requirement")
+    return needed.assign_attrs(
+        long_name="draws that would decide it, if the value stays", units="1")
 
-    def needed(value: float, low: float, high: float, draws: float, solved: float) -> float:
-        if math.isnan(value):
-            return math.nan
-        if what.is_rate:
-            return _of_rate(value, limit, level)
-        good = value >= limit if requirement.at_least else value <= limit
-        # The end that has to pass the limit.
-        end, gap = low if good == requirement.at_least else high, abs(value - limit)
-        least = float(MIN_DRAWS)
-        if what.percent is not None:
-            least = float(draws_to_see(1.0 - what.percent / 100.0, level))
-            if math.inf in (end, value) and draws >= least:
-                return max(least, _of_rate(solved, what.percent / 100.0, level))
-        if not math.isfinite(end) or not math.isfinite(value):
-            return max(least, 2.0 * draws)
-        if gap == 0.0:
-            return math.inf
-        reach = (end - value) / gap
-        # A spread without a largest value has an interval of the logarithm.
-        if isinstance(what.statistic, RootMeanSquare) and math.isinf(what.largest) and (
-                min(value, end) > 0.0):
-            reach = math.log(end / value) / math.log(limit / value)
-        if 2.0 <= draws < MIN_DRAWS and not what.exact:
-            # Student's factor of so few draws is far above that of many.
-            probability = (1.0 + level) / 2.0
-            reach *= special.ndtri(probability) / special.stdtrit(draws - 1.0, probability)
-        return _rounded(max(least, draws * reach ** 2))
 
-    found: xr.DataArray = xr.apply_ufunc(
-        np.vectorize(needed, otypes=[float]),
-        table["value"].where(table["decision"] == Decision.undecided), table["low"], table["high"],
-        table["draws"].astype(np.float64), solved)
-    return found
+def _needed(
+    requirement: Requirement, level: float, value: float, low: float, high: float, draws: float,
+    solved: float,
+) -> float:
+    """Return the draws that one undecided requirement needs; ``solved`` is a share of poses."""
+    what, limit = requirement.what, requirement.limit
+    if math.isnan(value):
+        return math.nan
+    if what.is_rate:
+        return _of_rate(value, limit, level)
+    good = value >= limit if requirement.at_least else value <= limit
+    # The end that has to pass the limit.
+    end, gap = low if good == requirement.at_least else high, abs(value - limit)
+    least = float(MIN_DRAWS)
+    if what.percent is not None:
+        least = float(estimator.draws_to_see(1.0 - what.percent / 100.0, level))
+        if math.inf in (end, value) and draws >= least:
+            return max(least, _of_rate(solved, what.percent / 100.0, level))
+    if not math.isfinite(end) or not math.isfinite(value):
+        return max(least, 2.0 * draws)
+    if gap == 0.0:
+        return math.inf
+    reach = (end - value) / gap
+    # A spread without a largest value has an interval of the logarithm.
+    if isinstance(what.statistic, estimator.RootMeanSquare) and math.isinf(what.largest) and (
+            min(value, end) > 0.0):
+        reach = math.log(end / value) / math.log(limit / value)
+    if 2.0 <= draws < MIN_DRAWS and not what.exact:
+        # Student's factor of so few draws is far above that of many.
+        probability = (1.0 + level) / 2.0
+        reach *= special.ndtri(probability) / special.stdtrit(draws - 1.0, probability)
+    return _rounded(max(least, draws * reach ** 2))
 
 
 def _of_rate(rate: float, limit: float, level: float) -> float:
     """Return the least power of about 1.1 at which the interval excludes the limit."""
     if rate == limit:
         return math.inf
-    counts = np.unique(np.ceil(1.1 ** np.arange(1, 218)))
-
     def is_decided(n: float) -> bool:
         # Whole hits, rounded towards the limit.
         hits = math.floor(rate * n) if rate > limit else math.ceil(rate * n)
         low, high = clopper_pearson(hits, n, level)
         return bool(low > limit) if rate > limit else bool(high < limit)
 
-    first = bisect.bisect_left(counts, True, key=is_decided)
-    return _rounded(float(counts[first])) if first < len(counts) else math.inf
+    first = bisect.bisect_left(POWERS, True, key=is_decided)
+    return _rounded(POWERS[first]) if first < len(POWERS) else math.inf
 
 
 def _rounded(count: float) -> float:
@@ -758,13 +703,15 @@ class Cause:
     draws_needed: float
 
     @classmethod
-    def at(cls, cell: xr.Dataset, conditions: Sequence[str], **more: Any) -> Self:
-        """Return the cause of one cell of a table of `decide`."""
-        return cls(
-            str(cell["requirement"].item()), str(cell["units"].item()),
-            {name: cell[name].item() for name in conditions}, Decision(int(cell["decision"])),
-            float(cell["value"]), float(cell["low"]), float(cell["high"]), int(cell["draws"]),
-            **more)
+    def of(cls, cells: xr.Dataset, conditions: Sequence[str], **more: Any) -> Self:
+        """Return the cause of the cell, of a table, that fails worst, or is nearest to it."""
+        decision = cells["decision"]
+        worst = next(each for each in WORST_FIRST if (decision == each).any())
+        cell = dataset.largest_cell(cells, excess_of(cells).where(decision == worst, -np.inf))
+        numbers = ("requirement", "units", "value", "low", "high", "draws", "draws_needed")
+        return cls(**{name: cell[name].item() for name in numbers} | {
+            "decision": worst, "condition": {name: cell[name].item() for name in conditions},
+            **more})
 
 
 @dataclass(frozen=True)
@@ -797,30 +744,20 @@ class Verdict(Cause):
                    if decision is not Decision.not_applicable)
 
 
-def worst_cell(table: xr.Dataset) -> xr.Dataset:
-    """Return the cell of a table of `decide` that fails worst, or is nearest to it."""
-    decision = table["decision"]
-    worst = next(each for each in WORST_FIRST if (decision == each).any())
-    return largest_cell(table, excess_of(table).where(decision == worst, -np.inf))
-
-
 def verdicts(table: xr.Dataset) -> list[Verdict]:
     """Return the verdicts of a table of `sweep.analysis.check_requirements`."""
-    configuration = [str(name) for name in table.attrs["configuration_dims"]]
+    configuration = table.attrs["configuration_dims"]
     conditions = [str(dim) for dim in table["decision"].dims
                   if dim not in (*configuration, "requirement")]
     found = []
-    for at, one in each_cell(
-            table.transpose(*configuration, "requirement", *conditions),
-            (*configuration, "requirement")):
-        cell, is_open = worst_cell(one), one["decision"] == Decision.undecided
-        needed = float(one["draws_needed"].where(is_open).max())
-        found.append(Verdict.at(
-            cell, conditions, limit=float(one["limit"]),
-            draws_needed=needed if cell["decision"] == Decision.undecided else math.nan,
-            configuration={name: at[name] for name in configuration},
-            counts={each: count for each in Decision
-                    if (count := int((one["decision"] == each).sum()))}))
+    for at, one in each_cell(table, (*configuration, "requirement")):
+        counts = {Decision(decision): int(count) for decision, count in zip(
+            *np.unique(one["decision"], return_counts=True), strict=True)}
+        # Where it fails somewhere, no number of draws mends it.
+        needed = math.nan if Decision.not_met in counts else float(one["draws_needed"].max())
+        found.append(Verdict.of(
+            one, conditions, draws_needed=needed, limit=one["limit"].item(), counts=counts,
+            configuration={name: at[name] for name in configuration}))
     return found
 
 
@@ -842,12 +779,6 @@ def excess_of(table: xr.Dataset) -> xr.DataArray:
         at_least = table["relation"].isin([">=", ">"])
         excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio)
     return excess.clip(min=-sys.float_info.max).fillna(np.inf)
-
-
-def kept_by(table: xr.Dataset, required: Sequence[Requirement]) -> xr.DataArray:
-    """Return where the values of a table (..., requirement) keep their limits."""
-    keeps = [each.holds(table["value"].isel(requirement=k)) for k, each in enumerate(required)]
-    return stacked(keeps, "requirement").transpose(*table["value"].dims)
 
 
 def described(values: Mapping[str, Any], equals: str = "=") -> str:
@@ -898,7 +829,7 @@ def conditions(
         them together holds of none that someone puts up. IDs of markers are no conditions.
     """
     if per is not None:
-        return kept_dimensions(results, per)
+        return dataset.kept_dimensions(results, per)
     if found := tuple(name for name in required_per if name in results.dims):
         return found
     axes = [name for name in axes_of(results, Stage.scene)
@@ -907,7 +838,7 @@ def conditions(
                and results[name].dtype.kind in "fiu"]
     boards = [name for name in axes if BOARDS in results.coords and results[BOARDS].dims == (name,)]
     usual = [next((name for name in names if name in axes), "") for names in (
-        (*SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES, boards)]
+        (*dataset.SIZE_AXES, *SIZES_BESIDE, *numeric), ANGLE_AXES, boards)]
     return tuple(dict.fromkeys(filter(None, usual)))
 
 
@@ -970,9 +901,7 @@ def course(decision: Decisions, keeps: Masks, start: int = 0) -> Course:
     >>> course(decision, decision == met)
     Course(met=1, possible=1, kept=1, unmet=2, failing=2)
     """
-    inner = tuple(range(1, decision.ndim))
-    keep = (keeps | (decision == Decision.not_applicable)).all(inner)
-    value = combined_decision(decision, inner)
+    value, keep = of_values(decision, keeps)
     judged = (value != Decision.not_applicable) & (np.arange(len(value)) >= start)
 
     def ends(holds: Masks) -> tuple[int, int]:
@@ -984,6 +913,16 @@ def course(decision: Decisions, keeps: Masks, start: int = 0) -> Course:
 
     (met, unmet), (kept, failing) = ends(value == Decision.met), ends(keep)
     return Course(met, ends(value != Decision.not_met)[0], kept, unmet, failing)
+
+
+def of_values(decision: Decisions, keeps: Masks) -> tuple[Decisions, Masks]:
+    """Return the decision on each value (values,), and where its estimates keep all limits.
+
+    ``decision`` and ``keeps`` are (values, ...): what cannot be judged is left out.
+    """
+    inner = tuple(range(1, decision.ndim))
+    return combined_decision(decision, inner), np.asarray(
+        (keeps | (decision == Decision.not_applicable)).all(inner))
 
 
 def error_shares(looks: float, decisions: int) -> ErrorShares:
@@ -1012,8 +951,8 @@ class Reach(Flag):
     within = flag(4, "They are met between two values, but not at the easiest.", present=True)
 
 
-#: Variables of limits: name -> meaning, and units; those of the axis if they are None.
-LIMITS: dict[str, tuple[str, str | None]] = {
+#: Variables of limits: name -> meaning, units (those of the axis if they are None), and flags.
+LIMITS: dict[str, tuple[Any, ...]] = {
     "value": ("{} up to which all requirements are met", None),
     "low": ("lower end of the interval: {} up to which all are met", None),
     "high": ("upper end of the interval: {} up to which all are met", None),
@@ -1022,10 +961,13 @@ LIMITS: dict[str, tuple[str, str | None]] = {
     "farthest_beyond": ("farthest {} beyond it at which all are met again", None),
     "failing_value": ("value of the requirement that fails there", ""),
     "met_beyond": ("values beyond it at which all are met again", "1"),
+    "limited_by": ("requirement that fails", ""),
+    "fails_where": ("where it fails", ""),
+    "reach": ("how far the requirements are met", "", Reach),
+    "settled": ("whether the interval is a single value of the grid", "1"),
+    "decision": ("whether all requirements are met", "", Decision),
+    "keeps": ("whether all values keep their limits", "1"),
 }
-
-#: Texts of limits: name -> meaning.
-LIMIT_TEXTS = {"limited_by": "requirement that fails", "fails_where": "where it fails"}
 
 
 @describes
@@ -1100,18 +1042,18 @@ def requirement_limits(
     >>> limit["limited_by"].item(), limit["fails_at"].item()
     ('detection_rate >= 0.6', 10.0)
     """
-    rule = stopping_rule(results)
-    rule = rule if rule is not None and rule.kind == "along" else None
-    require = [require] if isinstance(require, str) and require else require
-    if rule is not None:
+    rule, looks = dataset.stopping_rule(results), 1
+    if rule is not None and rule.kind == "along":
+        looks = len(rule.ends)
         require, along = require or rule.requirements, along or rule.along
+        if along == rule.along:
+            per = rule.per if per is None else per
+            at_all = rule.at_all if at_all is None else at_all
+    require = [require] if isinstance(require, str) and require else require
     if not require:
         raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
     if not along:
         raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
-    if rule is not None and along == rule.along:
-        per = rule.per if per is None else per
-        at_all = rule.at_all if at_all is None else at_all
     required = parse_requirements(require)
     values = axis_values(results, along)
     together = [name for name in as_names(at_all or ()) if name != along]
@@ -1121,61 +1063,34 @@ def requirement_limits(
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
     table = decide(results, required, [*names, *together, along],
-                   shares=error_shares(looks_factor(len(rule.ends) if rule else 1), count))
-    table = table.assign(keeps=kept_by(table, required))
+                   shares=error_shares(looks_factor(looks), count))
     upwards = is_harder_upwards(
         along, table["keeps"].transpose(along, ...).to_numpy()[np.argsort(values)])
     order = np.argsort(values if upwards else -values, kind="stable")
-    table = table.isel({along: order})
-    inner = [*together, "requirement"]
-    applicable = table["decision"] != Decision.not_applicable
-    keeps = ((table["keeps"] | ~applicable).all(inner) & applicable.any(inner)).assign_attrs(
-        long_name="whether all values keep their limits", units="1")
-    decision = xr.apply_ufunc(
-        combined_decision, table["decision"], input_core_dims=[inner],
-        kwargs={"axis": tuple(range(-len(inner), 0))}).assign_attrs(
-        cf_attributes("whether all requirements are met", flags=Decision))
-    kept = [dim for dim in decision.dims if dim != along]
-    rows = []
-    for index in np.ndindex(*(table.sizes[dim] for dim in kept)):
-        at = dict(zip(kept, index, strict=True))
-        failing, row = _limit(values[order], upwards, *(
-            array.isel(at).to_numpy() for array in (decision, keeps)))
-        if failing is not None:
-            row |= _cause(table.isel({**at, along: failing}), together)
-        rows.append(row)
-
-    def column(name: str, missing: Any) -> Any:
-        found = np.array([row.get(name, missing) for row in rows])
-        return found.reshape([table.sizes[dim] for dim in kept])
-
-    units = str(results[along].attrs.get("units", ""))
-    variables: dict[str, Any] = {
-        name: (kept, column(name, np.nan), {
-            "long_name": meaning.format(along), "units": units if unit is None else unit})
-        for name, (meaning, unit) in LIMITS.items()}
-    variables |= {name: (kept, column(name, ""), {"long_name": meaning})
-                  for name, meaning in LIMIT_TEXTS.items()}
-    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8),
-                          cf_attributes("how far the requirements are met", flags=Reach))
-    variables |= {name: array.transpose(*kept, along)
-                  for name, array in (("decision", decision), ("keeps", keeps))}
-    coordinates = {name: value for name, value in table.coords.items()
-                   if set(value.dims) <= {*kept, along}}
-    found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
-    computed = computed_scenes(results)
+    inner = (along, *together, "requirement")
+    kept = [str(dim) for dim in table["decision"].dims if dim not in inner]
+    rows = [_limit(part.transpose(along, ...), along, together, upwards=upwards)
+            for _, part in each_cell(table.isel({along: order}), kept)]
+    variables, units = {}, results[along].attrs.get("units", "")
+    for name, (meaning, own, *flags) in LIMITS.items():
+        column = np.array([row.get(name, np.nan) for row in rows])
+        rest = column.shape[1:]  # along the axis, if it has values there
+        variables[name] = (
+            [*kept, along][: len(kept) + len(rest)],
+            column.reshape([*(table.sizes[dim] for dim in kept), *rest]),
+            cf_attributes(meaning.format(along), units if own is None else own, *flags))
+    found = xr.Dataset(variables).isel({along: np.argsort(order)})
+    computed = dataset.computed_scenes(results)
     cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
     trials = computed.sum(DRAWS).compute()
-    return found.assign(
-        settled=(found["low"] == found["high"]).assign_attrs(
-            long_name="whether the interval is a single value of the grid", units="1"),
+    return found.assign_coords(table.drop_dims([*together, "requirement"]).coords).assign(
         trials=trials.max(cells).assign_attrs(
             long_name="trials of a cell, the most at this value", units="1"),
         poses=trials.sum([*cells, along]).assign_attrs(
             long_name="scenes that were computed, of all values", units="1"),
     ).assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
-        configuration_dims=[name for name in configuration_axes(results) if name in kept],
+        configuration_dims=table.attrs["configuration_dims"],
         per=[*names], at_all=together, require=[*require])
 
 
@@ -1188,15 +1103,12 @@ def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.
         If there is no such axis, or its values are no numbers, or it is one of configurations.
     """
     axes = [name for name in axes_of(results)
-            if name != DRAWS and name not in configuration_axes(results)
+            if name != DRAWS and name not in dataset.configuration_axes(results)
             and name in results.coords and results[name].dtype.kind in "fiu"]
     if along not in axes:
         raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
                             f"are {', '.join(axes) or 'none'}")
-    values = results[along].to_numpy().astype(np.float64)
-    if len(set(values.tolist())) < len(values) or not np.isfinite(values).all():
-        raise DatasetError(f"{along}: has values that repeat or are not finite")
-    return values
+    return results[along].to_numpy().astype(np.float64)
 
 
 #: Whether markers are smaller in the image at large values of an axis that changes their size.
@@ -1216,17 +1128,21 @@ def is_harder_upwards(along: str, keeps: NDArray[Any]) -> bool:
 
 
 def _limit(
-    values: Floats, upwards: bool, decision: Decisions, keeps: Masks
-) -> tuple[int | None, dict[str, Any]]:
-    """Return the limit of one condition along the axis, from easy to hard.
+    part: xr.Dataset, along: str, together: Sequence[str], *, upwards: bool
+) -> dict[str, Any]:
+    """Return the limit of one condition, a part of the table of `decide`, from easy to hard.
 
-    With it, before it: the index of the first value beyond that fails.
+    It has the variables of `LIMITS`; those that are left out are NaN.
     """
-    judged = decision != Decision.not_applicable
+    values = part[along].to_numpy().astype(np.float64)
+    decision, keeps = of_values(part["decision"].to_numpy(), part["keeps"].to_numpy())
+    judged, index = decision != Decision.not_applicable, np.arange(len(values))
+    row = {"decision": decision, "keeps": keeps & judged, "settled": False, "limited_by": "",
+           "fails_where": "", "reach": np.uint8(Reach.not_run)}
     if not judged.any():
-        return None, {"reach": Reach.not_run}
+        return row
     # Where the easiest values fail, the limit is the end of the longest run of values that do not.
-    run, index = met_run(keeps, judged), np.arange(len(values))
+    run = met_run(keeps, judged)
     gaps = np.flatnonzero(judged & ~keeps & (index < (run[0] if run else 0)))
     start = int(gaps[-1]) + 1 if gaps.size else 0
     found = course(decision, keeps, start)
@@ -1236,15 +1152,23 @@ def _limit(
     if (decision[start:] != Decision.not_met).all():
         possible = beyond
     low, high = sorted((met, possible))
-    row = {"value": value if np.isfinite(value) else np.nan, "low": low, "high": high,
-           "start": float(values[run[0]]) if run else np.nan, "met_beyond": 0.0}
+    row |= {"value": value if np.isfinite(value) else np.nan, "low": low, "high": high,
+            "start": float(values[run[0]]) if run else np.nan, "met_beyond": 0.0,
+            "settled": low == high, "reach": np.uint8(
+                Reach.never if run is None else Reach.within if gaps.size else
+                Reach.always if found.failing == len(values) else Reach.found)}
     if found.failing == len(values):
-        return None, {**row, "reach": Reach.within if gaps.size else Reach.always}
+        return row
     again = np.flatnonzero(judged & keeps & (index > found.failing))
-    return found.failing, {
-        **row, "fails_at": float(values[found.failing]), "met_beyond": float(len(again)),
+    cell = part.isel({along: found.failing})
+    failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
+    worst = dataset.largest_cell(cell, excess_of(cell).where(failing, -np.inf))
+    return row | {
+        "fails_at": float(values[found.failing]), "met_beyond": float(len(again)),
         "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
-        "reach": Reach.never if run is None else Reach.within if gaps.size else Reach.found}
+        "limited_by": str(worst["requirement"].item()),
+        "fails_where": described({name: worst[name].item() for name in together}, " = "),
+        "failing_value": float(worst["value"])}
 
 
 def met_run(
@@ -1266,15 +1190,6 @@ def met_run(
     runs = edges.reshape(-1, 2)
     first, end = runs[0] if runs[0, 0] == 0 else runs[np.argmax(runs[:, 1] - runs[:, 0])]
     return int(at[first]), int(at[end - 1])
-
-
-def _cause(cell: xr.Dataset, together: Sequence[str]) -> dict[str, Any]:
-    """Return which requirement fails worst, where among ``together``, and its value there."""
-    failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
-    worst = largest_cell(cell, excess_of(cell).where(failing, -np.inf))
-    where = described({name: worst[name].item() for name in together}, " = ")
-    return {"limited_by": str(worst["requirement"].item()), "fails_where": where,
-            "failing_value": float(worst["value"])}
 
 
 @describes
@@ -1329,36 +1244,37 @@ def detection_limit(
     >>> limit["side_px"].item(), limit["side_px_high"].item(), Reach(limit["reach"].item()).name
     (20.0, 40.0, 'found')
     """
-    require_poses(results)
+    dataset.require_poses(results)
     axes = axes_of(results)
     results = results.isel(  # what has several estimators has been detected once
         {name: 0 for name in axes if name not in results["detection"].dims}, drop=True)
     if per is None:
-        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
-    per = kept_dimensions(
-        results, (*as_names(per), *(name for name in ("dictionary",) if name in axes)))
-    sides = image_sides(results)
+        per = [name for name in ANGLE_AXES if name in axes]
+    per = dataset.kept_dimensions(results, (*as_names(per), *{"dictionary"}.intersection(axes)))
+    sides = dataset.image_sides(results)
     if not sides.dims:
         raise DatasetError("side_px or distance_m: no axis changes the size in the image; there "
                            f"are {', '.join(axes) or 'none'}")
-    along, *others = [str(dim) for dim in sides.dims if dim not in per] or [""]
-    if others or not along:
+    searched = [str(dim) for dim in sides.dims if dim not in per]
+    if len(searched) != 1:
         raise ArgumentError("per", ", ".join(per), "expected all axes of the size but one, which "
                             f"the limit is along; there are {', '.join(map(str, sides.dims))}")
+    along, = searched
     found = requirement_limits(results, [f"detection >= {rate:.12g}"], along, per)
-    names = parameter_value(results, "dictionary")
-    modules: Any = module_count(names) if isinstance(names, str) else xr.apply_ufunc(
-        np.vectorize(module_count), names)
+    modules = xr.apply_ufunc(
+        np.vectorize(module_count), xr.DataArray(dataset.parameter_value(results, "dictionary")))
     smaller = found.attrs["harder"] == "upwards"
+    # Beyond the grid's end at which markers are small the side is 0, beyond the other infinite.
+    sides = sides.drop_vars([name for name in sides.coords if name not in sides.dims]).reindex(
+        {along: [-np.inf, *np.sort(sides[along]), np.inf]})
+    ends = np.where((sides[along] > 0) == smaller, 0.0, np.inf)
+    sides = sides.where(np.isfinite(sides[along]), sides[along].copy(data=ends))
     out = {"reach": found["reach"]}
     for end, words in INTERVAL.items():
         # Where the axis makes markers small as it grows, ends of sides are the other ends.
         other = {"_low": "_high", "_high": "_low"}.get(end, end) if smaller else end
         at = found[other[1:] or "value"].fillna(-np.inf if smaller else np.inf)
-        within = at.clip(float(sides[along].min()), float(sides[along].max()))
-        side = sides.sel({along: within}, method="nearest").drop_vars(along)
-        beyond = at.copy(data=np.where((at > 0) == smaller, 0.0, np.inf))
-        side = side.where(np.isfinite(at), beyond).where(found["reach"] != Reach.not_run)
+        side = sides.sel({along: at}).where(found["reach"] != Reach.not_run)
         meaning = f"{words}smallest side from which on the detection rate is at least {rate:g}"
         out |= {
             f"side_px{end}": side.assign_attrs(long_name=meaning, units="px"),
@@ -1382,7 +1298,7 @@ CONFIDENCE = 0.95
 
 
 def needed(decision: Decisions, keeps: Masks) -> Masks:
-    """Return which cells need more trials, (..., values, conditions).
+    """Return which cells need more trials, (values, ...).
 
     Those are the undecided conditions of the values up to the first that fails, or seems to: of
     that one, only the conditions at which it seems to fail. What lies beyond it waits until it is
@@ -1391,18 +1307,19 @@ def needed(decision: Decisions, keeps: Masks) -> Masks:
     Parameters
     ----------
     decision
-        (..., values, conditions) of `sweep.analysis.requirements.Decision`, in the order of the
-        course.
+        (values, ...) of `Decision`, in the order of the course, at all conditions.
     keeps
         Of the same shape: where the estimates keep all limits.
     """
+    inner = tuple(range(1, decision.ndim))
     undecided = decision == Decision.undecided
     seems = undecided & ~keeps
-    value = combined_decision(decision, -1)
-    stops = (value == Decision.not_met) | seems.any(axis=-1)
-    before = np.cumsum(stops, axis=-1) == 0
-    first = stops & (np.cumsum(stops, axis=-1) == 1) & (value == Decision.undecided)
-    return np.asarray((undecided & before[..., None]) | (seems & first[..., None]))
+    value = combined_decision(decision, inner)
+    stops = (value == Decision.not_met) | seems.any(inner)
+    number = np.cumsum(stops)
+    before = np.expand_dims(number == 0, inner)
+    first = np.expand_dims(stops & (number == 1) & (value == Decision.undecided), inner)
+    return np.asarray((undecided & before) | (seems & first))
 
 
 @dataclass(frozen=True, slots=True)
@@ -1437,8 +1354,6 @@ class Answer:
     value
         The smallest (largest) value of the axis from which on all larger (smaller) ones of the
         grid meet them; None if there is no such axis, or no such value.
-    tightest
-        The requirement and condition at which the answer is nearest to failing.
     next, next_cause
         The next value, which fails or is undecided, and by what; None if all values meet them.
         Without an axis ``next`` is None, and ``next_cause`` that of the alternative itself.
@@ -1455,7 +1370,6 @@ class Answer:
     alternative: Mapping[str, Any]
     met: bool
     value: float | None
-    tightest: Cause | None
     next: float | None
     next_cause: Cause | None
     passing: tuple[float, ...]
@@ -1464,114 +1378,78 @@ class Answer:
     possible: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class ChoiceCells:
-    """Decisions at each value and condition of each alternative.
-
-    Attributes
-    ----------
-    table
-        Of `sweep.analysis.requirements.decide`, dimensions (*among, along, *at_all, requirement),
-        the values in the order of the course; without the axis ``along`` if there is none. With
-        ``keeps``, whether the estimates keep their limits, ``excess``, how far they are beyond
-        them, and ``hopeless``: undecided, and no number of trials will tell.
-    rule, shares
-        The search, and the shares of the error probability that a decision may spend.
-    """
-
-    table: xr.Dataset
-    rule: StoppingRule
-    shares: ErrorShares
-
-    def of(self, name: str) -> NDArray[Any]:
-        """Return a variable (alternatives, values, conditions, requirements)."""
-        sizes = self.table.sizes
-        return self.table[name].to_numpy().reshape(
-            -1, sizes[self.rule.along] if self.rule.along else 1,
-            math.prod(sizes[name] for name in self.rule.at_all), sizes["requirement"])
-
-    @property
-    def decision(self) -> Decisions:
-        """Decisions (alternatives, values, conditions) on all requirements together."""
-        return combined_decision(self.of("decision"), -1)
-
-    @property
-    def keeps(self) -> Masks:
-        """Where (alternatives, values, conditions) the estimates keep all limits."""
-        return np.asarray(self.of("keeps").all(axis=-1))
-
-    @property
-    def hopeless(self) -> Masks:
-        """Where (alternatives, values, conditions) trials will not tell."""
-        return np.asarray(
-            self.of("hopeless").any(axis=-1) & (self.decision == Decision.undecided))
-
-    def needed(self) -> xr.DataArray:
-        """Return which cells need more trials, dimensions (*among, along, *at_all)."""
-        template = self.table["decision"].isel(requirement=0, drop=True)
-        decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
-        return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
+#: The dimension of the values of a choice that is searched along no axis: there is one.
+CHOICE = "choice"
 
 
-def choice_cells(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> ChoiceCells:
-    """Return the decisions of a dataset, of a whole store or of some of its alternatives.
+def choice_table(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> xr.Dataset:
+    """Return the decisions that make a choice, of a whole store or of some of its alternatives.
+
+    Returns
+    -------
+    xr.Dataset
+        As `decide`, dimensions (*among, along, *at_all, requirement), the values in the order of
+        the course, with ``hopeless``: undecided, and no number of trials will tell.
 
     Raises
     ------
     ArgumentError, DatasetError
         As `sweep.analysis.check_requirements`.
     """
-    required = parse_requirements(rule.requirements)
-    kept = [*rule.among, *([rule.along] if rule.along else []), *rule.at_all]
-    table = decide(results, required, kept, shares=shares).transpose(..., *kept, "requirement")
-    if rule.along:
-        table = table.sortby(rule.along, ascending=rule.largest)
+    kept = [*rule.among, *filter(None, [rule.along]), *rule.at_all]
+    table = decide(results, parse_requirements(rule.requirements), kept, shares=shares)
+    table = table.sortby(rule.along, ascending=rule.largest) if rule.along else (
+        table.expand_dims(CHOICE))
+    table = table.transpose(*rule.among, rule.along or CHOICE, *rule.at_all, "requirement")
     # Where so few poses count that max_trials will not have enough, there is nothing to learn.
-    pooled = math.prod(results.sizes[str(name)] for name in results["true_tvec_m"].dims if
-                       name not in (*kept, DRAWS, "xyz"))
+    pooled = math.prod(results.sizes[name] for name in axes_of(results, Stage.scene)
+                       if name not in (*kept, DRAWS))
     coming = table["draws"] / table["looked_for"] * rule.max_trials * pooled
     few = (table["looked_for"] >= MIN_DRAWS) & (coming < MIN_DRAWS)
-    judged = table["decision"] != Decision.not_applicable
-    return ChoiceCells(table.assign(
-        hopeless=(table["decision"] == Decision.undecided) & few,
-        excess=excess_of(table).where(judged, -np.inf),
-        keeps=kept_by(table, required) | ~judged), rule, shares)
+    return table.assign(hopeless=few & (table["decision"] == Decision.undecided))
 
 
-def answers(cells: ChoiceCells) -> list[Answer]:
-    """Return the answer of each alternative, in the order of the table's dimensions."""
-    parts = zip(cells.decision, cells.keeps, cells.of("excess").max(axis=(2, 3)),
-                each_cell(cells.table, cells.rule.among), strict=True)
-    return [_answer(cells, *part) for part in parts]
+def choice_needed(table: xr.Dataset, rule: StoppingRule) -> xr.DataArray:
+    """Return which cells of a choice need more trials, dimensions (*among, along, *at_all)."""
+    cells = [rule.along or CHOICE, *rule.at_all]
+    decision = table["decision"].where(~table["hopeless"], np.uint8(Decision.not_met))
+    keeps = (table["keeps"] | (decision == Decision.not_applicable)).all("requirement")
+    decision = xr.apply_ufunc(combined_decision, decision, kwargs={"axis": -1},
+                              input_core_dims=[["requirement"]])
+    wanted: xr.DataArray = xr.apply_ufunc(
+        needed, decision, keeps, vectorize=True, input_core_dims=[cells] * 2,
+        output_core_dims=[cells])
+    return wanted if rule.along else wanted.isel({CHOICE: 0})
 
 
-def _answer(
-    cells: ChoiceCells, decision: Decisions, keeps: Masks, excess: Floats,
-    part: tuple[dict[str, Any], xr.Dataset],
-) -> Answer:
+def answers(results: xr.Dataset, rule: StoppingRule, shares: ErrorShares) -> list[Answer]:
+    """Return the answer of each alternative, in the order of the axes ``among``."""
+    table = choice_table(results, rule, shares)
+    table = table.assign(draws_needed=draws_needed(
+        table, parse_requirements(rule.requirements), shares.met))
+    return [_answer(*part, rule) for part in each_cell(table, rule.among)]
+
+
+def _answer(alternative: Mapping[str, Any], part: xr.Dataset, rule: StoppingRule) -> Answer:
     """Return the answer of an alternative, a part of the table."""
-    (alternative, table), along = part, cells.rule.along
-    values: list[Any] = table[along].to_numpy().tolist() if along else [None]
+    values: list[Any] = part[rule.along].to_numpy().tolist() if rule.along else [None]
+    decision, keeps = (part[name].to_numpy() for name in ("decision", "keeps"))
+    found, (value, keep) = course(decision, keeps), of_values(decision, keeps)
+    judged = value != Decision.not_applicable
+    excess = excess_of(part).where(part["decision"] != Decision.not_applicable, -np.inf).max(
+        [*rule.at_all, "requirement"]).to_numpy()
+    best = int(np.argmin(np.where(judged, excess, np.inf)))
 
     def cause(at: int) -> Cause:
         """Return the requirement and condition by which a value fails worst, or is nearest."""
-        cell = worst_cell(table.isel({along: at}) if along else table)
-        needed = math.nan
-        if cell["decision"] == Decision.undecided:
-            required = parse_requirements(str(cell["requirement"].item()))[0]
-            solved = float(cell["solved"]) / max(float(cell["looked_for"]), 1.0)
-            needed = float(draws_needed(required, cell, solved, cells.shares.met))
-        return Cause.at(cell, cells.rule.at_all, draws_needed=needed)
+        return Cause.of(part.isel({rule.along or CHOICE: at}), rule.at_all)
 
-    found, value = course(decision, keeps), combined_decision(decision, -1)
-    judged = value != Decision.not_applicable
     met, after = found.met >= 0, found.unmet < len(values)
-    best = int(np.argmin(np.where(judged, excess, np.inf)))
     return Answer(
-        alternative, met, values[found.met] if met else None, cause(found.met) if met else None,
+        alternative, met, values[found.met] if met else None,
         values[found.unmet] if after else None, cause(found.unmet) if after else None,
         tuple(value for k, value in enumerate(values)
-              if k > found.unmet and judged[k] and keeps[k].all()),
+              if k > found.unmet and judged[k] and keep[k]),
         None if met else Nearest(values[best], float(excess[best]), cause(best)),
         bool((value[: found.possible + 1] == Decision.undecided).any()),
         None if found.possible < 0 else values[found.possible])
@@ -1613,30 +1491,25 @@ class WantedPrecision:
 
     Attributes
     ----------
-    requirable
+    what
         The quantity.
     half_width
         As the comment above says; above 0, below 1.
     """
 
-    requirable: Requirable
+    what: Requirable
     half_width: float
-
-    @property
-    def name(self) -> str:
-        """Name of the quantity."""
-        return self.requirable.name
 
     @property
     def spread(self) -> Requirable | None:
         """Of a bias the standard deviation; else None."""
-        return requirables().get(self.name.replace("_bias_", "_sd_")) \
-            if "_bias_" in self.name else None
+        bias = self.what.name
+        return requirables()[bias.replace("_bias_", "_sd_")] if "_bias_" in bias else None
 
-    def statistics(self, prefix: str) -> list[Statistic[Poses]]:
-        """Return the statistics that must be computed, their variables' names with a prefix."""
-        parts = self.requirable.computed(prefix, LEVEL)
-        return parts + self.spread.computed(f"{prefix}of ", LEVEL)[:1] if self.spread else parts
+    def statistics(self) -> list[Statistic[Poses]]:
+        """Return the statistics that must be computed."""
+        parts = self.what.statistics(LEVEL)
+        return parts + self.spread.statistics(LEVEL)[:1] if self.spread else parts
 
     @property
     def least_draws(self) -> int:
@@ -1644,42 +1517,38 @@ class WantedPrecision:
 
         It does not depend on the half-width, so that a smaller one never needs fewer trials.
         """
-        if self.requirable.is_rate:
+        if self.what.is_rate:
             return MIN_OF_RATE
-        if (percent := self.requirable.percent) is None:
+        if (percent := self.what.percent) is None:
             return MIN_MEAN_DRAWS
-        return draws_to_see(1.0 - percent / 100.0, stopped_level(LEVEL))
+        return estimator.draws_to_see(1.0 - percent / 100.0, estimator.stopped_level(LEVEL))
 
     @property
     def fewest_draws(self) -> int:
         """Draws below which no interval is narrow enough, whatever the results are."""
-        if not self.requirable.is_rate:
+        if not self.what.is_rate:
             return self.least_draws
         # An interval of half of all shares, or more, has a single draw.
-        return draws_to_see(min(2.0 * self.half_width, 0.999), stopped_level(LEVEL))
+        return estimator.draws_to_see(
+            min(2.0 * self.half_width, 0.999), estimator.stopped_level(LEVEL))
 
-    def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
+    def judged(self, table: xr.Dataset, total: xr.DataArray) -> xr.Dataset:
         """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.
 
         Parameters
         ----------
         table
             The variables of `statistics`; ``looked_for`` and ``run``: poses that were.
-        prefix
-            As there.
         total
             Poses that all trials would be.
         """
-        what, run = self.requirable, table["run"]
-        # Of a bias with its sign.
-        value, low, high = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL] \
-            if what.signed else what.interval(table, prefix)
-        used, draws = table[f"{prefix}used"], table[f"{prefix}draws"]
+        what, run, used, draws = self.what, table["run"], table["used"], table["draws"]
+        value, low, high = (table[f"{what.name}{end}"] for end in INTERVAL)
         with np.errstate(all="ignore"):
             half = (high - low) / 2.0
             if not what.is_rate:
                 scale = abs(value) if self.spread is None else xr.apply_ufunc(
-                    np.hypot, value, table[f"{prefix}of {self.spread.name}"])
+                    np.hypot, value, table[self.spread.name])
                 half = (half / scale).where(half != 0.0, 0.0)
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
         half = half.where(low != np.inf, 0.0)
@@ -1687,15 +1556,20 @@ class WantedPrecision:
         share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
         worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
         too_rare = (share * total * worth < self.least_draws) & (total >= self.least_draws)
+        narrow = (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS))
         reached = np.select(
-            [run == 0, table["looked_for"] == 0,
-             (half <= self.half_width) & (draws >= (1 if what.exact else MIN_MEAN_DRAWS)),
-             too_rare],
+            [run == 0, table["looked_for"] == 0, narrow, too_rare],
             [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
             Reached.not_reached)
         return xr.Dataset({
-            "value": value, "half_width": half, "used": used, "draws": draws,
-            "reached": used.copy(data=reached.astype(np.uint8))})
+            name: array.drop_attrs().assign_attrs(cf_attributes(*words))
+            for name, array, *words in (
+                ("value", value, "value"),
+                ("half_width", half, "half-width of the interval, as was wanted"),
+                ("used", used, "poses that the value is of", "1"),
+                ("draws", draws, "random draws that these are worth", "1"),
+                ("reached", used.copy(data=reached.astype(np.uint8)),
+                 "whether the interval is as narrow as was wanted", "", Reached))})
 
 
 def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
@@ -1711,7 +1585,7 @@ def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...
 
     Examples
     --------
-    >>> [(each.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
+    >>> [(each.what.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
     [('detection_rate', 0.02)]
     """
     precisions: dict[str, WantedPrecision] = {}
@@ -1783,7 +1657,7 @@ def precision_reached(
     >>> [Reached(flag).name for flag in table["reached"].isel(solver=0, quantity=0).values]
     ['reached', 'not_reached', 'reached']
     """
-    rule = stopping_rule(results)
+    rule = dataset.stopping_rule(results)
     if wanted is None:
         if rule is None or not rule.precision:
             raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
@@ -1795,38 +1669,28 @@ def precision_reached(
         precisions = wanted_precisions(wanted)
     except ValueError as error:
         raise ArgumentError("wanted", wanted, str(error)) from None
-    configuration = configuration_axes(results)
-    kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *as_names(per)))))
-    table = aggregate(
-        results, requirable_arrays(results, [each.requirable for each in precisions]), kept, [
-            Count(*LOOKED_FOR, lambda poses: poses.looked_for),
-            Count("run", "poses that were run", lambda poses: poses.run),
-            Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
-            *(each for number, precision in enumerate(precisions)
-              for each in precision.statistics(f"{number} ")),
+    configuration = dataset.configuration_axes(results)
+    kept = dataset.kept_dimensions(results, (*configuration, *as_names(per)))
+    poses, *tables = aggregates(
+        results, requirable_arrays(results, [each.what for each in precisions]), kept, [
+            [Count(*LOOKED_FOR, lambda poses: poses.looked_for),
+             Count("run", "poses that were run", lambda poses: poses.run),
+             Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run))],
+            *(each.statistics() for each in precisions),
         ], Poses, stopped=True)
-    total = table["poses"]
+    total = poses["poses"]
     if max_trials is not None:
         total = total // results.sizes[DRAWS] * max_trials
-    out = stacked([each.judged(table, f"{number} ", total)
-                   for number, each in enumerate(precisions)], "quantity").reset_coords(drop=True)
-    needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
-    out = out.assign(
-        settled=~needs.any([*configuration, "quantity"]), run=table["run"], poses=table["poses"])
-    for name, *words in (
-        ("value", "value"), ("half_width", "half-width of the interval, as was wanted"),
-        ("used", "poses that the value is of", "1"),
-        ("draws", "random draws that these are worth", "1"),
-        ("reached", "whether the interval is as narrow as was wanted", "", Reached),
-        ("settled", "whether no configuration and quantity needs more trials", "1"),
-    ):
-        out[name].attrs = cf_attributes(*words)
-    return out.assign_coords(
-        {name: each for name, each in table.coords.items() if {*each.dims} <= {*kept}},
-    ).assign_coords({name: ("quantity", listed) for name, listed in (
-        ("quantity", [each.name for each in precisions]),
-        ("wanted", [each.half_width for each in precisions]),
-        # The quantity of which the half-width is a share; none of a rate.
-        ("relative_to", ["" if each.requirable.is_rate else "RMSE" if each.spread else "value"
-                         for each in precisions]))},
+    out = stacked([each.judged(table.assign(poses.data_vars), total)
+                   for each, table in zip(precisions, tables, strict=True)], "quantity")
+    needs = out["reached"].drop_attrs().isin((Reached.not_run, Reached.not_reached))
+    settled = (~needs.any([*configuration, "quantity"])).assign_attrs(
+        long_name="whether no configuration and quantity needs more trials", units="1")
+    return out.assign(settled=settled, run=poses["run"], poses=poses["poses"]).assign_coords(
+        {name: ("quantity", listed) for name, listed in (
+            ("quantity", [each.what.name for each in precisions]),
+            ("wanted", [each.half_width for each in precisions]),
+            # The quantity of which the half-width is a share; none of a rate.
+            ("relative_to", ["" if each.what.is_rate else "RMSE" if each.spread else "value"
+                             for each in precisions]))},
     ).assign_attrs(configuration_dims=configuration)

@@ -14,52 +14,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import special, stats
 
-from sweep.analysis.dataset import (
-    BOUND_INPUTS,
-    COMMON,
-    DETECTION_INPUTS,
-    DRAWS,
-    ESTIMATE_INPUTS,
-    QUANTITIES,
-    Poses,
-    Quantity,
-    as_names,
-    axes_of,
-    chosen_quantities,
-    common_trials,
-    configuration_axes,
-    describes,
-    is_grid_axis,
-    is_replicated,
-    is_sampling_stopped,
-    kept_dimensions,
-    norm_squared,
-    pose_arrays,
-    require_dimension,
-    stacked,
-)
-from sweep.analysis.estimator import (
-    INTERVAL,
-    TAIL_SHARE,
-    Bins,
-    Columns,
-    Count,
-    Design,
-    FlipMixture,
-    Interval,
-    Mean,
-    MeanLength,
-    PositiveMean,
-    Quantiles,
-    Rate,
-    RootMeanSquare,
-    StandardDeviation,
-    Statistic,
-    aggregate,
-    aggregates,
-    guarded,
-    scaled_to_draws,
-)
+from sweep.analysis import dataset, estimator
+from sweep.analysis.dataset import DRAWS, QUANTITIES, Poses, Quantity, as_names, describes, stacked
+from sweep.analysis.estimator import INTERVAL, Bins, Count, Mean, Rate, Statistic, aggregate
 from sweep.analysis.intervals import LEVEL, TAIL, clopper_pearson
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, cf_attributes
@@ -75,13 +32,13 @@ FLIPPED = ("flipped", "solved poses that are nearer to the mirror of the truth")
 
 DETECTION_RATE: Rate[Poses] = Rate(
     "detection_rate", "detected of looked_for", lambda poses: poses.detected,
-    lambda poses: poses.looked_for, inputs=DETECTION_INPUTS)
+    lambda poses: poses.looked_for, inputs=dataset.DETECTION_INPUTS)
 SOLVED_RATE: Rate[Poses] = Rate(
     "solved_rate", "solved of looked_for", lambda poses: poses.solved,
-    lambda poses: poses.looked_for, inputs=ESTIMATE_INPUTS)
+    lambda poses: poses.looked_for, inputs=dataset.ESTIMATE_INPUTS)
 FLIP_RATE: Rate[Poses] = Rate(
     "flip_rate", "nearer to the mirror of the truth, of solved", lambda poses: poses.flipped,
-    lambda poses: poses.solved, inputs=ESTIMATE_INPUTS)
+    lambda poses: poses.solved, inputs=dataset.ESTIMATE_INPUTS)
 
 
 @describes
@@ -235,9 +192,10 @@ def failure_composition(
     >>> table["share"].sel(outcome="solved").values.tolist()
     [0.0, 0.625, 1.0]
     """
-    kept = kept_dimensions(results, per)
+    kept = dataset.kept_dimensions(results, per)
     ends = [functools.partial(ends_as, outcome) for outcome in OUTCOMES]
-    tables = aggregates(results, pose_arrays(results, ESTIMATE_INPUTS), kept, [[
+    inputs = dataset.pose_arrays(results, dataset.ESTIMATE_INPUTS)
+    tables = estimator.aggregates(results, inputs, kept, [[
         Count("count", "poses that ended so", end),
         Rate("share", "share of the poses looked for", end, lambda poses: poses.looked_for),
     ] for end in ends], Poses, bins)
@@ -304,36 +262,33 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     >>> table["detection_rate"].round(3).values.tolist(), table["weak"].values.tolist()
     ([0.542, 0.542], [False, False])
     """
-    require_dimension(results, "marker_id")
-    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
-    kept = kept_dimensions(results, (*as_names(per), *dictionaries, "marker_id"))
-    kept = (*(name for name in kept if name != "marker_id"), "marker_id")
+    dataset.require_dimension(results, "marker_id")
+    own = [name for name in ("dictionary", "marker_id") if name in dataset.axes_of(results)]
+    kept = dataset.kept_dimensions(
+        results, (*(name for name in as_names(per) if name != "marker_id"), *own))
     if DRAWS in kept:
         raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
-    cells = [name for name in axes_of(results) if name in results["detection"].dims
-             and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
-    inputs = pose_arrays(results, DETECTION_INPUTS)
-    if is_sampling_stopped(results):
-        inputs[COMMON] = common_trials(results, inputs, kept)
+    cells = [name for name in dataset.axes_of(results) if name in results["detection"].dims
+             and name not in (*kept, DRAWS) and dataset.is_grid_axis(name, results)]
+    inputs = dataset.pose_arrays(results, dataset.DETECTION_INPUTS)
+    if dataset.is_sampling_stopped(results):
+        inputs[dataset.COMMON] = dataset.common_trials(results, inputs, kept)
     rate = replace(DETECTION_RATE, counts=(LOOKED_FOR, ("detected", "")))
     table, counts = (aggregate(results, inputs, names, [rate], Poses)
                      for names in (kept, (*kept, *cells)))
     table = table.drop_vars(["detected", "draws"])
     n = counts["draws"].astype(np.float64)
     hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
-    strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
-    expected, variance, third = xr.apply_ufunc(
-        hypergeometric_moments, *strata, output_core_dims=[[]] * 3)
-    sums = xr.Dataset({
-        "n": n, "hits": hits, "expected": expected, "variance": variance, "third": third,
-    }).sum(cells).transpose(*kept)
+    moments = xr.apply_ufunc(
+        hypergeometric_moments, n, n.sum("marker_id"), hits.sum("marker_id"),
+        output_core_dims=[[]] * 3)
+    n, hits, expected, variance, third = (
+        each.sum(cells).transpose(*kept) for each in (n, hits, *moments))
     # The test is of independent draws.
-    drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
-    p_value = xr.apply_ufunc(
-        two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
-    ).where(drawn)
+    drawn = table["detection_rate_low"].notnull() & (not dataset.is_replicated(results))
+    p_value = xr.apply_ufunc(two_sided, hits - expected, variance, third).where(drawn)
     adjusted = xr.apply_ufunc(holm, p_value)
-    expected_rate = sums["expected"] / sums["n"]
+    expected_rate = expected / n
     share = table["detection_rate"] / expected_rate
     rank = xr.apply_ufunc(  # equal values share the lowest
         stats.rankdata, share, kwargs={"method": "min", "axis": -1, "nan_policy": "omit"},
@@ -406,15 +361,15 @@ ERROR_HEADINGS = {
 
 #: Counts and rates of the poses.
 POSE_STATISTICS: tuple[Statistic[Poses], ...] = (
-    Count(*LOOKED_FOR, lambda poses: poses.looked_for, inputs=DETECTION_INPUTS),
-    Count(*SOLVED, lambda poses: poses.solved, inputs=ESTIMATE_INPUTS),
+    Count(*LOOKED_FOR, lambda poses: poses.looked_for, inputs=dataset.DETECTION_INPUTS),
+    Count(*SOLVED, lambda poses: poses.solved, inputs=dataset.ESTIMATE_INPUTS),
     DETECTION_RATE, SOLVED_RATE, FLIP_RATE,
 )
 
 
 def quantiles_of(quantity: Quantity) -> Statistic[Poses]:
     """Return the quantiles of a kind of error, also of one with a sign: of the absolute values."""
-    return Quantiles(
+    return estimator.Quantiles(
         quantity.named("{}"), f"absolute {quantity.words}", quantity.norm,
         lambda poses: poses.solved, lambda poses: poses.looked_for,
         units=quantity.units, inputs=quantity.inputs)
@@ -433,20 +388,21 @@ def statistics_of(quantity: Quantity) -> list[Statistic[Poses]]:
 
     # A mean error is signed if the error is, else it is the mean vector's length. Flips make most
     # of a rotation's RMSE, and it is bounded.
-    mean, of = (Mean, "mean") if quantity.signed else (MeanLength, "length of the mean")
-    square: Callable[..., Statistic[Poses]] = RootMeanSquare if quantity.bound is None else (
-        functools.partial(FlipMixture, bound=quantity.bound))
+    mean, of = (Mean, "mean") if quantity.signed else (estimator.MeanLength, "length of the mean")
+    square: Callable[..., Statistic[Poses]] = estimator.RootMeanSquare
+    if quantity.bound is not None:
+        square = functools.partial(estimator.FlipMixture, bound=quantity.bound)
     return [
         *([] if quantity not in QUANTITIES else [
             quantiles_of(quantity),
             square(quantity.named("rmse"), f"RMS {words}, solved", quantity.squares, solved,
                    **described),
-            RootMeanSquare(
+            estimator.RootMeanSquare(
                 quantity.named("rmse_unflipped"), f"RMS {words}, solved and not flipped",
                 quantity.squares, unflipped, **described)]),
         mean(quantity.named("bias"), f"{of} {words}, solved and not flipped", quantity.vector,
              unflipped, **described),
-        StandardDeviation(
+        estimator.StandardDeviation(
             quantity.named("sd"), f"standard deviation of the {words}, solved and not flipped",
             quantity.vector, unflipped, **described),
     ]
@@ -546,7 +502,7 @@ def error_statistics(
     >>> float(table["camera_in_marker_x_sd_m"].round(4)), float(table["yaw_sd_deg"].round(2))
     (0.0074, 0.32)
     """
-    return _table(results, per, bins, registered(chosen_quantities(quantities)))
+    return _table(results, per, bins, registered(dataset.chosen_quantities(quantities)))
 
 
 def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
@@ -555,7 +511,7 @@ def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr
     Upper ends of root mean squares and standard deviations hold rare errors that no draw showed, as
     those of requirements do (`sweep.analysis.estimator.with_unseen_tail`).
     """
-    return _table(results, per, None, [*map(guarded, registered())])
+    return _table(results, per, None, [*map(estimator.guarded, registered())])
 
 
 def _table(
@@ -563,8 +519,8 @@ def _table(
     statistics: Sequence[Statistic[Poses]],
 ) -> xr.Dataset:
     """Return some statistics, (*per, *bins)."""
-    kept = kept_dimensions(results, per)
-    inputs = pose_arrays(results, [name for each in statistics for name in each.inputs])
+    kept = dataset.kept_dimensions(results, per)
+    inputs = dataset.pose_arrays(results, [name for each in statistics for name in each.inputs])
     return aggregate(results, inputs, kept, statistics, Poses, bins)
 
 
@@ -587,9 +543,9 @@ def _with_nees(poses: Poses) -> Masks:
 
 
 #: The mean of ``nees``.
-NEES_MEAN: Statistic[Poses] = PositiveMean(
+NEES_MEAN: Statistic[Poses] = estimator.PositiveMean(
     "nees_mean", "mean normalised estimation error squared, expected 6",
-    lambda poses: _nees(poses)[..., None], _with_nees, inputs=(*ESTIMATE_INPUTS, "nees"))
+    lambda poses: _nees(poses)[..., None], _with_nees, inputs=(*dataset.ESTIMATE_INPUTS, "nees"))
 
 
 @describes
@@ -649,11 +605,11 @@ def covariance_trust(
     nominal = np.atleast_1d(np.array(levels, dtype=np.float64))
     if not (nominal.size and ((nominal > 0.0) & (nominal < 1.0)).all()):
         raise ArgumentError("levels", levels, "expected numbers between 0 and 1")
-    kept = kept_dimensions(results, per)
+    kept = dataset.kept_dimensions(results, per)
     limits = special.chdtri(len(POSE_PARAMETERS), 1.0 - nominal).tolist()
-    inputs = pose_arrays(results, ESTIMATE_INPUTS) | {
+    inputs = dataset.pose_arrays(results, dataset.ESTIMATE_INPUTS) | {
         "nees": results.get("nees", xr.DataArray(np.nan))}
-    table, *tables = aggregates(results, inputs, kept, [
+    table, *tables = estimator.aggregates(results, inputs, kept, [
         [NEES_MEAN], *(_within(limit, len(limits)) for limit in limits)], Poses)
     at_levels = stacked(tables, "level").assign_coords(level=("level", nominal, {
         "long_name": "nominal probability of the covariance's region", "units": "1"}))
@@ -736,7 +692,7 @@ def efficiency(
 
 
 @dataclass(frozen=True)
-class BoundRatio(RootMeanSquare[Poses]):
+class BoundRatio(estimator.RootMeanSquare[Poses]):
     """The RMS bound over the RMS error, of the poses that have both; ``values`` are of the error.
 
     Attributes
@@ -747,7 +703,9 @@ class BoundRatio(RootMeanSquare[Poses]):
 
     bound: Callable[[Poses], Floats]
 
-    def interval(self, columns: Columns[Poses], design: Design, level: float) -> Interval:
+    def interval(
+        self, columns: estimator.Columns[Poses], design: estimator.Design, level: float
+    ) -> estimator.Interval:
         """Return the ratio; its interval is the error's."""
         value, low, high = super().interval(columns, design, level)
         squares: Mean[Poses] = Mean("", "", lambda poses: self.bound(poses)[..., None], self.used)
@@ -760,13 +718,14 @@ def _of_bound(quantity: Quantity, bound: Callable[[Poses], Floats]) -> Statistic
     return BoundRatio(
         f"{quantity.name}_efficiency",
         f"RMS bound over RMS {quantity.words}, solved and not flipped", quantity.squares,
-        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound, inputs=BOUND_INPUTS)
+        lambda poses: poses.unflipped & np.isfinite(bound(poses)), bound,
+        inputs=dataset.BOUND_INPUTS)
 
 
 #: Of the rotation and of the depth.
 RATIOS = (
     _of_bound(QUANTITIES[0],
-              lambda poses: norm_squared(np.degrees(poses["bound_std"][..., :3]))),
+              lambda poses: dataset.norm_squared(np.degrees(poses["bound_std"][..., :3]))),
     _of_bound(QUANTITIES[1],
               lambda poses: poses.percent_of_depth(poses["bound_std"][..., 5]) ** 2),
 )
@@ -784,7 +743,7 @@ THRESHOLDS = (
 MAX_THRESHOLDS = 200
 
 RATIO_INPUTS = (
-    *ESTIMATE_INPUTS, "reprojection_error_px", "alternative_reprojection_error_px")
+    *dataset.ESTIMATE_INPUTS, "reprojection_error_px", "alternative_reprojection_error_px")
 
 
 class ThresholdChoice(Flag):
@@ -911,21 +870,21 @@ def ambiguity(
             "flip_rate", flip_rate, "expected a number above 0 and below 1, such as 0.01")
     if not 0.0 <= min_kept <= 1.0:
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
-    kept = kept_dimensions(
-        results, (*as_names(per), *configuration_axes(results)))
+    kept = dataset.kept_dimensions(
+        results, (*as_names(per), *dataset.configuration_axes(results)))
     counts: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution", lambda poses:
               poses.solved & np.isnan(poses["alternative_reprojection_error_px"]))]
     levels = np.unique([*tried, np.inf])
-    table, *at_levels = aggregates(
-        results, pose_arrays(results, RATIO_INPUTS), kept, [counts, *map(_rates_at, levels)],
-        AmbiguousPoses, bins)
+    inputs = dataset.pose_arrays(results, RATIO_INPUTS)
+    table, *at_levels = estimator.aggregates(
+        results, inputs, kept, [counts, *map(_rates_at, levels)], AmbiguousPoses, bins)
     table = table.assign(stacked(at_levels, "threshold")).assign_coords(
         threshold=("threshold", levels, cf_attributes(
             "largest ratio of both reprojection errors that is kept", "1")))
-    tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
+    tail = TAIL * estimator.TAIL_SHARE if dataset.is_sampling_stopped(results) else TAIL
     return _with_choice(table, flip_rate, min_kept, tail)
 
 
@@ -966,7 +925,7 @@ def _with_choice(
     table: xr.Dataset, flip_rate: float, min_kept: float, tail: float
 ) -> xr.Dataset:
     """Return the table with the chosen threshold of each group."""
-    _, most = scaled_to_draws(*(
+    _, most = estimator.scaled_to_draws(*(
         table[name].values for name in ("kept_flipped", "kept", "draws")))
     level = 1.0 - 2.0 * tail / table.sizes["threshold"]
     bound = table["kept"].copy(data=clopper_pearson(most, table["draws"], level)[1])

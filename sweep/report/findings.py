@@ -135,7 +135,7 @@ def require(
     table = judged.check_requirements(results, required, axes) if required else None
     found = [] if table is None else judged.verdicts(table)
     worse = [] if against is None else regressions(
-        selected_store(against, at)[0], results, [each.variable for each in required], axes)
+        selected_store(against, at)[0], results, [each.what.name for each in required], axes)
     decision = Decision.not_met if any(each.worse for each in worse) else (
         judged.combined(found) if found else Decision.met)
     named = {*axes, DRAWS, *configuration_axes(results)}

@@ -43,14 +43,12 @@ def group_dataset(
         axis.name: (axis.name, axis.coordinates(*parts.get(axis.name, ())),
                     {"zip": " ".join(axis.columns)} if axis.zipped else {})
         for axis in pipeline.axes}
-    lengths = {name: len(listed) for name, (_, listed, _) in coordinates.items()}
-    arrays = {}
-    for name in dict.fromkeys([*ERROR_INPUTS, *values]):
-        dims = VARIABLES[name].dimensions(pipeline)
-        missing = np.broadcast_to(np.float32(np.nan), [
-            lengths[dim] if dim in lengths else len(LABELS[dim]) for dim in dims])
-        arrays[name] = dims, values.get(name, missing)
-    return xr.Dataset(arrays, coordinates)
+    sizes = {name: len(labels) for name, labels in LABELS.items()} | {
+        name: len(listed) for name, (_, listed, _) in coordinates.items()}
+    dims = {name: VARIABLES[name].dimensions(pipeline) for name in (*ERROR_INPUTS, *values)}
+    return xr.Dataset({
+        name: (own, values.get(name, np.broadcast_to(np.float32(np.nan), [
+            sizes[dim] for dim in own]))) for name, own in dims.items()}, coordinates)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -162,30 +160,27 @@ def pooled_cells(pipeline: Pipeline, rule: StoppingRule) -> int:
 def _limit(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the values of the axis at which trials decide the limit."""
     required = decisions.parse_requirements(rule.requirements)
-    searched = (*rule.per, *rule.at_all, rule.along)
     shares = decisions.error_shares(
         looks_factor(len(rule.ends)),
         len(required) * product_of(pipeline, (rule.along, *rule.at_all)))
     most = rule.max_trials * pooled_cells(pipeline, rule)
+    cells = [rule.along, *rule.at_all, "requirement"]
 
     def open_cells(dataset: xr.Dataset) -> xr.DataArray:
-        table = decisions.decide(dataset, required, searched, shares=shares)
-        keeps = decisions.kept_by(table, required)
-        inner = [*rule.at_all, "requirement"]
-        arrays = [array.sortby(rule.along) for array in (
-            table["decision"], keeps, may_be_decided(table, keeps, required, shares, most))]
+        table = decisions.decide(
+            dataset, required, (*rule.per, *rule.at_all, rule.along), shares=shares)
+        table = table.sortby(rule.along)
         wanted: xr.DataArray = xr.apply_ufunc(
-            functools.partial(_of_row, rule.along), *arrays,
-            input_core_dims=[[rule.along, *inner]] * 3, output_core_dims=[[rule.along, *inner]],
-            vectorize=True)
+            functools.partial(_of_row, rule.along), table["decision"], table["keeps"],
+            may_be_decided(table, required, shares, most), vectorize=True,
+            input_core_dims=[cells] * 3, output_core_dims=[cells])
         return wanted
 
-    return [each.requirable for each in required], open_cells
+    return [each.what for each in required], open_cells
 
 
 def may_be_decided(
-    table: xr.Dataset, keeps: xr.DataArray, required: Sequence[Requirement], shares: ErrorShares,
-    most: int,
+    table: xr.Dataset, required: Sequence[Requirement], shares: ErrorShares, most: int
 ) -> xr.DataArray:
     """Return where there are draws, and ``most`` of them may decide.
 
@@ -196,10 +191,10 @@ def may_be_decided(
     value, draws, limit = table["value"], table["draws"], table["limit"]
     met, not_met = (-float(special.ndtri(decisions.ERROR_PROBABILITY / 2.0 * share))
                     for share in (shares.met, shares.not_met))
-    errors = xr.full_like(value, not_met).where(~keeps, met)
+    errors = xr.full_like(value, not_met).where(~table["keeps"], met)
     width = (value - table["low"]).where(value >= limit, table["high"] - value)
     shrinks = width / (abs(value - limit) + width / errors)
-    of_rates = xr.DataArray([each.requirable.is_rate for each in required], dims="requirement")
+    of_rates = xr.DataArray([each.what.is_rate for each in required], dims="requirement")
     possible: xr.DataArray = (draws > 0) & ((draws * shrinks**2 <= most) | ~of_rates)
     return possible
 
@@ -208,19 +203,16 @@ def _of_row(
     along: str, decision: NDArray[np.uint8], keeps: Masks, possible: Masks
 ) -> Masks:
     """Return which decisions (values, *at_all, requirement) along an axis need trials."""
-    inner = tuple(range(1, decision.ndim))
-    keep = keeps | (decision == Decision.not_applicable)
-    upwards = decisions.is_harder_upwards(along, keeps)
-    step = slice(None, None, 1 if upwards else -1)
-    of_values = decisions.combined_decision(decision, inner)[step]
-    values = wanted_values(
-        keep.all(axis=inner)[step], of_values == Decision.met, of_values == Decision.not_met,
-        of_values != Decision.not_applicable)[step]
+    step = slice(None, None, 1 if decisions.is_harder_upwards(along, keeps) else -1)
+    value, value_keeps = decisions.of_values(decision, keeps)
+    wanted = wanted_values(
+        value_keeps[step], value[step] == Decision.met, value[step] == Decision.not_met,
+        value[step] != Decision.not_applicable)[step]
+    wanted, all_keep = (np.expand_dims(each, tuple(range(1, decision.ndim)))
+                        for each in (wanted, value_keeps))
     # Where something fails, it is that which decides.
-    all_keep = keep.all(axis=inner, keepdims=True)
-    values = values.reshape((-1, *(1,) * (decision.ndim - 1)))
     return np.asarray(
-        (decision == Decision.undecided) & possible & values & (all_keep | ~keep))
+        (decision == Decision.undecided) & possible & wanted & (all_keep | ~keeps))
 
 
 def choice_shares(pipeline: Pipeline, rule: StoppingRule) -> ErrorShares:
@@ -241,7 +233,7 @@ def least_draws(requirement: Requirement, share: float) -> int:
     >>> least_draws(decisions.parse_requirements("detection >= 0.99")[0], 1.0)
     368
     """
-    what = requirement.requirable
+    what = requirement.what
     if not what.exact:
         return decisions.MIN_DRAWS
     # The share of the draws that must not be seen, or must be.
@@ -253,22 +245,22 @@ def least_draws(requirement: Requirement, share: float) -> int:
 def _choice(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the cells that decide the smallest, or the cheapest, choice."""
     shares = choice_shares(pipeline, rule)
-    required = decisions.read_requirements(rule.requirements)[0]
+    required = decisions.parse_requirements(rule.requirements)
     lines = [
         _too_few(pipeline, rule, least, f"fewer cannot show {each.text} with "
                  f"{100 * decisions.CONFIDENCE:g} % confidence, even if all meet it")
         for each in required if (least := least_draws(each, shares.met))]
     if any(lines):
         raise refusal(list(filter(None, lines)))
-    return [each.requirable for each in required], lambda dataset: decisions.choice_cells(
-        dataset, rule, shares).needed()
+    return [each.what for each in required], lambda dataset: decisions.choice_needed(
+        decisions.choice_table(dataset, rule, shares), rule)
 
 
-def store_cells(
+def store_answers(
     results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule
-) -> decisions.ChoiceCells:
-    """Return the decisions of a store's whole dataset, as the search made the last ones."""
-    return decisions.choice_cells(results, rule, choice_shares(pipeline, rule))
+) -> list[decisions.Answer]:
+    """Return the answers of a choice from a store's dataset, as the search decided last."""
+    return decisions.answers(results, rule, choice_shares(pipeline, rule))
 
 
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
@@ -280,11 +272,12 @@ def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the conditions at which an interval is wider than was wanted."""
     widths = dict(rule.precision)
     wanted = decisions.wanted_precisions(widths)
-    lines = [_too_few(pipeline, rule, each.fewest_draws, f"with fewer no interval of {each.name} "
-                      f"has a half-width of {each.half_width:g}") for each in wanted]
+    lines = [_too_few(pipeline, rule, each.fewest_draws, "with fewer no interval of "
+                      f"{each.what.name} has a half-width of {each.half_width:g}")
+             for each in wanted]
     if any(lines):
         raise refusal(list(filter(None, lines)))
-    return [each.requirable for each in wanted], lambda dataset: ~decisions.precision_reached(
+    return [each.what for each in wanted], lambda dataset: ~decisions.precision_reached(
         dataset, widths, rule.per, rule.max_trials)["settled"]
 
 

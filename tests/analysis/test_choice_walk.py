@@ -33,7 +33,7 @@ def search(rates, limit, generator):
         hits = hits + np.where(asked, generator.binomial(end - before, rates), 0)
         decision = decided(hits, n, limit, shares)
         keeps = hits >= limit * n
-        asked = needed(decision, keeps)
+        asked = np.stack([needed(*each) for each in zip(decision, keeps, strict=True)])
         if not asked.any():
             break
     return decision, keeps, n

@@ -7,13 +7,13 @@ import pytest
 
 from support.searches import DOCUMENT, block_of, flags_of, needed_by
 from support.small_datasets import perfect
-from sweep.analysis.requirements import Decision, ErrorShares, answers, choice_cells
+from sweep.analysis.requirements import Decision, ErrorShares, choice_needed, choice_table
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report import findings as size_lines
 from sweep.sampling.rules import make_rule
-from sweep.sampling.searches import group_dataset, store_cells
+from sweep.sampling.searches import group_dataset, store_answers
 from sweep.tradeoff import choice_search
 
 
@@ -90,7 +90,7 @@ def test_answers_name_the_next_size_and_what_it_fails_by():
     rates[1] = [[1.0, 1.0], [0.2, 1.0]]
     flags = found_at(rates, 400, np.random.default_rng(2))
     results = group_dataset(pipeline, block_of(flags), flags)
-    found = answers(store_cells(results, pipeline, pipeline.stopping))
+    found = store_answers(results, pipeline, pipeline.stopping)
     by = {tuple(each.alternative.values()): each for each in found}
     assert list(by) == [(dictionary, solver) for dictionary in ("DICT_4X4_50", "DICT_6X6_50")
                         for solver in ("ippe", "iterative")]
@@ -111,6 +111,6 @@ def test_what_too_few_poses_have_a_number_of_is_given_up(most, hopeless):
     results["estimate"].values[:, 1:] = EstimateStatus.solver_failed
     rule = StoppingRule(kind="smallest", along="side_px", max_trials=most, unit=50,
                         requirements=("rotation_rmse_deg <= 5",))
-    cells = choice_cells(results, rule, ErrorShares(met=0.1, not_met=0.05))
-    assert cells.hopeless.all() == hopeless
-    assert bool(cells.needed().any()) != hopeless
+    table = choice_table(results, rule, ErrorShares(met=0.1, not_met=0.05))
+    assert table["hopeless"].all() == hopeless
+    assert bool(choice_needed(table, rule).any()) != hopeless

@@ -127,14 +127,14 @@ def _refused(source: str, faults: Faults) -> PipelineError:
 
 
 def _text(path: Path, source: str) -> str:
-    """Return a file's text in any encoding that a byte order mark names, else UTF-8."""
+    """Return a file's text, of UTF-8 with or without a byte order mark."""
     try:
         content = path.read_bytes()
-        return content.decode(
-            "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise _refused(source, {line: f"not text ({error.reason}); expected CSV"}) from None
+        fault = f"not text ({error.reason}); expected CSV in UTF-8"
+        raise _refused(source, {line: fault}) from None
     except OSError as error:
         raise StoreError(
             f"{source}: cannot be read: {reason_of(error)}{nearest_file(path)}") from None

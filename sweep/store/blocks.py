@@ -6,9 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import os
 import struct
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -325,7 +323,7 @@ def begin_block(store: RunStore, block: Block) -> bool:
         key = f"{BEGUN}/{store.blocks.number(block)}"
         if files.sync(store.storage.exists(key)):
             return True
-        files.write_document(store.storage, key, {"pid": os.getpid(), "at": time.time()})
+        files.write_document(store.storage, key, {})
     return False
 
 
@@ -359,7 +357,6 @@ def write_block(
                 checksums[name] = files.checksum_of(content)
             files.write_files(store.storage, contents)
         receipt = dataclasses.replace(receipt, checksums=checksums, block=number)
-        check_not_replaced(store)
         files.write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
         withdraw_block(store, block)
     return receipt

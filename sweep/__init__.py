@@ -178,7 +178,7 @@ def run(
     """
     # The child imports its packages while this process does.
     with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-        read = _pipeline(pipeline)
+        read = library.lifecycle.read_pipeline(pipeline)
         if store is None and not isinstance(pipeline, library.pipeline.Pipeline | Mapping):
             store = pipeline if library.lifecycle.names_store(pipeline) else None
         summary = library.runner.execute(
@@ -250,29 +250,15 @@ def limit(
     """
     # The child imports its packages while this process does.
     with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-        source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
+        source = (
+            library.pipeline.Pipeline.from_dict(pipeline) if isinstance(pipeline, Mapping)
+            else pipeline)
         limits, summary = library.runner.search_limits(
             source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
             store=store, progress=report, child=child, **options)
     for line in summary.warnings if summary is not None else ():
         notice(line)
     return limits
-
-
-def _pipeline(
-    given: library.pipeline.Pipeline | Mapping[str, Any] | str | os.PathLike[str],
-) -> library.pipeline.Pipeline:
-
-    if isinstance(given, Mapping):
-        pipeline = library.pipeline.Pipeline.from_dict(given)
-    elif isinstance(given, (library.pipeline.Pipeline, str, os.PathLike)):
-        pipeline = library.lifecycle.read_pipeline(given)
-    else:
-        raise ArgumentError(
-            "pipeline", given,
-            "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
-        )
-    return pipeline
 
 
 def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray and zarr have it)
@@ -463,8 +449,8 @@ def size(
     with (Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report,
           library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
-            _pipeline(pipeline), store, limit_s=limit_s, progress=report, stage=stage, child=child,
-            **options)
+            library.lifecycle.read_pipeline(pipeline), store, limit_s=limit_s, progress=report,
+            stage=stage, child=child, **options)
     for line in found.notes:
         notice(line)
     return found

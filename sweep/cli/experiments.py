@@ -308,17 +308,15 @@ def repro(
         raise ArgumentError("output", output, "expected one --at beside it")
     if output is not None:
         check_png(output)
-    library.verification.check_selection(store, chosen)
-    cells = [
-        library.verification.reproduce(store, each, whole_frame=full, time_limit_s=time_limit_s)
-        for each in chosen]
+    cells = library.verification.reproduce(
+        store, chosen, whole_frame=full, time_limit_s=time_limit_s)
     lines = [line for again in cells for line in ("", *_cell_lines(again))][1:]
     last, status = cells[-1], int(any(each.difference for each in cells))
     if output is not None and last.image is None:
         lines.append("no image: rendering failed")
     elif output is not None:
         _write_image(output, last.image, None if plain else last.inspection, last.pipeline,
-                     last.cell_pipeline)
+                     library.pipeline.cell(last.pipeline, last.at))
         lines.append(f"{output}: image of the cell")
     url = quoted(store)
     then = f"sweep verify {url}", "checks the rest of the store"
@@ -338,7 +336,8 @@ def _cell_lines(again: Reproduction) -> Iterator[Any]:
     yield f"--at {again.at}"
     for line in again.changes:
         yield f"changed since the store was created: {line}"
-    yield library.scenes.value_table(again.variables, again.recomputed, again.stored)
+    yield library.scenes.value_table(
+        again.pipeline.experiment.variables, again.recomputed, again.stored)
     if again.inspection is not None:
         left, top, right, bottom = again.inspection.window
         ids = ", ".join(str(marker_id) for marker_id, _ in again.inspection.decoded) or "none"

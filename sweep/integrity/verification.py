@@ -22,7 +22,6 @@ from sweep.execution.waves import InWaves
 from sweep.experiment.grid import Block
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, cell, parse_selection, selection_text
-from sweep.experiment.schema import Variable
 from sweep.isolation.child_process import Child, ChildError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV
@@ -456,8 +455,6 @@ class Reproduction:
     ----------
     at
         Its value of every axis, as text.
-    variables
-        Those of the store.
     recomputed, stored
         Variable -> value, of the dimensions that are no axes; ``stored`` is None if the block is
         not committed.
@@ -472,8 +469,8 @@ class Reproduction:
         Exceptions that were raised, and deaths of the process.
     changes
         Versions and files that have changed since the store was created.
-    pipeline, cell_pipeline
-        The store's pipeline, and the same with every axis fixed at the cell.
+    pipeline
+        The store's.
     inspection
         The inspected scene; None if its inspection raises or ends its process.
     image
@@ -483,7 +480,6 @@ class Reproduction:
     """
 
     at: str
-    variables: tuple[Variable, ...]
     recomputed: StoredValues
     stored: StoredValues | None
     difference: str
@@ -492,39 +488,49 @@ class Reproduction:
     failures: list[Failure]
     changes: list[str]
     pipeline: Pipeline
-    cell_pipeline: Pipeline
     inspection: SceneInspection | None
     image: NDArray[np.uint8] | None
     unneeded: bool = False
 
 
 def reproduce(
-    url: str, at: str, *, whole_frame: bool = False, time_limit_s: float = 60.0
-) -> Reproduction:
-    """Recompute one cell of a store in a child process, and compare it with the stored one.
+    url: str, chosen: Sequence[str], *, whole_frame: bool = False, time_limit_s: float = 60.0
+) -> list[Reproduction]:
+    """Recompute cells of a store in child processes, and compare them with the stored ones.
 
     Parameters
     ----------
     url
         The store.
-    at
-        A value of each axis, such as "distance_m=0.3,solver=ippe"; the first one of axes that it
-        does not name.
+    chosen
+        For each cell a value of each axis, such as "distance_m=0.3,solver=ippe"; the first one of
+        axes that it does not name.
     whole_frame
         Whether the image shows the whole frame, not the marker's surroundings alone.
     time_limit_s
-        Timeout in seconds.
+        Timeout in seconds for each cell.
 
     Raises
     ------
     PipelineError
-        If ``at`` is not on the store's grid.
+        If one is not on the store's grid; no cell is computed.
     StoreError
         If there is no store.
     """
     store = lifecycle.open_store(url)
     pipeline, changes = current_pipeline(store)
-    index = _index(pipeline, at)
+    done = blocks.check_whole(store)
+    return [
+        _reproduced(store, pipeline, changes, index, done, whole_frame, time_limit_s)
+        for index in [_index(pipeline, at) for at in chosen]
+    ]
+
+
+def _reproduced(
+    store: RunStore, pipeline: Pipeline, changes: list[str], index: Mapping[str, int],
+    done: Container[int], whole_frame: bool, time_limit_s: float,
+) -> Reproduction:
+    """Recompute the cell at an index along the axes; ``done`` has the committed blocks."""
     corner = tuple(index[axis.name] for axis in pipeline.experiment.scene_axes)
     setting, estimator = (
         int(np.ravel_multi_index([index[axis.name] for axis in axes], [*map(len, axes)]))
@@ -541,7 +547,7 @@ def reproduce(
         for v in store.variables
     }
     number, stored, exact, unneeded = store.blocks.number(Block(corner, corner)), None, False, False
-    if number in blocks.check_whole(store):
+    if number in done:
         _, receipt = next(blocks.receipts(store, [number]))
         values = stored_values(store, index)
         unneeded = bool(values["detection"] == DetectionStatus.not_needed)
@@ -551,28 +557,12 @@ def reproduce(
         recomputed, stored, store.variables, same_processor=exact
     )
     full_at = selection_text(pipeline, index)
-    cell_pipeline = cell(pipeline, full_at)
-    inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
+    inspected, image = _inspected(cell(pipeline, full_at), whole_frame, time_limit_s)
     return Reproduction(
-        full_at, store.variables, recomputed, stored, difference, exact,
+        full_at, recomputed, stored, difference, exact,
         {stage.name: cells.seconds[stage.name][number] for stage, number in configuration.items()},
-        cells.failures, changes, pipeline, cell_pipeline, inspected, image, unneeded,
+        cells.failures, changes, pipeline, inspected, image, unneeded,
     )
-
-
-def check_selection(url: str, chosen: Sequence[str]) -> None:
-    """Check that cells are on a store's grid, before any is computed.
-
-    Raises
-    ------
-    PipelineError
-        If one is not.
-    StoreError
-        If there is no store.
-    """
-    pipeline = lifecycle.open_store(url).pipeline
-    for at in chosen:
-        _index(pipeline, at)
 
 
 def _index(pipeline: Pipeline, at: str) -> dict[str, int]:

@@ -25,7 +25,7 @@ from zarr.abc.store import Store
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
-from sweep.errors import StoreError, SweepError
+from sweep.errors import ArgumentError, StoreError, SweepError
 from sweep.experiment.document import file_text, read_document
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
@@ -221,9 +221,8 @@ def damaged_files(store: RunStore, *, tables: bool) -> dict[str, str]:
 
     Tables are left out if they do not matter.
     """
-    within = tuple(f"{name}/" for name in TABLES)
     listed = {key: crc for key, crc in store.run_metadata["files"].items()
-              if tables or not key.startswith(within)}
+              if tables or key.partition("/")[0] not in TABLES}
     contents = files.read_files(store.storage, list(listed))
     return {
         key: "missing" if content is None else CHANGED
@@ -323,8 +322,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         If nothing can be written there.
     """
     run_id = uuid.uuid4().hex
-    planned = planned_arrays(pipeline, extents)
-    contents = planned_files(planned)
+    contents = planned_files(planned_arrays(pipeline, extents))
     metadata = {
         "format": FORMAT,
         "run_id": run_id,
@@ -335,7 +333,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         "finished": False,
         "files": checksums(contents),
     }
-    contents["zarr.json"] = files.encoded(root_document(pipeline, planned, metadata))
+    contents["zarr.json"] = files.encoded(root_document(pipeline, metadata))
     remote = locations.is_remote(url)
     with locations.translate_errors(url, "written"):
         path = Path(url).resolve()  # a link may lead there
@@ -343,23 +341,21 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             locations.check_writable(url)
             for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
                 shutil.rmtree(doomed, ignore_errors=True)  # a killed process began it
-        building = f"{url}/{run_id}" if remote else str(_beside(path, "new"))
+        home, folder = (url, run_id) if remote else (str(path.parent), _beside(path, "new").name)
+        outside = locations.storage_at(home, read_only=False)
         try:
-            files.write_files(locations.storage_at(building, read_only=False), contents)
+            files.write_files(locations.storage_at(f"{home}/{folder}", read_only=False), contents)
             if locations.exists(url):
                 raise StoreError(
                     f"{url}: another process has made it meanwhile; run it again to continue")
             if not remote:
-                Path(building).rename(path)
+                Path(home, folder).rename(path)
         except BaseException:
-            if remote:
-                files.delete_folder(locations.storage_at(url, read_only=False), run_id)
-            else:
-                shutil.rmtree(building, ignore_errors=True)
+            files.delete_folder(outside, folder)
             raise
         if remote:  # the URL points to it once it is complete
-            files.write_document(locations.storage_at(url, read_only=False), "zarr.json",
-                                 GROUP | {"attributes": {locations.POINTER: run_id}})
+            files.write_document(
+                outside, "zarr.json", GROUP | {"attributes": {locations.POINTER: run_id}})
     return open_store(url, "r+")
 
 
@@ -381,14 +377,12 @@ def _beside(path: Path, ending: str) -> Path:
 #: which a store is lost, and that of the whole document, which can be written again.
 CHECKSUM, SEAL = "checksum", "seal"
 
-
 #: The document of a group, without its attributes.
 GROUP = {"zarr_format": 3, "node_type": "group"}
 
 
 def root_document(
-    pipeline: Pipeline, planned: Iterable[PlannedArray], metadata: Mapping[str, Any],
-    members: Mapping[str, Any] | None = None,
+    pipeline: Pipeline, metadata: Mapping[str, Any], members: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the document of a store's root, sealed.
 
@@ -396,7 +390,9 @@ def root_document(
     and groups by path, of which a finished store's root has a copy. That is not part of the Zarr 3
     specification; xarray reads it, and warns if it is missing.
     """
-    coordinates = [array.path for array in planned if array.coordinate]
+    coordinates = [
+        array.path for array in planned_arrays(pipeline, tuple(metadata["block"]))
+        if array.coordinate]
     surprising = [*pipeline.facts.camera_notes]
     attributes = {
         "title": pipeline.heading,
@@ -630,10 +626,8 @@ def write_root(
             for key, content in zip(keys, files.read_files(store.storage, keys), strict=True)
             if content
         }
-    pipeline = pipeline or store.pipeline
-    planned = planned_arrays(pipeline, store.blocks.extents)
     files.write_document(
-        store.storage, "zarr.json", root_document(pipeline, planned, metadata, members))
+        store.storage, "zarr.json", root_document(pipeline or store.pipeline, metadata, members))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -668,24 +662,28 @@ def names_store(path: str | os.PathLike[str]) -> bool:
 
 
 def read_pipeline(
-    source: Pipeline | str | os.PathLike[str], settings: Sequence[str] = ()
+    source: Pipeline | Mapping[str, Any] | str | os.PathLike[str], settings: Sequence[str] = ()
 ) -> Pipeline:
     """Return the pipeline of a TOML file or of a store, or a pipeline with other settings.
 
     Parameters
     ----------
     source
-        A TOML file, the path or URL of a store, or a pipeline.
+        A TOML file, the content of one, the path or URL of a store, or a pipeline.
     settings
         "key=value" with TOML values, as ``--set`` takes them.
 
     Raises
     ------
+    ArgumentError
+        If the source is none of these.
     PipelineError
         If the file or a setting is invalid, or a folder is no store.
     StoreError
         If the store cannot be read.
     """
+    if isinstance(source, Mapping):
+        return Pipeline.from_dict(source, settings)
     found = _pipeline_or_file(source)
     if isinstance(found, str):
         return Pipeline.from_toml(found, settings)
@@ -697,6 +695,10 @@ def _pipeline_or_file(source: Pipeline | str | os.PathLike[str]) -> Pipeline | s
     """Return a pipeline itself, that of a store, or the path of a file."""
     if isinstance(source, Pipeline):
         return source
+    if not isinstance(source, (str, os.PathLike)):
+        raise ArgumentError(
+            "pipeline", source,
+            "expected a Pipeline, the path of a TOML file or of a store, or a mapping")
     url = os.fspath(source)
     if not names_store(url):
         return url

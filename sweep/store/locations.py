@@ -221,9 +221,7 @@ def check_writable(url: str) -> None:
         around = enclosing_store(Path(url).absolute().parent)
         if around is not None:
             raise StoreError(f"{url}: cannot be written: it is inside the store {around}")
-        try:
+        with contextlib.suppress(FileExistsError):  # a file, which cannot hold a folder
             Path(url).parent.mkdir(parents=True, exist_ok=True)
-        except FileExistsError:
-            raise StoreError(f"{url}: cannot be written: Not a directory") from None
         with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
             pass

@@ -173,7 +173,7 @@ def test_readers_name_what_is_gone_and_what_repairs_it(lost, grid, copied, capsy
     assert {damage.block for damage in verify(str(copied), 0).damage} <= set(range(4))
     if name == "detection":
         with pytest.raises(StoreError, match="detection/c/0"):
-            reproduce(str(copied), "side_px=30")
+            reproduce(str(copied), ["side_px=30"])
 
 
 @pytest.mark.parametrize(("name", "values"), [

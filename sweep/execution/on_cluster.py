@@ -77,7 +77,6 @@ def connected(
         If the cluster cannot be used: it does not answer or refuses, has no workers, or a worker
         has other versions; each within a bounded time.
     """
-    argument, name = ("client", _name(client)) if scheduler is None else ("scheduler", scheduler)
     own: Any = client
     with contextlib.ExitStack() as stack:
         if scheduler is not None:
@@ -89,19 +88,19 @@ def connected(
                 "client", client,
                 "expected a distributed.Client or a cluster object such as LocalCluster; "
                 "the address of a scheduler is given as scheduler")
-        else:
-            state = "asynchronous" if getattr(client, "asynchronous", False) else (
-                getattr(client, "status", "running"))
-            state = getattr(state, "name", state)
+        try:
+            state = getattr(own, "status", "running")
+            state = "asynchronous" if getattr(own, "asynchronous", False) else (
+                getattr(state, "name", state))
             if state in ("asynchronous", "closing", "closed", "failed"):
-                raise ArgumentError("client", name, f"it is {state}")
-        if not isinstance(own, Client):
-            try:
+                raise ValueError(f"it is {state}")
+            if not isinstance(own, Client):
                 own = stack.enter_context(Client(own, timeout=ANSWER_S, set_as_default=False))
-            except (OSError, RuntimeError, ValueError) as error:
-                reason = f"cannot connect: {exception_line(error)}"
-                raise ArgumentError(argument, name, reason) from None
-        check_workers(own, pipeline, argument, name)
+            check_workers(own, pipeline)
+        except (OSError, RuntimeError, ValueError) as error:
+            argument = "client" if scheduler is None else "scheduler"
+            raise ArgumentError(
+                argument, scheduler or type(client).__name__, str(error)) from None
         yield OnCluster(own)
 
 
@@ -152,13 +151,6 @@ async def _ask_scheduler(address: str) -> None:
         raise TypeError(f"a {kind}")
 
 
-def _name(client: object) -> str:
-    """Return the name of a client or cluster in messages: its type, and the scheduler's address."""
-    scheduler = getattr(client, "scheduler", None)
-    address = getattr(scheduler, "address", getattr(client, "scheduler_address", None))
-    return f"{type(client).__name__}({address})"
-
-
 def this_process(
     pipeline: Pipeline, begun: dict[str, Any]
 ) -> tuple[list[str], tuple[str, int], str]:
@@ -166,7 +158,7 @@ def this_process(
     return other_here(pipeline, begun), (socket.gethostname(), os.getpid()), processor()
 
 
-def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) -> None:
+def check_workers(client: Client, pipeline: Pipeline) -> None:
     """Check that workers have this process's versions and files, and are other processes.
 
     A line says if their processors have different features, which the last bits of results, and
@@ -175,7 +167,7 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
 
     Raises
     ------
-    ArgumentError
+    ValueError
         If a worker cannot compute the pipeline as this process would, or none answers.
     """
     begun = fingerprint(pipeline)
@@ -190,20 +182,16 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, name: str) 
             wait(list(asked.values()), timeout=WORKERS_S)
         told = {worker: answer.result() for worker, answer in asked.items() if answer.done()}
     except TimeoutError:
-        raise ArgumentError(
-            argument, name, f"no workers within {WORKERS_S:.0f} s; start some") from None
+        raise ValueError(f"no workers within {WORKERS_S:.0f} s; start some") from None
     except Exception as error:
-        raise ArgumentError(
-            argument, name, f"its workers cannot run sweep: {exception_line(error)}") from None
+        raise ValueError(f"its workers cannot run sweep: {exception_line(error)}") from None
     if any(process == (socket.gethostname(), os.getpid()) for _, process, _ in told.values()):
-        raise ArgumentError(
-            argument, name, "its workers are threads of this process, which a scene may end; "
-            "start it with processes=True")
-    if lines := [f"  {worker}: {line}" for worker, (other, _, _) in sorted(told.items())
+        raise ValueError("its workers are threads of this process, which a scene may end; "
+                         "start it with processes=True")
+    if lines := [f"\n  {worker}: {line}" for worker, (other, _, _) in sorted(told.items())
                  for line in other]:
-        raise ArgumentError(
-            argument, name, "\n".join(["workers with other versions; install the same everywhere",
-                                       *lines]))
+        raise ValueError(
+            "workers with other versions; install the same everywhere" + "".join(lines))
     for line in differing_processors(Counter(used for _, _, used in told.values()), "workers"):
         notice(f"warning: {line}")
 
@@ -264,10 +252,10 @@ class OnCluster(Executor):
         """Ask the scheduler for its workers."""
         try:
             if self._client.scheduler is None or self._client.status != "running":
-                raise ConnectionError(AWAY)
-            identity = self._client.sync(
-                self._client.scheduler.identity, n_workers=-1, callback_timeout=LOOK_LIMIT_S)
-            self._states = identity["workers"]
+                raise ConnectionError
+            self._states = self._client.sync(
+                self._client.scheduler.identity, n_workers=-1, callback_timeout=LOOK_LIMIT_S,
+            )["workers"]
         except TimeoutError:
             pass  # it is busy
         except OSError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from sweep.evaluation.results import CellsResult, Failure
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError, ChildRaisedError
 from sweep.measure.detectors import make_detector
-from sweep.measure.estimators import PluggedEstimatorSetting, build
+from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plugins.loading import PluginSetting
 from sweep.store.blocks import selected
@@ -268,17 +267,15 @@ def check_repeatable(
     MachineFaultError
         If a scene does not fail again in the same parts, or the machine fails meanwhile.
     """
-    raised = [failure for failure in cells.failures if not failure.crashed]
-    scenes = sorted({failure.scene for failure in raised})
-    again = run_cells_isolated(
-        pipeline, [index[scenes] for index in indices], need[scenes], limit_s).failures \
-        if scenes else []
-    repeated = {(scenes[each.scene], each.stage, each.setting, each.estimator, each.crashed)
-                for each in again}
-    for each in raised:
-        if (each.scene, each.stage, each.setting, each.estimator, False) not in repeated:
-            raise local_fault("raised in a scene, but not when that was repeated in another "
-                              f"process: {each.text.strip().splitlines()[-1]}")
+    scenes = sorted({each.scene for each in cells.failures if not each.crashed})
+    if scenes:
+        again = run_cells_isolated(
+            pipeline, [index[scenes] for index in indices], need[scenes], limit_s).failures
+        repeated = {dataclasses.replace(each, scene=scenes[each.scene], text="") for each in again}
+        for each in cells.failures:
+            if not each.crashed and dataclasses.replace(each, text="") not in repeated:
+                raise local_fault("raised in a scene, but not when that was repeated in another "
+                                  f"process: {each.text.strip().splitlines()[-1]}")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -287,12 +284,12 @@ def check_repeatable(
 #: Seconds that a plug-in may take to be made, and to search one blank frame.
 LIMIT_S = 60.0
 
-#: Settings of a plug-in that are tried.
-MAX_SETTINGS = 16
+#: Settings that are tried, of all plug-ins.
+MAX_SETTINGS = 64
 
 
 def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) -> None:
-    """Use each of a pipeline's plug-ins in a child process, which goes on to work.
+    """Use a pipeline's plug-ins in a child process, which goes on to work.
 
     Raises
     ------
@@ -300,20 +297,21 @@ def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) ->
         If one cannot be imported or made, raises on a blank frame, ends its process, or does not
         return; in one line.
     """
-    for plugin in pipeline.plugins:
-        try:
-            child.call(use, pipeline, plugin.name, limit_s=limit_s)
-        except ChildError as error:
-            ends = ""
-            if isinstance(error, ChildDiedError):
-                child.restart()
-                ends = "ends its process before the first pose: "
-            raise PluginError(f"{plugin.kind} {plugin.name}: {ends}{error.line}") from None
+    names = " or ".join(f"{plugin.kind} {plugin.name}" for plugin in pipeline.plugins)
+    try:
+        if names:
+            child.call(use, pipeline, limit_s=limit_s * len(pipeline.plugins))
+    except ChildError as error:
+        ends = ""
+        if isinstance(error, ChildDiedError):
+            child.restart()
+            ends = "ends its process before the first pose: "
+        raise PluginError(f"{names}: {ends}{error.line}") from None
 
 
 @single_threaded()
-def use(pipeline: Pipeline, name: str) -> None:
-    """Import a plug-in and make it with each of its settings; a detector searches a blank frame.
+def use(pipeline: Pipeline) -> None:
+    """Import plug-ins and make them with each of their settings; detectors search a blank frame.
 
     Raises
     ------
@@ -321,16 +319,13 @@ def use(pipeline: Pipeline, name: str) -> None:
         If that cannot be done.
     """
     experiment = pipeline.experiment
-    if any(each.name == name and each.kind in ("effect", "renderer") for each in pipeline.plugins):
-        _ = experiment.scene_plugins
+    _ = experiment.scene_plugins
     width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
     blank = np.full((height, width), 128, dtype=np.uint8)
-    settings: Any = [setting for setting in dict.fromkeys(experiment.detectors)
-                     if isinstance(setting, PluginSetting) and setting.plugin.name == name]
-    searches = itertools.product(settings, pipeline.values_of("dictionary"))
-    for setting, dictionary in itertools.islice(searches, MAX_SETTINGS):
+    settings = [setting for setting in dict.fromkeys(experiment.detectors)
+                if isinstance(setting, PluginSetting)]
+    searches = itertools.product(pipeline.values_of("dictionary"), settings)
+    for dictionary, setting in itertools.islice(searches, MAX_SETTINGS):
         make_detector(setting)(blank, dictionary, max(width, height))
-    solvers = [setting for setting in dict.fromkeys(experiment.estimators)
-               if isinstance(setting, PluggedEstimatorSetting) and setting.solver == name]
-    for solver in solvers[:MAX_SETTINGS]:
+    for solver in itertools.islice(dict.fromkeys(experiment.estimators), MAX_SETTINGS):
         build(solver)

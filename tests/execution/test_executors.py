@@ -179,15 +179,14 @@ def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(tmp_path
                 with pytest.raises(ArgumentError, match=r"tcp://.*: opencv is .*, the run began"):
                     execute(PIPELINE, tmp_path / "other.zarr", **given)
         assert not (tmp_path / "other.zarr").exists()
-        address = cluster.scheduler_address
         client = Client(cluster, set_as_default=False)
         client.close()
-        assert refusal(client) == "client = Client(None): it is closed"
+        assert refusal(client) == "client = Client: it is closed"
         client = Client(cluster, set_as_default=False)
         client.retire_workers()
         assert refusal(client).endswith("no workers within 0 s; start some")
         client.close()
-    assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
+    assert refusal(cluster) == "client = LocalCluster: it is closed"
 
 
 def test_what_is_no_client_and_what_is_no_address_are_refused():

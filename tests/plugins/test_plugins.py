@@ -309,7 +309,7 @@ def bad(tmp_path):
 ])
 def test_an_image_at_which_a_detector_is_at_fault_is_flagged(bad, returned, told):
     pipeline = bad(returned)
-    use(pipeline, "bad:D")  # on a blank frame nothing is wrong
+    use(pipeline)  # on a blank frame nothing is wrong
     cells = run_cells(pipeline, [])
     assert [flags.tolist() for flags in cells.columns["detection"]] == [
         [DetectionStatus.detected], [DetectionStatus.failed],

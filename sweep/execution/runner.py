@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ from sweep.execution.waves import InWaves, condition_count
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import search_settings, texts_in
+from sweep.experiment.sampling import search_settings
 from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.measure.flags import DetectionStatus
@@ -116,10 +116,19 @@ def execute(
     """
     started = time.perf_counter()
     rule = make_rule(pipeline)  # it refuses names that it does not know
-    _check_arguments(workers, scheduler, client, block_s, time_limit_s)
-    url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
+    if workers is not None and workers < 1:
+        raise ArgumentError("workers", workers, "expected at least 1")
+    if scheduler is not None and client is not None:
+        raise ArgumentError("scheduler", scheduler, "expected no client beside it")
+    if scheduler is not None and ":" not in scheduler and scheduler != "local":
+        raise ArgumentError(
+            "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
+    for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
+        if seconds is not None and not 0 < seconds < math.inf:
+            raise ArgumentError(name, seconds, "expected seconds above 0")
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
+    url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
     again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
@@ -169,25 +178,9 @@ def execute(
             begun = lifecycle.reopen(begun, pipeline if stricter else None, again)
         limit_s = forecast.block_time_limit_s(time_limit_s, timing.scene_s * len(begun.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
-            computed = _compute_and_close(begun, executor, sources, limit_s, interrupts, progress)
+            computed = compute(begun, executor, sources, limit_s, interrupts, progress)
     return status.summary_of(
         lifecycle.open_store(url), computed, time.perf_counter() - started, again)
-
-
-def _check_arguments(
-    workers: int | None, scheduler: str | None, client: object, block_s: float | None,
-    time_limit_s: float | None,
-) -> None:
-    if workers is not None and workers < 1:
-        raise ArgumentError("workers", workers, "expected at least 1")
-    if scheduler is not None and client is not None:
-        raise ArgumentError("scheduler", scheduler, "expected no client beside it")
-    if scheduler is not None and ":" not in scheduler and scheduler != "local":
-        raise ArgumentError(
-            "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
-    for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
-        if seconds is not None and not 0 < seconds < math.inf:
-            raise ArgumentError(name, seconds, "expected seconds above 0")
 
 
 # Before anything is computed
@@ -225,41 +218,15 @@ def _matching_sources(
 # The blocks, and the end
 
 
-def _compute_and_close(
-    store: RunStore, executor: Executor, sources: Sequence[str], time_limit_s: float,
-    interrupts: Interrupts, progress: ProgressReport | None,
-) -> Mapping[str, int]:
-    """Compute the blocks that are not committed; return counts of the computed poses."""
-    with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
-        for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
-            thread.submit(importlib.import_module, module)
-        done = blocks.committed(store)
-        missing = blocks.missing_chunks(store, done)
-        for number, key in sorted(missing.items())[:1]:
-            notice(
-                f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of "
-                f"block {number}, as in a copy that was made during a run; they are computed again")
-        for number in missing:
-            blocks.drop_block(store, store.blocks[number])
-        left = sorted(set(range(len(store.blocks))) - (done - missing.keys()))
-        computed = compute(store, left, executor, sources, time_limit_s, interrupts, progress)
-        attributes, _ = lifecycle.read_root(store.url, store.storage)
-        if attributes["pipeline"] != store.pipeline.text:  # as it may be on S3
-            raise StoreError(f"{store.url}: another run has changed when its sampling stops")
-        if not store.finished:  # by another process that wrote it, too
-            status.close(store)
-    return computed
-
-
 #: Failed blocks after which a run ends.
 MAX_FAILED_BLOCKS = 10
 
 
 def compute(
-    store: RunStore, numbers: Collection[int], executor: Executor, sources: Sequence[str],
-    time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None = None,
+    store: RunStore, executor: Executor, sources: Sequence[str], time_limit_s: float,
+    interrupts: Interrupts, progress: ProgressReport | None = None,
 ) -> Mapping[str, int]:
-    """Compute blocks that are not committed, by their numbers.
+    """Compute the blocks that are not committed, and close the store.
 
     Returns
     -------
@@ -275,11 +242,7 @@ def compute(
         If the receipt of a block that was committed before is damaged.
     """
     url, pipeline = absolute_url(store.url), store.pipeline
-    waves = None if pipeline.stopping is None else InWaves(store, set(numbers))
-    conditions = condition_count(pipeline)
     computed: Counter[str] = Counter()
-    failed: list[str] = []
-    machine_faults = 0
 
     def report() -> None:
         if progress is not None:
@@ -288,33 +251,51 @@ def compute(
                 int(totals.detection[DetectionStatus.detected]), *(() if waves is None else (
                     totals.needed, int(waves.settled_share * conditions), conditions))))
 
-    done = blocks.committed(store).difference(numbers) if waves is None else waves.current
-    totals = status.Totals.of(blocks.receipts(store, done))
-    report()
-    for wave in waves or [((number, None) for number in numbers)]:
-        tasks = (
-            (number, (url, store.run_id, store.blocks[number], sources, time_limit_s, decision))
-            for number, decision in wave)
-        with contextlib.closing(executor.map(tasks, time_limit_s, interrupts)) as results:
-            for number, result in results:
-                if isinstance(result, Failed):
-                    failed.append(f"block {store.blocks[number]}: {result.reason}")
-                    machine_faults += result.machine_fault
-                    if len(failed) >= MAX_FAILED_BLOCKS:
-                        break
-                    continue
-                if waves is not None:
-                    waves.committed(number, result)
-                computed.update({"blocks": 1, **result.computed})
-                totals.add(result)
-                report()
-        if failed and machine_faults == len(failed):
-            more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
-            raise RunError(f"{store.url}: {failed[0]}{more}")
-        if failed:
-            raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed", *failed]))
-    if waves is not None:
+    with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
+        for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
+            thread.submit(importlib.import_module, module)
+        done = blocks.committed(store)
+        missing = blocks.missing_chunks(store, done)
+        for number, key in sorted(missing.items())[:1]:
+            notice(
+                f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of "
+                f"block {number}, as in a copy that was made during a run; they are computed again")
+        for number in missing:
+            blocks.drop_block(store, store.blocks[number])
+        done -= missing.keys()
+        waves = None if pipeline.stopping is None else InWaves(store)
+        conditions = condition_count(pipeline)
+        totals = status.Totals.of(blocks.receipts(store, done if waves is None else waves.current))
         report()
+        left = ((number, None) for number in range(len(store.blocks)) if number not in done)
+        for wave in waves or [left]:
+            tasks = (
+                (number, (url, store.run_id, store.blocks[number], sources, time_limit_s, decision))
+                for number, decision in wave)
+            failed: list[Failed] = []
+            with contextlib.closing(executor.map(tasks, time_limit_s, interrupts)) as results:
+                for number, result in results:
+                    if isinstance(result, Failed):
+                        reason = f"block {store.blocks[number]}: {result.reason}"
+                        failed.append(result._replace(reason=reason))
+                        if len(failed) >= MAX_FAILED_BLOCKS:
+                            break
+                        continue
+                    if waves is not None:
+                        waves.committed(number, result)
+                    computed.update({"blocks": 1, **result.computed})
+                    totals.add(result)
+                    report()
+            if failed and all(each.machine_fault for each in failed):
+                more = f", and {len(failed) - 1} blocks more likewise" if len(failed) > 1 else ""
+                raise RunError(f"{store.url}: {failed[0].reason}{more}")
+            if failed:
+                raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed",
+                                            *(each.reason for each in failed)]))
+        if waves is not None:
+            report()
+        if not store.finished:  # by another process that wrote it, too
+            status.close(store)
     return computed
 
 
@@ -379,31 +360,14 @@ def search_limits(
             return limits.assign_attrs(store=os.fspath(source)), None
         if store is None and not settings:
             store = source
-    pipeline = _with_search(source, settings, chosen)
-    rule = pipeline.stopping
-    assert rule is not None  # noqa: S101  (the section [search] has been read)
+    own = (lifecycle.document_of(source) or {}).get(SEARCH, {})
+    default = [] if isinstance(own, dict) and "max_trials" in own else (
+        search_settings(max_trials=MAX_TRIALS))
+    pipeline = lifecycle.read_pipeline(source, [*default, *settings, *chosen])
     begin(pipeline)
     if store is None:
-        store = Path("runs") / f"{pipeline.name}-limit-{rule.along}.zarr"
+        along = getattr(pipeline.stopping, "along", "")
+        store = Path("runs") / f"{pipeline.name}-limit-{along}.zarr"
     summary = execute(pipeline, store, **options)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
     return limits.assign_attrs(store=summary.store), summary
-
-
-def _with_search(
-    source: Pipeline | str | os.PathLike[str], settings: Sequence[str], chosen: Sequence[str]
-) -> Pipeline:
-    """Return a pipeline with the section [search] of its document and of what is chosen."""
-    document = lifecycle.document_of(source)
-    if document is None and not isinstance(source, Pipeline):
-        return lifecycle.read_pipeline(source, settings)  # it says why
-    document = document or {}
-    own = document.get(SEARCH, {})
-    given = {*(own if isinstance(own, dict) else ()), *(
-        each.partition("=")[0].partition(".")[2] for each in chosen)}
-    more = [] if "max_trials" in given else search_settings(max_trials=MAX_TRIALS)
-    if "all" not in given and not texts_in(document):
-        raise ArgumentError("require", "", "expected what must hold, such as 'detection >= 0.9'")
-    if "along" not in given:
-        raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
-    return lifecycle.read_pipeline(source, [*settings, *chosen, *more])

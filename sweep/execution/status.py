@@ -288,7 +288,7 @@ def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -
 
 
 # --------------------------------------------------------------------------------------------------
-# Failed cells, tried again: the blocks that hold them are computed as if they never had been.
+# Blocks that are computed again, as if they never had been: those in which cells failed, say.
 
 def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict[int, int]:
     """Return the committed blocks in which cells failed or crashed, and how many did.

@@ -7,7 +7,6 @@ import json
 import math
 import zlib
 from collections.abc import Iterator
-from collections.abc import Set as AbstractSet
 from typing import NamedTuple
 
 import numpy as np
@@ -41,18 +40,14 @@ class InWaves:
     ----------
     store
         The store of a pipeline whose sampling stops; its committed blocks are read.
-    only
-        The blocks that may be computed, if they are not committed (default: all).
-
     """
 
-    def __init__(self, store: RunStore, only: AbstractSet[int] | None = None) -> None:
+    def __init__(self, store: RunStore) -> None:
         rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
         assert rule is not None and sampling is not None  # noqa: PT018, S101  (a section says so)
         self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._read = sorted({"detection", *sampling.variables})
-        self._only = range(len(store.blocks)) if only is None else only
         self._known: dict[int, _Known] = {}
         self._settled_shares = np.zeros(len(self._waves.groups))
         #: Numbers of the blocks that are committed on the basis that they have now.
@@ -94,12 +89,11 @@ class InWaves:
             numbers = [*self._waves.numbers(group, wave, last if settled else wave)]
             basis = bases[-1] if bases else None
             decision = Decision(self._rule, wave, bases, settled) if bases else None
-            pending = {number for number in numbers
-                       if number not in self._known or self._known[number].basis != basis}
-            self.current.update(set(numbers) - pending)
+            pending = [number for number in numbers
+                       if number not in self._known or self._known[number].basis != basis]
+            self.current.update(set(numbers).difference(pending))
             if pending:
-                yield from ((number, decision) for number in numbers if number in pending
-                            and (number in self._only or number in self._known))
+                yield from ((number, decision) for number in pending)
                 return
             found = [self._known[number] for number in numbers]
             needed, scenes = sum(each.needed for each in found), sum(each.scenes for each in found)

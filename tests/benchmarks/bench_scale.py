@@ -30,6 +30,7 @@ import sweep
 from support.clusters import Cluster
 from support.commands import started
 from sweep.execution import on_cluster
+from sweep.execution import status as execution_status
 from sweep.execution.forecast import block_work_s
 from sweep.execution.runner import compute
 from sweep.execution.status import status
@@ -82,18 +83,19 @@ def opened(url, run_id):  # noqa: ARG001  (a store of its own for each run)
     return open_store(url, "r+")
 
 
-def simulated_blocks(url, run_id, blocks, _decision, _sources, time_limit_s, *_others):
+def simulated_block(arguments):
     """Wait a block's time, here passed as its time limit; write its receipt and return it.
 
     It takes 0.5 to 1.5 of that: workers do not finish all at once.
     """
+    url, run_id, block, _, time_limit_s, _ = arguments
     begun, store = time.perf_counter(), opened(url, run_id)
-    number = store.blocks.number(blocks[0])
+    number = store.blocks.number(block)
     wanted = time_limit_s * (0.5 + number * 0.6180339887498949 % 1.0)
     receipt = receipt_of(store, number, wanted)
     time.sleep(max(wanted - (time.perf_counter() - begun), 0.0))
     write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
-    return [receipt]
+    return receipt
 
 
 async def live(address, count):
@@ -141,8 +143,7 @@ def simulated(count, waves, folder):
         processes = {"scheduler": psutil.Process(cluster.scheduler.pid), "client": psutil.Process()}
         spent = {name: cpu_s(process) for name, process in processes.items()}
         begun = time.perf_counter()
-        compute(store, range(len(store.blocks)), on_cluster.OnCluster(client), (),
-                block_s, interrupts, lambda _: None)
+        compute(store, on_cluster.OnCluster(client), (), block_s, interrupts, lambda _: None)
         wall = time.perf_counter() - begun
         busy_s = sum(one.wall_s for _, one in receipts(store, range(len(store.blocks))))
         return {
@@ -185,7 +186,8 @@ def main(*words):
     parser.add_argument("--waves", type=int, default=WAVES)
     parser.add_argument("--stored", type=int, nargs="*", default=[])
     options = parser.parse_args(words)
-    on_cluster.compute_blocks = simulated_blocks
+    on_cluster.on_worker = simulated_block
+    execution_status.close = lambda _store: None  # it has no chunks
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # a worker needs several
     with tempfile.TemporaryDirectory() as folder:

@@ -92,18 +92,19 @@ def suicide(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def compute_in(store, child):
+def compute_in(folder, child):
+    store = create_store(str(folder / "one.zarr"), PIPELINE, (2, 6))
     with child, Interrupts() as interrupts, Children(child, 1, at_once=True) as executor:
-        compute(store, range(len(store.blocks)), executor, (), 60, interrupts)
+        compute(store, executor, (), 60, interrupts)
 
 
 @pytest.mark.system
-def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
+def test_block_that_ends_its_process_each_time_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(executors, "MAX_ATTEMPTS", 2)
     monkeypatch.setattr(executors, "attempt", suicide)
     failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
-        compute_in(open_store(undisturbed), Child())
+        compute_in(tmp_path, Child())
 
 
 @pytest.mark.parametrize(("raised", "error", "reason"), [
@@ -112,10 +113,10 @@ def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch
     (StoreReplacedError("moved"), StoreReplacedError, "moved"),
     (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
 ])
-def test_block_that_fails_is_named(raised, error, reason, undisturbed, monkeypatch):
+def test_block_that_fails_is_named(raised, error, reason, tmp_path, monkeypatch):
     monkeypatch.setattr(executors, "compute_block", mock.Mock(side_effect=raised))
     with pytest.raises(error, match=reason):
-        compute_in(open_store(undisturbed), Here())
+        compute_in(tmp_path, Here())
 
 
 @pytest.mark.evidence

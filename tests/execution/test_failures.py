@@ -36,7 +36,6 @@ from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import FailedCell, begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import writing
 
 TRACEBACK = """Traceback (most recent call last):
   File "a.py", line 3, in f
@@ -231,9 +230,8 @@ def undisturbed(tmp_path_factory):
 def run_on(client, url):
     """Run the pipeline in blocks of one scene; return how many scenes failed."""
     store = create_store(str(url), FAULTY, (1,))
-    with writing(store.url, store.storage), Interrupts() as interrupts:
-        compute(store, range(len(store.blocks)), OnCluster(client), (), 600.0, interrupts)
-        close(store)
+    with Interrupts() as interrupts:
+        compute(store, OnCluster(client), (), 600.0, interrupts)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
 

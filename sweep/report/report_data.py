@@ -538,7 +538,7 @@ class Comparison:
             columns += PAIRED
             few = any(each.column is UNFLIPPED for pair in self.differences for each in pair)
             caption += (
-                f"; differences, ratios and verdict: {self.name} against each, on the same images"
+                f"; differences, ratios and verdict: {self.name} against each, trial by trial"
                 + "; rotation without flips where few poses differ by them" * few)
         return Table.of(caption, [*headings, *(each.heading for each in columns)],
                         list(zip(known.names, *cells, strict=True)), stub=len(headings))

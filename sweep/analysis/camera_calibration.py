@@ -16,7 +16,7 @@ import xarray as xr
 
 from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
 from sweep.analysis.intervals import DEVIATIONS, wilson
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import cf_attributes
@@ -111,7 +111,12 @@ def camera_calibrations(
     ...     print(error)
     no pipeline in the dataset's attributes: expected results as sweep.open returns them
     """
-    pipeline = _pipeline_of(results)
+    pipeline = stored_pipeline(results)
+    if pipeline is None:
+        raise DatasetError(
+            "no pipeline in the dataset's attributes: expected results as sweep.open returns them")
+    if not pipeline.shows_boards:
+        raise DatasetError("the scenes show no board: give kind = charuco or grid under [board]")
     counts = sorted({int(count) for count in views})
     if not counts or counts[0] < MIN_VIEWS:
         raise ArgumentError("views", list(views), f"expected numbers of at least {MIN_VIEWS}")
@@ -227,18 +232,6 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
         "position_rmse_m": ((calibrated["position_error_m"] ** 2).mean("set") ** 0.5).assign_attrs(
             cf_attributes("root mean square error of a target's position", "m")),
     }, attrs=calibrated.attrs)
-
-
-def _pipeline_of(results: xr.Dataset) -> Pipeline:
-    try:
-        pipeline = stored_pipeline(results)
-    except (KeyError, SweepError):
-        raise DatasetError(
-            "no pipeline in the dataset's attributes: expected results as sweep.open returns them"
-        ) from None
-    if not pipeline.shows_boards:
-        raise DatasetError("the scenes show no board: give kind = charuco or grid under [board]")
-    return pipeline
 
 
 def _views(

@@ -19,9 +19,8 @@ from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quant
 from sweep.analysis.estimator import INTERVAL, Bins, Columns, Count, Design, Mean, Output, Statistic
 from sweep.analysis.intervals import LEVEL, MIN_UNITS
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
-from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import label, plain, shown
@@ -582,7 +581,7 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
         [xr.concat([side["translation_error_m"], side["rotation_error_rad"]], "xyz").where(
             side["estimate"] == EstimateStatus.solved)] for side in sides],
         "xyz", scene, _distance, _turn)
-    changes = list(_fingerprint_differences(*map(dataset.fingerprint_of, (first, second))))
+    changes = list(_changes(dataset.fingerprint_of(first), dataset.fingerprint_of(second)))
     fingerprint = xr.DataArray(
         np.array([pair for _, *pair in changes], dtype=object).reshape(-1, 2),
         dims=("entry", "store"))
@@ -670,18 +669,20 @@ def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:
         dataset.require_poses(side)
         dataset.pose_arrays(side, ERROR_INPUTS)  # raises for the markers of boards
     require_pairs(first, second)
-    try:
-        ours, theirs = (_parameters(dataset.stored_pipeline(side)) for side in (first, second))
-    except (KeyError, SweepError):
-        return  # they were cut or joined: their coordinates have been compared
-    for name in sorted({*ours, *theirs}):
-        if ours.get(name) != theirs.get(name):
-            values = (plain(each.get(name, "not given")) for each in (ours, theirs))
-            raise DatasetError(f"not one pipeline: {name} is {' and '.join(values)}")
+    ours, theirs = map(_parameters, (first, second))
+    for name, *values in _changes(ours, theirs) if ours and theirs else ():
+        raise DatasetError(f"not one pipeline: {name} is {' and '.join(values)}")
 
 
-def _parameters(pipeline: Pipeline) -> dict[str, Any]:
-    """Return each parameter's value, distribution or values; of a file its content's digest."""
+def _parameters(results: xr.Dataset) -> dict[str, Any]:
+    """Return each parameter's value, distribution or values; of a file its content's digest.
+
+    Nothing of a dataset that was cut or joined: its coordinates are compared.
+    """
+    pipeline = dataset.stored_pipeline(results)
+    if pipeline is None:
+        return {}
+
     def content(value: Any) -> Any:
         return pipeline.files.get(value, value) if isinstance(value, str) else value
 
@@ -693,16 +694,17 @@ def _parameters(pipeline: Pipeline) -> dict[str, Any]:
     return {**fixed, **pipeline.distributions, **listed}
 
 
-def _fingerprint_differences(
-    first: Mapping[str, Any], second: Mapping[str, Any], *, prefix: str = ""
+def _changes(
+    first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield name and both values of each entry in which two fingerprints differ."""
+    """Yield name and both values of each entry in which nested mappings differ."""
     for key in sorted({*first, *second}):
         ours, theirs = first.get(key, {}), second.get(key, {})
         if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-            yield from _fingerprint_differences(ours, theirs, prefix=f"{prefix}{key}.")
+            yield from _changes(ours, theirs, f"{prefix}{key}.")
         elif ours != theirs:
-            yield f"{prefix}{key}", plain(ours or "none"), plain(theirs or "none")
+            old, new = (plain("none" if each == {} else each) for each in (ours, theirs))
+            yield f"{prefix}{key}", old, new
 
 
 # --------------------------------------------------------------------------------------------------

@@ -83,35 +83,23 @@ def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
     return fingerprint if isinstance(fingerprint, Mapping) else {}
 
 
-def pipeline_text(results: xr.Dataset) -> str:
-    """Return the text of the pipeline in a dataset's attributes; KeyError if they have none."""
-    return str(results.attrs["pipeline"])
-
-
-def stored_pipeline(results: xr.Dataset) -> Pipeline:
-    """Return the pipeline in a dataset's attributes, without its files and plug-ins.
-
-    Raises
-    ------
-    KeyError, SweepError
-        If they have none.
-    """
-    metadata = _run_metadata(results)
-    return Pipeline.from_text(
-        pipeline_text(results), files=fingerprint_of(results).get("files", {}),
-        plugins=recorded_plugins(metadata),
-    )
+def stored_pipeline(results: xr.Dataset) -> Pipeline | None:
+    """Return the pipeline in a dataset's attributes, without files and plug-ins; None without."""
+    try:
+        return Pipeline.from_text(
+            str(results.attrs["pipeline"]), files=fingerprint_of(results).get("files", {}),
+            plugins=recorded_plugins(_run_metadata(results)))
+    except (KeyError, SweepError):
+        return None
 
 
 def stopping_rule(results: xr.Dataset) -> StoppingRule | None:
     """Return the rule by which a dataset's sampling was stopped; None if it was not."""
-    try:
-        # To read a pipeline takes milliseconds.
-        if SEARCH not in pipeline_text(results):
-            return None
-        return stored_pipeline(results).stopping
-    except (KeyError, SweepError):
+    # To read a pipeline takes milliseconds.
+    if SEARCH not in str(results.attrs.get("pipeline")):
         return None
+    pipeline = stored_pipeline(results)
+    return None if pipeline is None else pipeline.stopping
 
 
 def is_sampling_stopped(results: xr.Dataset) -> bool:
@@ -228,11 +216,10 @@ def parameter_value(results: xr.Dataset, name: str) -> Any:
     """
     if name in results.coords:
         return results[name].reset_coords(drop=True)
-    try:
-        pipeline = stored_pipeline(results)
-    except (KeyError, SweepError):
-        raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
-                           "that has it") from None
+    pipeline = stored_pipeline(results)
+    if pipeline is None:
+        raise DatasetError(
+            f"{name}: not a coordinate, and the attributes hold no pipeline that has it")
     if pipeline.axis_of(name) is not None or name in pipeline.distributions:
         raise DatasetError(f"{name}: varies in this store, but the dataset lacks its coordinate")
     return pipeline.fixed.get(name, pipeline.parameters[name].default)
@@ -956,7 +943,7 @@ def sampling_text(results: xr.Dataset) -> str:
     """
     if not is_sampling_stopped(results):
         return ""
-    table = read_document(pipeline_text(results))[SEARCH]
+    table = read_document(str(results.attrs["pipeline"]))[SEARCH]
     keys = ", ".join(f"{key} = {shown(value)}" for key, value in table.items())
     return f"stopped by [{SEARCH}]: {keys}"
 

@@ -1117,14 +1117,9 @@ def bin_coordinates(results: xr.Dataset, edges: Edges) -> dict[str, Any]:
 # Statistics of all poses of a dataset, by group: the one way to a table.
 
 def aggregate(
-    results: xr.Dataset,
-    inputs: Mapping[str, xr.DataArray],
-    kept: Sequence[str],
-    statistics: Sequence[Statistic[ViewT]],
-    view: Callable[[Arrays], ViewT],
-    bins: Bins | None = None,
-    *,
-    stopped: bool | None = None,
+    results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str],
+    statistics: Sequence[Statistic[ViewT]], view: Callable[[Arrays], ViewT],
+    bins: Bins | None = None, *, stopped: bool | None = None,
 ) -> xr.Dataset:
     """Return the statistics of the poses of each combination of ``kept`` and of bins.
 

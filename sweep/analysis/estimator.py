@@ -24,19 +24,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from sweep.analysis.dataset import (
-    COMMON,
-    DRAWS,
-    INSIDE,
-    Poses,
-    common_trials,
-    component_sum,
-    is_fixed,
-    is_grid_axis,
-    is_sampling_stopped,
-    of_photographs,
-    replicate_order,
-)
+from sweep.analysis import dataset
+from sweep.analysis.dataset import COMMON, DRAWS, INSIDE, Poses, component_sum
 from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.draws import REPLICATES
@@ -1175,7 +1164,7 @@ def aggregates(
             for block in blocks), strict=True)])
     shape = (*(results.sizes[name] for name in kept), *(len(each) - 1 for each in edges.values()))
     coordinates = {name: value.variable for name, value in results.coords.items()
-                   if set(value.dims) <= set(kept) and not is_fixed(value)}
+                   if set(value.dims) <= set(kept) and not dataset.is_fixed(value)}
     every = zip(*found, strict=True)
     return [xr.Dataset({
         output.name: (
@@ -1197,20 +1186,20 @@ def arranged(
     stopped: bool | None = None,
 ) -> tuple[Arrays, Design]:
     """Return a dataset's columns (groups, cells, draws, settings, ...), and the draws' design."""
-    stopped = is_sampling_stopped(results) if stopped is None else stopped
+    stopped = dataset.is_sampling_stopped(results) if stopped is None else stopped
     if stopped:
-        inputs = {COMMON: common_trials(results, inputs, kept), **inputs}
+        inputs = {COMMON: dataset.common_trials(results, inputs, kept), **inputs}
     sizes = {name: results.sizes[name] for name in kept}
     for array in inputs.values():
         sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}
     pooled = [name for name in sizes if name not in kept]
     draws = [name for name in pooled if name == DRAWS]
-    cells = [name for name in pooled if name != DRAWS and is_grid_axis(name, results)]
+    cells = [name for name in pooled if name != DRAWS and dataset.is_grid_axis(name, results)]
     settings = [name for name in pooled if name not in (*cells, *draws)]
     axes = {"groups": kept, "cells": cells, "draws": draws, "settings": settings}
-    order = replicate_order(results, draws)
+    order = dataset.replicate_order(results, draws)
     unit = Unit.replicate if order is not None else (
-        Unit.photograph if of_photographs(results) else Unit.trial)
+        Unit.photograph if dataset.of_photographs(results) else Unit.trial)
     points = math.prod(sizes[name] for name in settings)
     return ({name: _column(array, axes, sizes, order) for name, array in inputs.items()},
             Design(unit, points, stopped))

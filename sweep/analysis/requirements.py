@@ -587,25 +587,22 @@ def draws_needed(
     share
         Share of the error probability that a decision may spend.
     """
-    found = [xr.apply_ufunc(
-        np.vectorize(functools.partial(_needed, each, each.what.level(share)),
-                     otypes=[float]),
-        cells["value"].where(cells["decision"] == Decision.undecided), cells["low"], cells["high"],
-        cells["draws"].astype(np.float64),
-        (cells["solved"] / cells["looked_for"]).where(cells["looked_for"] > 0),
-    ) for each, cells in zip(required, (
-        table.isel(requirement=k) for k in range(len(required))), strict=True)]
-    needed: xr.DataArray = stacked(found, "requirement")
-    return needed.assign_attrs(
+    needed: xr.DataArray = xr.apply_ufunc(
+        np.vectorize(functools.partial(_needed, share), otypes=[float]),
+        xr.DataArray(np.array(required, dtype=object), dims="requirement"),
+        table["value"].where(table["decision"] == Decision.undecided), table["low"], table["high"],
+        table["draws"].astype(np.float64),
+        (table["solved"] / table["looked_for"]).where(table["looked_for"] > 0))
+    return needed.transpose(..., "requirement").assign_attrs(
         long_name="draws that would decide it, if the value stays", units="1")
 
 
 def _needed(
-    requirement: Requirement, level: float, value: float, low: float, high: float, draws: float,
+    share: float, requirement: Requirement, value: float, low: float, high: float, draws: float,
     solved: float,
 ) -> float:
     """Return the draws that one undecided requirement needs; ``solved`` is a share of poses."""
-    what, limit = requirement.what, requirement.limit
+    what, limit, level = requirement.what, requirement.limit, requirement.what.level(share)
     if math.isnan(value):
         return math.nan
     if what.is_rate:
@@ -661,13 +658,10 @@ def _rounded(count: float) -> float:
 
 def quantity_faults(texts: Iterable[str], names: Iterable[str]) -> list[str]:
     """Return a line for each fault of a pipeline's requirements and of its precisions' names."""
-    lines = [f"require.all = {shown(text)}: {problem}"
-             for text, problem in read_requirements(texts)[1]]
-    try:
-        wanted_precisions(dict.fromkeys(names, 0.5))
-    except ValueError as error:
-        lines += [f"search.precision.{line}" for line in str(error).splitlines()]
-    return lines
+    return [*(f"require.all = {shown(text)}: {problem}"
+              for text, problem in read_requirements(texts)[1]),
+            *(f"search.precision.{line}"
+              for line in wanted_precisions(dict.fromkeys(names, 0.5))[1])]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -967,6 +961,8 @@ LIMITS: dict[str, tuple[Any, ...]] = {
     "settled": ("whether the interval is a single value of the grid", "1"),
     "decision": ("whether all requirements are met", "", Decision),
     "keeps": ("whether all values keep their limits", "1"),
+    "trials": ("trials of a cell, the most at this value", "1"),
+    "poses": ("scenes that were computed, of all values", "1"),
 }
 
 
@@ -1071,24 +1067,22 @@ def requirement_limits(
     kept = [str(dim) for dim in table["decision"].dims if dim not in inner]
     rows = [_limit(part.transpose(along, ...), along, together, upwards=upwards)
             for _, part in each_cell(table.isel({along: order}), kept)]
-    variables, units = {}, results[along].attrs.get("units", "")
-    for name, (meaning, own, *flags) in LIMITS.items():
-        column = np.array([row.get(name, np.nan) for row in rows])
+    columns = {}
+    for name in rows[0]:
+        column = np.array([row[name] for row in rows])
         rest = column.shape[1:]  # along the axis, if it has values there
-        variables[name] = (
-            [*kept, along][: len(kept) + len(rest)],
-            column.reshape([*(table.sizes[dim] for dim in kept), *rest]),
-            cf_attributes(meaning.format(along), units if own is None else own, *flags))
-    found = xr.Dataset(variables).isel({along: np.argsort(order)})
+        columns[name] = ([*kept, along][: len(kept) + len(rest)],
+                         column.reshape([*(table.sizes[dim] for dim in kept), *rest]))
     computed = dataset.computed_scenes(results)
     cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
     trials = computed.sum(DRAWS).compute()
-    return found.assign_coords(table.drop_dims([*together, "requirement"]).coords).assign(
-        trials=trials.max(cells).assign_attrs(
-            long_name="trials of a cell, the most at this value", units="1"),
-        poses=trials.sum([*cells, along]).assign_attrs(
-            long_name="scenes that were computed, of all values", units="1"),
-    ).assign_attrs(
+    found = xr.Dataset(columns).isel({along: np.argsort(order)}).assign(
+        trials=trials.max(cells), poses=trials.sum([*cells, along]))
+    units = results[along].attrs.get("units", "")
+    for name, (meaning, own, *flags) in LIMITS.items():
+        found[name].attrs = cf_attributes(
+            meaning.format(along), units if own is None else own, *flags)
+    return found.assign_coords(table.drop_dims([*together, "requirement"]).coords).assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
         configuration_dims=table.attrs["configuration_dims"],
         per=[*names], at_all=together, require=[*require])
@@ -1132,31 +1126,31 @@ def _limit(
 ) -> dict[str, Any]:
     """Return the limit of one condition, a part of the table of `decide`, from easy to hard.
 
-    It has the variables of `LIMITS`; those that are left out are NaN.
+    It has the variables of `LIMITS` but those of trials.
     """
     values = part[along].to_numpy().astype(np.float64)
     decision, keeps = of_values(part["decision"].to_numpy(), part["keeps"].to_numpy())
     judged, index = decision != Decision.not_applicable, np.arange(len(values))
-    row = {"decision": decision, "keeps": keeps & judged, "settled": False, "limited_by": "",
-           "fails_where": "", "reach": np.uint8(Reach.not_run)}
+    row = dict.fromkeys(("value", "low", "high", "start", "fails_at", "farthest_beyond",
+                         "failing_value", "met_beyond"), np.nan) | {
+        "limited_by": "", "fails_where": "", "decision": decision, "keeps": keeps & judged,
+        "settled": False, "reach": np.uint8(Reach.not_run)}
     if not judged.any():
         return row
     # Where the easiest values fail, the limit is the end of the longest run of values that do not.
-    run = met_run(keeps, judged)
-    gaps = np.flatnonzero(judged & ~keeps & (index < (run[0] if run else 0)))
-    start = int(gaps[-1]) + 1 if gaps.size else 0
-    found = course(decision, keeps, start)
+    start = kept_from(keeps, judged)
+    found = course(decision, keeps, start or 0)
     none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
-    met, possible, value = (none if k < 0 else float(values[k])
-                            for k in (found.met, found.possible, found.kept))
-    if (decision[start:] != Decision.not_met).all():
+    met, possible = (values[k] if k >= 0 else none for k in (found.met, found.possible))
+    if (decision[start or 0 :] != Decision.not_met).all():
         possible = beyond
     low, high = sorted((met, possible))
-    row |= {"value": value if np.isfinite(value) else np.nan, "low": low, "high": high,
-            "start": float(values[run[0]]) if run else np.nan, "met_beyond": 0.0,
-            "settled": low == high, "reach": np.uint8(
-                Reach.never if run is None else Reach.within if gaps.size else
-                Reach.always if found.failing == len(values) else Reach.found)}
+    row |= {"low": low, "high": high, "settled": low == high, "met_beyond": 0.0,
+            "reach": np.uint8(Reach.never)}
+    if start is not None:
+        row |= {"start": values[start], "value": values[found.kept], "reach": np.uint8(
+            Reach.within if judged[:start].any() else
+            Reach.always if found.failing == len(values) else Reach.found)}
     if found.failing == len(values):
         return row
     again = np.flatnonzero(judged & keeps & (index > found.failing))
@@ -1164,23 +1158,21 @@ def _limit(
     failing = ~cell["keeps"] & (cell["decision"] != Decision.not_applicable)
     worst = dataset.largest_cell(cell, excess_of(cell).where(failing, -np.inf))
     return row | {
-        "fails_at": float(values[found.failing]), "met_beyond": float(len(again)),
-        "farthest_beyond": float(values[again[-1]]) if again.size else np.nan,
+        "fails_at": values[found.failing], "met_beyond": float(len(again)),
+        "farthest_beyond": values[again[-1]] if again.size else np.nan,
         "limited_by": str(worst["requirement"].item()),
         "fails_where": described({name: worst[name].item() for name in together}, " = "),
         "failing_value": float(worst["value"])}
 
 
-def met_run(
-    keeps: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]
-) -> tuple[int, int] | None:
-    """Return the first and the last index of the run of values that are kept, without a gap.
+def kept_from(keeps: Masks, judged: Masks) -> int | None:
+    """Return the first index of the run of values that are kept, without a gap.
 
     It is that from the first judged value on, or, if that is not kept, the longest; of several the
     first. Values that are not judged (n,) neither count nor make a gap. None without any.
 
-    >>> met_run(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
-    (3, 4)
+    >>> kept_from(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
+    3
     """
     at = np.flatnonzero(judged)
     # Runs begin and end where the mask changes.
@@ -1188,8 +1180,8 @@ def met_run(
     if not edges.size:
         return None
     runs = edges.reshape(-1, 2)
-    first, end = runs[0] if runs[0, 0] == 0 else runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    return int(at[first]), int(at[end - 1])
+    longest = 0 if runs[0, 0] == 0 else int(np.argmax(runs[:, 1] - runs[:, 0]))
+    return int(at[runs[longest, 0]])
 
 
 @describes
@@ -1506,11 +1498,6 @@ class WantedPrecision:
         bias = self.what.name
         return requirables()[bias.replace("_bias_", "_sd_")] if "_bias_" in bias else None
 
-    def statistics(self) -> list[Statistic[Poses]]:
-        """Return the statistics that must be computed."""
-        parts = self.what.statistics(LEVEL)
-        return parts + self.spread.statistics(LEVEL)[:1] if self.spread else parts
-
     @property
     def least_draws(self) -> int:
         """Draws with a number below which it is useless to go on.
@@ -1538,7 +1525,7 @@ class WantedPrecision:
         Parameters
         ----------
         table
-            The variables of `statistics`; ``looked_for`` and ``run``: poses that were.
+            The statistics of the quantity; ``looked_for`` and ``run``: poses that were.
         total
             Poses that all trials would be.
         """
@@ -1572,20 +1559,15 @@ class WantedPrecision:
                  "whether the interval is as narrow as was wanted", "", Reached))})
 
 
-def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
-    """Return the precisions that names and half-widths ask for.
+def wanted_precisions(wanted: Mapping[str, float]) -> tuple[list[WantedPrecision], list[str]]:
+    """Return the precisions that names and half-widths ask for, and lines of faults.
 
-    Names are as in requirements (`sweep.analysis.requirements.parse_requirements`).
-
-    Raises
-    ------
-    ValueError
-        One line for each name that does not exist, each half-width that cannot be, and each
-        quantity that is named twice.
+    Names are as in requirements (`sweep.analysis.requirements.parse_requirements`). Faults are
+    names that do not exist or mean what another one means, and half-widths that cannot be.
 
     Examples
     --------
-    >>> [(each.what.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
+    >>> [(each.what.name, each.half_width) for each in wanted_precisions({"detection": 0.02})[0]]
     [('detection_rate', 0.02)]
     """
     precisions: dict[str, WantedPrecision] = {}
@@ -1600,9 +1582,7 @@ def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...
             precisions[what.name] = WantedPrecision(what, float(half_width))
         except ValueError as error:
             faults.append(f"{name}: {error}")
-    if faults:
-        raise ValueError("\n".join(faults))
-    return tuple(precisions.values())
+    return [*precisions.values()], faults
 
 
 @describes
@@ -1658,17 +1638,16 @@ def precision_reached(
     ['reached', 'not_reached', 'reached']
     """
     rule = dataset.stopping_rule(results)
-    if wanted is None:
-        if rule is None or not rule.precision:
-            raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
-                                'give half-widths, such as {"detection_rate": 0.02}')
-        wanted = dict(rule.precision)
+    own = {} if rule is None else dict(rule.precision)
+    wanted = own if wanted is None else wanted
+    if not wanted:
+        raise ArgumentError("wanted", None, "this store's pipeline searches no precision; "
+                            'give half-widths, such as {"detection_rate": 0.02}')
     if per is None:
-        per = rule.per if rule is not None and rule.precision else ()
-    try:
-        precisions = wanted_precisions(wanted)
-    except ValueError as error:
-        raise ArgumentError("wanted", wanted, str(error)) from None
+        per = rule.per if rule is not None and own else ()
+    precisions, faults = wanted_precisions(wanted)
+    if faults:
+        raise ArgumentError("wanted", wanted, "\n".join(faults))
     configuration = dataset.configuration_axes(results)
     kept = dataset.kept_dimensions(results, (*configuration, *as_names(per)))
     poses, *tables = aggregates(
@@ -1676,7 +1655,8 @@ def precision_reached(
             [Count(*LOOKED_FOR, lambda poses: poses.looked_for),
              Count("run", "poses that were run", lambda poses: poses.run),
              Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run))],
-            *(each.statistics() for each in precisions),
+            *(each.what.statistics(LEVEL)
+              + (each.spread.statistics(LEVEL)[:1] if each.spread else []) for each in precisions),
         ], Poses, stopped=True)
     total = poses["poses"]
     if max_trials is not None:
@@ -1687,10 +1667,9 @@ def precision_reached(
     settled = (~needs.any([*configuration, "quantity"])).assign_attrs(
         long_name="whether no configuration and quantity needs more trials", units="1")
     return out.assign(settled=settled, run=poses["run"], poses=poses["poses"]).assign_coords(
-        {name: ("quantity", listed) for name, listed in (
-            ("quantity", [each.what.name for each in precisions]),
-            ("wanted", [each.half_width for each in precisions]),
-            # The quantity of which the half-width is a share; none of a rate.
-            ("relative_to", ["" if each.what.is_rate else "RMSE" if each.spread else "value"
-                             for each in precisions]))},
+        quantity=("quantity", [each.what.name for each in precisions]),
+        wanted=("quantity", [each.half_width for each in precisions]),
+        # The quantity of which the half-width is a share; none of a rate.
+        relative_to=("quantity", ["" if each.what.is_rate else "RMSE" if each.spread else "value"
+                                  for each in precisions]),
     ).assign_attrs(configuration_dims=configuration)

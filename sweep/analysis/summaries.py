@@ -294,18 +294,14 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         stats.rankdata, share, kwargs={"method": "min", "axis": -1, "nan_policy": "omit"},
         input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]]).astype(np.float64)
     below = table["detection_rate"] < expected_rate
-    meanings = {
-        "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),
-        "p_value": (p_value, "chance of a rate so far from it if they were alike"),
-        "p_adjusted": (adjusted, "the same for the whole table (Holm)"),
-        "weak": (below & (adjusted < SIGNIFICANCE),
-                 "whether the rate is below the expected one, p_adjusted < 0.05"),
-        "rank": (rank, "1 has the lowest share of its expected rate"),
-    }
-    return table.assign({
-        name: array.assign_attrs(long_name=meaning, units="1")
-        for name, (array, meaning) in meanings.items()
-    })
+    return table.assign({name: array.assign_attrs(long_name=meaning, units="1")
+                         for name, array, meaning in (
+        ("expected_rate", expected_rate, "detection rate if all IDs were alike in each cell"),
+        ("p_value", p_value, "chance of a rate so far from it if they were alike"),
+        ("p_adjusted", adjusted, "the same for the whole table (Holm)"),
+        ("weak", below & (adjusted < SIGNIFICANCE),
+         "whether the rate is below the expected one, p_adjusted < 0.05"),
+        ("rank", rank, "1 has the lowest share of its expected rate"))})
 
 
 def hypergeometric_moments(

@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any, cast
 
 import numpy as np
@@ -122,20 +121,17 @@ class Waves:
             for name, length, extent in zip(names, blocks.lengths, blocks.extents, strict=True))
         return Waves(blocks, Blocks(blocks.lengths, extents), trial, rule.ends)
 
-    def numbers(self, group: int, first: int, last: int | None = None) -> Iterator[int]:
-        """Yield the numbers of a group's blocks in the waves ``first`` to ``last``, from 0.
+    def numbers(self, group: int, first: int, last: int | None = None) -> list[int]:
+        """Return the numbers of a group's blocks in the waves ``first`` to ``last``, from 0.
 
         ``last`` is ``first`` if it is left out; earlier trials come first.
         """
         start = self.ends[first - 1] if first else 0
-        stop = self.ends[first if last is None else last]
-        box = self.trials(self.groups[group], start, stop)
-        ranges = [range(start // extent, -(-stop // extent)) for start, stop, extent in zip(
-            box.starts, box.stops, self.blocks.extents, strict=True)]
-        for trial in ranges[self.trial]:
-            ranges[self.trial] = range(trial, trial + 1)
-            for index in product(*ranges):
-                yield int(np.ravel_multi_index(index, self.blocks.counts))
+        box = self.trials(self.groups[group], start, self.ends[first if last is None else last])
+        places = np.ix_(*(np.arange(start // extent, -(-stop // extent)) for start, stop, extent in
+                          zip(box.starts, box.stops, self.blocks.extents, strict=True)))
+        numbers = np.moveaxis(np.ravel_multi_index(places, self.blocks.counts), self.trial, 0)
+        return [int(number) for number in numbers.flat]
 
     def trials(self, box: Block, start: int, stop: int) -> Block:
         """Return a box with other trials."""

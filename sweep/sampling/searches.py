@@ -96,8 +96,7 @@ def wanted_values(keeps: Masks, met: Masks, not_met: Masks, judged: Masks) -> Ma
     at = np.flatnonzero(judged)
     keeps, met, not_met = keeps[at], met[at], not_met[at]
     index = np.arange(len(at))
-    run = decisions.met_run(keeps, np.ones(len(at), dtype=bool))
-    start = run[0] if run else 0
+    start = decisions.kept_from(keeps, np.ones(len(at), dtype=bool)) or 0
     ends = np.flatnonzero(not_met & (index >= start))
     end = ends[0] if len(ends) else len(at)
     last = np.flatnonzero(keeps & (index < end))
@@ -246,21 +245,13 @@ def _choice(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the cells that decide the smallest, or the cheapest, choice."""
     shares = choice_shares(pipeline, rule)
     required = decisions.parse_requirements(rule.requirements)
-    lines = [
-        _too_few(pipeline, rule, least, f"fewer cannot show {each.text} with "
-                 f"{100 * decisions.CONFIDENCE:g} % confidence, even if all meet it")
-        for each in required if (least := least_draws(each, shares.met))]
-    if any(lines):
-        raise refusal(list(filter(None, lines)))
+    _check_trials(pipeline, rule, [
+        (least_draws(each, shares.met), (
+            f"fewer cannot show {each.text} with {100 * decisions.CONFIDENCE:g} % confidence, "
+            "even if all meet it"))
+        for each in required])
     return [each.what for each in required], lambda dataset: decisions.choice_needed(
         decisions.choice_table(dataset, rule, shares), rule)
-
-
-def store_answers(
-    results: xr.Dataset, pipeline: Pipeline, rule: StoppingRule
-) -> list[decisions.Answer]:
-    """Return the answers of a choice from a store's dataset, as the search decided last."""
-    return decisions.answers(results, rule, choice_shares(pipeline, rule))
 
 
 # A condition is judged by the intervals that the analysis shows of it. It is settled when every
@@ -271,19 +262,21 @@ def store_answers(
 def _precision(pipeline: Pipeline, rule: StoppingRule) -> Search:
     """Return a search of the conditions at which an interval is wider than was wanted."""
     widths = dict(rule.precision)
-    wanted = decisions.wanted_precisions(widths)
-    lines = [_too_few(pipeline, rule, each.fewest_draws, "with fewer no interval of "
-                      f"{each.what.name} has a half-width of {each.half_width:g}")
-             for each in wanted]
-    if any(lines):
-        raise refusal(list(filter(None, lines)))
+    wanted, _ = decisions.wanted_precisions(widths)
+    _check_trials(pipeline, rule, [
+        (each.fewest_draws, (f"with fewer no interval of {each.what.name} has a half-width of "
+                             f"{each.half_width:g}")) for each in wanted])
     return [each.what for each in wanted], lambda dataset: ~decisions.precision_reached(
         dataset, widths, rule.per, rule.max_trials)["settled"]
 
 
-def _too_few(pipeline: Pipeline, rule: StoppingRule, draws: int, why: str) -> str:
-    """Return the fault of ``max_trials`` that are fewer than some draws; empty without one."""
-    least = math.ceil(draws / pooled_cells(pipeline, rule))
-    return "" if least <= rule.max_trials else (
-        f"{pipeline.source}: {SEARCH}.{MAX_TRIALS} = {rule.max_trials}: expected at least "
-        f"{least:,}: {why}")
+def _check_trials(
+    pipeline: Pipeline, rule: StoppingRule, needed: Iterable[tuple[int, str]]
+) -> None:
+    """Raise PipelineError if ``max_trials`` are fewer than needed draws, each with the reason."""
+    pooled = pooled_cells(pipeline, rule)
+    lines = [f"{pipeline.source}: {SEARCH}.{MAX_TRIALS} = {rule.max_trials}: expected at least "
+             f"{least:,}: {why}" for draws, why in needed
+             if (least := math.ceil(draws / pooled)) > rule.max_trials]
+    if lines:
+        raise refusal(lines)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sweep.analysis.dataset import DRAWS, computed_scenes
-from sweep.analysis.requirements import Answer, Decision
+from sweep.analysis.requirements import Answer, Decision, answers
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
 from sweep.experiment.document import SEARCH
@@ -22,7 +22,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import CHOICES, StoppingRule
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
-from sweep.sampling.searches import product_of, store_answers
+from sweep.sampling.searches import choice_shares, product_of
 from sweep.store.lifecycle import open_dataset
 from sweep.tradeoff.costs import measure, median_interval, sample_scenes
 from sweep.tradeoff.pareto import pareto_front
@@ -239,7 +239,7 @@ def search_choice(
     rule = chosen_by(pipeline)
     summary = execute(pipeline, store, progress=progress, child=child, **options)
     results = open_dataset(summary.store)
-    found = tuple(store_answers(results, pipeline, rule))
+    found = tuple(answers(results, rule, choice_shares(pipeline, rule)))
     costs: Sequence[Cost | None] = [None] * len(found)
     if len(found) > 1 or pipeline.budget_ms is not None:
         costs = choice_costs(

@@ -7,13 +7,13 @@ import pytest
 
 from support.searches import DOCUMENT, block_of, flags_of, needed_by
 from support.small_datasets import perfect
-from sweep.analysis.requirements import Decision, ErrorShares, choice_needed, choice_table
+from sweep.analysis.requirements import Decision, ErrorShares, answers, choice_needed, choice_table
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report import findings as size_lines
 from sweep.sampling.rules import make_rule
-from sweep.sampling.searches import group_dataset, store_answers
+from sweep.sampling.searches import choice_shares, group_dataset
 from sweep.tradeoff import choice_search
 
 
@@ -90,7 +90,7 @@ def test_answers_name_the_next_size_and_what_it_fails_by():
     rates[1] = [[1.0, 1.0], [0.2, 1.0]]
     flags = found_at(rates, 400, np.random.default_rng(2))
     results = group_dataset(pipeline, block_of(flags), flags)
-    found = store_answers(results, pipeline, pipeline.stopping)
+    found = answers(results, pipeline.stopping, choice_shares(pipeline, pipeline.stopping))
     by = {tuple(each.alternative.values()): each for each in found}
     assert list(by) == [(dictionary, solver) for dictionary in ("DICT_4X4_50", "DICT_6X6_50")
                         for solver in ("ippe", "iterative")]

@@ -100,7 +100,7 @@ def test_a_rate_is_too_rare_where_all_trials_could_give_enough(most, reached):
 
 @pytest.mark.parametrize("width", [0.49, 0.05, 0.01])
 def test_no_fewer_draws_than_are_told_make_an_interval_as_narrow(width):
-    fewest = wanted_precisions({"detection_rate": width})[0].fewest_draws
+    fewest = wanted_precisions({"detection_rate": width})[0][0].fewest_draws
     widths = [clopper_pearson(0, n, stopped_level(LEVEL))[1] / 2 for n in (fewest - 1, fewest)]
     assert widths[1] <= width < widths[0]
-    assert wanted_precisions({"rotation_rmse_deg": width})[0].fewest_draws == 450
+    assert wanted_precisions({"rotation_rmse_deg": width})[0][0].fewest_draws == 450

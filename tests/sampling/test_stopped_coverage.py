@@ -103,7 +103,7 @@ def test_intervals_with_which_sampling_stops_cover_the_truth(
         axes = {{ azimuth_deg = {{ linspace = [0, 300, {REPETITIONS}] }} }}
         search = {{ precision = {{ {name} = {width} }}, max_trials = {most} }}
     """)
-    rule, wanted = make_rule(pipeline), wanted_precisions({name: width})[0]
+    rule, wanted = make_rule(pipeline), wanted_precisions({name: width})[0][0]
     values = {"true_tvec_m": np.broadcast_to([0.0, 0.0, 1.0], (REPETITIONS, most, 3)),
               **draw(np.random.default_rng(20), (REPETITIONS, most))}
     left, held = np.arange(REPETITIONS), 0

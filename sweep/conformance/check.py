@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, MachineFaultError, PipelineError, PluginError, SweepError
+from sweep.errors import ArgumentError, PipelineError, PluginError
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, detections_of, scenes_at
@@ -383,9 +383,7 @@ def check_plugin(
             try:
                 findings[check] = child.call(
                     _next, number, plugin.kind, pipeline, limit_s=time_limit_s)
-            except MachineFaultError:
-                raise
-            except (ChildError, SweepError) as error:
+            except (ChildError, PluginError) as error:
                 line = str(error).strip().splitlines()[-1]
                 if isinstance(error, ChildDiedError):
                     line = f"the call ended by {line}"

@@ -222,12 +222,10 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
             found = entry.load()
         if entry.dist is not None and entry.dist.name != OWN_DISTRIBUTION:
             versions[entry.dist.name] = entry.dist.version
-    if isinstance(found, Plugin) or not callable(found) or kind == "effect":
-        if not isinstance(found, record):
-            raise PluginError(
-                f"a record {record.__name__}, not a value of type {type(found).__name__}")
-    else:
+    if callable(found) and not isinstance(found, Plugin) and kind != "effect":
         found = record(**{record.function: found})
+    if not isinstance(found, record):
+        raise PluginError(f"a record {record.__name__}, not a value of type {type(found).__name__}")
     needed = found.distribution
     for distribution in [needed] * bool(needed) if isinstance(needed, str) else needed:
         try:

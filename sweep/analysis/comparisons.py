@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import special
 
 from sweep.analysis import dataset, estimator, intervals
 from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quantity, axes_of
@@ -33,9 +34,6 @@ from sweep.typing import Floats, Integers, Masks
 #: Variables that are the same for both poses of a pair.
 TRUTH = ("true_tvec_m", "true_rvec")
 
-#: Name of the mask of the pairs whose truth differs.
-DIFFERING = "differing"
-
 #: Part of the name of the first configuration's mean absolute error.
 OLDER = "older"
 
@@ -51,7 +49,6 @@ class Pair:
 
     def __init__(self, arrays: estimator.Arrays) -> None:
         self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
-        self._arrays = arrays
 
     @property
     def draws(self) -> Masks:
@@ -66,7 +63,8 @@ class Pair:
     @property
     def differing(self) -> Masks:
         """Poses whose truth differs."""
-        return self._arrays[DIFFERING]
+        return functools.reduce(operator.or_, (
+            (self.first[name] != self.second[name]).any(axis=-1) for name in TRUTH))
 
     @property
     def both_solved(self) -> Masks:
@@ -198,11 +196,8 @@ def paired_tables(
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
-    inputs = paired_arrays(first, second, *ERROR_INPUTS, *(
+    inputs = paired_arrays(first, second, *ERROR_INPUTS, *TRUTH, *(
         name for quantity in quantities for name in quantity.inputs))
-    inputs[DIFFERING] = sum(
-        ((first[name] != second[name]).any("xyz").reset_coords(drop=True)
-         for name in TRUTH if name in first and name in second), xr.DataArray(False))
     statistics: list[PairStatistic] = [
         RateDifference("detection", "detected", lambda poses: poses.detected),
         RateDifference("solved", "solved", lambda poses: poses.solved),
@@ -227,8 +222,10 @@ def paired_tables(
 class RateDifference(Statistic[Pair]):
     """The difference of a rate between both, second minus first, and the pairs that it is of.
 
-    The interval is Newcombe's; the p-value that of McNemar's test. The name is the rate's, the
-    meaning the word for the poses that it counts.
+    The interval: Newcombe, Statistics in Medicine 17 (1998), pages 2635-2650, method 10, with the
+    continuity correction of the correlation; of pairs that are worth fewer draws it is that of so
+    many. The p-value is McNemar's, the exact binomial test of the discordant pairs. Both are NaN if
+    no cell has two draws. The name is the rate's, the meaning the word for poses that it counts.
     """
 
     reached: Callable[[Poses], Masks]
@@ -251,9 +248,33 @@ class RateDifference(Statistic[Pair]):
                 first & second, first & ~second, ~first & second, ~first & ~second, True)]
 
         *cases, compared = map(estimator.Sample, columns.by_draw(pairs))
-        counts = [each.n for each in cases]
-        return [*counts, *estimator.newcombe_and_mcnemar(
-            counts, compared.draws, compared.drawn, design.level(self.level))]
+        both, first, second, neither = counts = [each.n for each in cases]
+        n, draws, level = compared.n, compared.draws, design.level(self.level)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = draws / np.maximum(n, 1)
+            rates = [(both + one) / n for one in (second, first)]
+            ends = [estimator.outward(intervals.wilson, both + one, n, draws, level)
+                    for one in (second, first)]
+            margins = ((both + first) * (second + neither)).astype(np.float64) * (
+                (both + second) * (first + neither))
+            cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
+            # Of counts scaled to draws.
+            corrected = np.maximum(cross * scale**2 - draws / 2, 0.0)
+            lessened = np.where(cross > 0, corrected, cross * scale**2)
+            correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
+
+            def reach(up: Floats, down: Floats) -> Floats:
+                squares = up**2 - 2 * correlation * up * down + down**2
+                return np.sqrt(np.maximum(squares, 0.0))
+
+            difference = rates[0] - rates[1]
+            low = difference - reach(rates[0] - ends[0][0], ends[1][1] - rates[1])
+            high = difference + reach(ends[0][1] - rates[0], rates[1] - ends[1][0])
+        _, fewer = estimator.scaled_to_draws(np.minimum(first, second), n, draws)
+        discordant = np.maximum(estimator.scaled_to_draws(first + second, n, draws)[0], fewer)
+        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
+        return [*counts, difference, *(
+            np.where(compared.drawn, each, np.nan) for each in (low, high, p_value))]
 
 
 def _differences(quantity: Quantity) -> list[PairStatistic]:
@@ -1087,7 +1108,7 @@ def simulation_gap(
         outputs = estimator.with_interval(f"{each.name}_gap", f"{words}: {each.meaning}",
                                 "1" if each.ratio else each.units)
         with np.errstate(divide="ignore", invalid="ignore"):
-            gaps |= {output.name: array.assign_attrs(output.attributes())
+            gaps |= {output.name: array.assign_attrs(cf_attributes(output.meaning, output.units))
                      for output, array in zip(outputs, each.gap(*tables), strict=True)}
     both = xr.concat(tables, "source", coords="minimal", compat="override", join="override")
     return both.drop_vars([

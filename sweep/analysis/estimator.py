@@ -459,10 +459,6 @@ class Output(NamedTuple):
     dtype: str = "f8"
     dims: tuple[str, ...] = ()
 
-    def attributes(self) -> dict[str, Any]:
-        """Return its attributes."""
-        return cf_attributes(self.meaning, self.units)
-
 
 #: Endings of names, of a value and of its interval's ends, with what meanings begin with.
 INTERVAL = {"": "", "_low": "lower end of the 95 % interval: ",
@@ -600,45 +596,6 @@ def outward(
     """
     fewest, most = scaled_to_draws(hits, n, draws)
     return interval(fewest, draws, level)[0], interval(most, draws, level)[1]
-
-
-def newcombe_and_mcnemar(
-    counts: Sequence[Integers], draws: Integers, drawn: Masks, level: float = LEVEL
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the difference of two paired rates, its interval's ends, and McNemar's p-value.
-
-    ``counts`` are of the pairs of which both, the first alone, the second alone, and neither are
-    hits. They are scaled to ``draws`` if these are fewer; without ``drawn`` the interval and the
-    p-value are NaN.
-    Newcombe, Statistics in Medicine 17 (1998), pages 2635-2650, method 10, with the continuity
-    correction of the correlation; the test is the exact binomial one of the discordant pairs.
-    """
-    both, first, second, neither = counts
-    n = both + first + second + neither
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = draws / np.maximum(n, 1)
-        rates = [(both + one) / n for one in (second, first)]
-        ends = [outward(wilson, both + one, n, draws, level) for one in (second, first)]
-        margins = ((both + first) * (second + neither)).astype(np.float64) * (
-            (both + second) * (first + neither))
-        cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
-        # Of counts scaled to draws.
-        corrected = np.maximum(cross * scale**2 - draws / 2, 0.0)
-        lessened = np.where(cross > 0, corrected, cross * scale**2)
-        correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
-
-        def reach(up: Floats, down: Floats) -> Floats:
-            squares = up**2 - 2 * correlation * up * down + down**2
-            return np.sqrt(np.maximum(squares, 0.0))
-
-        difference = rates[0] - rates[1]
-        low = difference - reach(rates[0] - ends[0][0], ends[1][1] - rates[1])
-        high = difference + reach(ends[0][1] - rates[0], rates[1] - ends[1][0])
-        _, fewer = scaled_to_draws(np.minimum(first, second), n, draws)
-        discordant = np.maximum(scaled_to_draws(first + second, n, draws)[0], fewer)
-        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
-    low, high, p_value = (np.where(drawn, each, np.nan) for each in (low, high, p_value))
-    return difference, low, high, p_value
 
 
 # --------------------------------------------------------------------------------------------------
@@ -1170,7 +1127,7 @@ def aggregates(
         output.name: (
             (*kept, *edges, *output.dims), np.stack(arrays, axis=1).reshape(
                 (*shape, *arrays[0].shape[1:])).astype(output.dtype),
-            output.attributes())
+            cf_attributes(output.meaning, output.units))
         for statistic in some for output, arrays in zip(statistic.outputs(), every, strict=False)
     }, coordinates).assign_coords(bin_coordinates(results, edges)) for some in sets]
 

@@ -27,11 +27,11 @@ def pose_errors(model, x, y, z, viewing_angle_deg, side_px=None):
         side_px = (model["side_px_times_distance_m"] or math.nan) / (z or math.nan)
     u = [math.log(value) if value > 0 else math.nan for value in (z, side_px)]
     u += [viewing_angle_deg, math.degrees(math.atan2(math.hypot(x, y), z))]
-    seen = cell(model["region"]["seen"], model["region"]["boundaries"], u) and all(
+    seen = cell(model["looked_for"], model["cells_u"], u) and all(
         each["low"]
         <= sum(w * value for w, value in zip(each["weights"], u, strict=False))
         <= each["high"]
-        for each in model["region"]["directions"])
+        for each in model["region"])
     return {name: {
         "sigma": math.exp(
             interpolated(each["ln_sigma"], model["knots_u"], u)) if seen else math.nan,

@@ -283,12 +283,6 @@ FRONTAL_DEG = 5.0
 #: Poses that a cell should have, on average, where cells can be made wider.
 POSES_A_CELL = 150
 
-#: Cells along a drawn condition in which the seen region is told.
-MAX_REGION_CELLS = 12
-
-#: Poses that such a cell should have, on average, so that none is empty by chance.
-POSES_A_REGION_CELL = 15
-
 #: Shares of two conditions' ranges by which their sum and difference may leave the seen ones; to it
 #: comes that of `CORNER`.
 SLACK = 0.05
@@ -361,22 +355,6 @@ class Condition:
             np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))[1:-1])
         low, high = ends + outwards * 2.0 * self.rounding
         return np.concatenate([[self.begins(low)], inner, [high]])
-
-    def between(self, values: Floats) -> Floats | None:
-        """Return the middles between the few values, None if there are many.
-
-        Values that jitter spreads by no more than what counts as the same are one.
-
-        >>> CONDITIONS["bearing_deg"].between(
-        ...     np.array([*np.linspace(0.0, 0.1, 99), 20.0])).tolist()
-        [10.05]
-        """
-        few = len(values) <= MAX_VALUES
-        jumps = np.flatnonzero(np.diff(values) > (0.0 if few else self.tolerance))
-        if not few and (len(jumps) >= MAX_VALUES
-                        or any(map(self.varies, np.split(values, jumps + 1)))):
-            return None
-        return np.asarray((values[jumps] + values[jumps + 1]) / 2)
 
 
 #: Models do not depend on the last, but hold where it was seen.
@@ -456,7 +434,7 @@ class Sights:
         return self.solved & ~self.flipped
 
 
-#: Edges of bins along the scaled conditions, of all four or without the bearing.
+#: Edges of bins along the scaled `PREDICTORS`.
 Edges = tuple[Floats, ...]
 
 
@@ -533,28 +511,6 @@ def bins_and_cells(
             for name in PREDICTORS)
 
     return bins(lambda each: each.bins), bins(lambda each: min(many, each.cells))
-
-
-def region_cells(
-    found: Mapping[str, Floats], poses: int, trials: int
-) -> tuple[Edges, tuple[int, ...]]:
-    """Return the cells of conditions that poses are in or not, and which conditions were drawn.
-
-    Few distinct values, of an axis, have a cell each, also those that jitter spreads a little;
-    others have some cells of about as many values each.
-    """
-    middles = [CONDITIONS[name].between(values) for name, values in found.items()]
-    drawn = tuple(k for k, middle in enumerate(middles) if middle is None)
-    # Values that go together along an axis make fewer combinations.
-    others = min(math.prod(len(middle) + 1 for middle in middles if middle is not None),
-                 poses // trials)
-    many = poses / (POSES_A_REGION_CELL * others)
-    count = min(max(1, int(many ** (1.0 / max(len(drawn), 1)))), MAX_REGION_CELLS)
-    shares = np.linspace(0.0, 1.0, count + 1)[1:-1]
-    return tuple(
-        np.concatenate([[-np.inf], np.unique(np.quantile(values, shares))
-                        if middle is None else middle, [np.inf]])
-        for middle, values in zip(middles, found.values(), strict=True)), drawn
 
 
 def region_directions(found: Mapping[str, Floats]) -> Floats:
@@ -647,8 +603,6 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "flip_rate": (CELLS, "nearer to the mirror of the truth, of the solved", "1"),
     "region_low": (("direction",), "smallest weighted sum of a direction in the region", ""),
     "region_high": (("direction",), "largest weighted sum of a direction in the region", ""),
-    "region_seen": (tuple(f"region_{name}" for name in CONDITIONS),
-                    "whether a cell of the conditions has poses", "1"),
     "knots": (("quantity", "predictor"), "knots that the error needs", "1"),
 }
 
@@ -686,10 +640,10 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         - ``use`` (quantity, cells): whether the model may be used there (`Use`): the coverage lies
           within 0.93 to 0.97, with a tolerance of a standard error, and that of each half of the
           trials with one of two.
-        - ``region_low``, ``region_high`` (direction), ``region_seen`` (cells): the joint region of
-          distance, side, viewing angle and bearing in which poses were looked for; outside it the
-          model has no answer. In it are conditions whose weighted sums (``direction_weight``) lie
-          between both ends, and that are in a cell with poses.
+        - ``region_low``, ``region_high`` (direction): the joint region of distance, side, viewing
+          angle and bearing in which poses were looked for; outside it, and in cells without poses,
+          the model has no answer. In it are conditions whose weighted sums
+          (``direction_weight``) lie between both ends.
         - ``flip_rate``, ``solved_rate`` and ``looked_for`` (cells). Flipped and missing poses are
           in these, not in sigma.
 
@@ -735,7 +689,6 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     least, most = float(focal_size.min()), float(focal_size.max())
     bins, cells = bins_and_cells(found, poses, collinear=not CONDITIONS["side_px"].varies(
         np.log([least, most])))
-    region, drawn = region_cells(found, poses, results.sizes[DRAWS])
     directions = region_directions(found)
     moments = np.stack([sum(moments_of(bins, block) for block in model) for model in models])
     _check_solved(moments, results, kept)
@@ -754,7 +707,8 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         whole = sums.sum(axis=0)
         tables.append({
             **_of_knots(_at_knots(whole, own, knots), knots), **_exponents(whole),
-            **_of_cells(np.asarray(judged)), **_of_region(model, region, drawn, directions),
+            **_of_cells(np.asarray(judged)),
+            **_of_region(model, directions, results.sizes[DRAWS]),
             "knots": np.array([[*map(len, each)] for each in own])})
     variables: dict[str, Any] = {"direction_weight": (
         ("direction", "condition"), directions,
@@ -776,8 +730,6 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     for name, edges in zip(PREDICTORS, cells, strict=True):
         parts += [(f"cell_{name}_low", name, edges[:-1], "low end of cells"),
                   (f"cell_{name}_high", name, edges[1:], "high end of cells")]
-    parts += [(f"region_{name}", name, edges[:-1], "low end of cells of the region")
-              for name, edges in zip(CONDITIONS, region, strict=True)]
     for coordinate, name, at, words in parts:
         condition = CONDITIONS[name]
         coordinates[coordinate] = (
@@ -835,18 +787,13 @@ def _metres(distance_m: Floats) -> Floats:
     return np.asarray(scale * distance_m + (1.0 - scale))
 
 
-def _of_region(
-    model: Sequence[Sights], region: Edges, drawn: tuple[int, ...], directions: Floats
-) -> Values:
+def _of_region(model: Sequence[Sights], directions: Floats, trials: int) -> Values:
     """Return the joint region of the conditions that was seen.
 
     An end along a direction has a margin for rounding; where there is hardly an extent, as wide as
-    what counts as the same; of sums and differences `SLACK` and what the fewest draws of a cell of
-    the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
+    what counts as the same; of sums and differences `SLACK` and what so many trials may leave empty
+    in a corner (`CORNER`). Angles that begin near 0 begin at 0.
     """
-    cells = np.asarray(sum(
-        binned(region, block, np.ones_like(block.solved)).sum(axis=(0, -1)) for block in model))
-    of_grid = cells.sum(axis=drawn)
     projected = np.concatenate([block.at for block in model]) @ directions.T
     low, high = projected.min(axis=0), projected.max(axis=0)
     listed = [*CONDITIONS.values()]
@@ -854,7 +801,7 @@ def _of_region(
     # Knots at the ends lie two roundings outside the poses; ln(fx size) is of two ends.
     same = np.array([each.tolerance for each in (*listed, listed[0])])
     rounding = np.array([*(3.0 * each.rounding for each in listed), 6.0 * listed[0].rounding])
-    margin = np.full(len(low), SLACK + math.sqrt(CORNER / of_grid[of_grid > 0].min()))
+    margin = np.full(len(low), SLACK + math.sqrt(CORNER / trials))
     margin[alone] = np.where(high[alone] - low[alone] <= same, same, rounding)
     ends = np.array([condition.begins(end) for condition, end in zip(
         listed, (low - margin)[axes], strict=True)])
@@ -862,7 +809,7 @@ def _of_region(
     margin[alone.stop :] += np.abs(directions[alone.stop :]) @ (low[axes] - ends)
     low, high = low - margin, high + margin
     low[axes] = ends
-    return {"region_low": low, "region_high": high, "region_seen": cells > 0}
+    return {"region_low": low, "region_high": high}
 
 
 def _of_knots(fit: Floats, knots: Sequence[Floats]) -> Values:
@@ -1068,15 +1015,9 @@ def _seen(model: xr.Dataset, at: Floats, *, any_bearing: bool) -> Masks:
     """Return whether points (n, 4), in ln(distance), ln(side) and degrees, are in the region."""
     weights, low, high = (model[name].values for name in (
         "direction_weight", "region_low", "region_high"))
-    cells = model["region_seen"].values
     if any_bearing:
         free = weights[:, -1] == 0
         at, weights, low, high = at[:, :-1], weights[free, :-1], low[free], high[free]
-        cells = np.asarray(cells.any(axis=-1))
-    numbers = tuple(
-        np.searchsorted(
-            model[f"region_{name}"].values[1:], condition.unscaled(value), side="right")
-        for value, (name, condition) in zip(at.T, CONDITIONS.items(), strict=False))
     with np.errstate(invalid="ignore"):
         projected = at @ weights.T
-    return np.asarray(((low <= projected) & (projected <= high)).all(axis=1) & cells[numbers])
+    return np.asarray(((low <= projected) & (projected <= high)).all(axis=1))

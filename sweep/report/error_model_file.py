@@ -85,7 +85,9 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
                 "configuration": configuration,
                 "side_px_times_distance_m": None if models.attrs["focal_size_varies"] else
                 models.attrs["focal_size_px_m"],
-                "region": _region(model),
+                "region": [dict(zip(("weights", "low", "high"), each, strict=True))
+                           for each in zip(*(model[name].values.tolist() for name in (
+                               "direction_weight", "region_low", "region_high")), strict=True)],
                 "knots": knots,
                 "knots_u": [_logarithms(name, values) for name, values in knots.items()],
                 "cells": edges,
@@ -96,18 +98,6 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
             }
             for configuration, _, model in models_apart(models)
         ],
-    }
-
-
-def _region(model: xr.Dataset) -> dict[str, Any]:
-    """Return the joint region of a model: ends along directions, and cells with poses."""
-    ends = zip(*(model[name].values.tolist()
-                 for name in ("direction_weight", "region_low", "region_high")), strict=True)
-    return {
-        "directions": [dict(zip(("weights", "low", "high"), each, strict=True)) for each in ends],
-        "boundaries": [_logarithms(name, model[f"region_{name}"].values[1:])
-                       for name in CONDITIONS],
-        "seen": model["region_seen"].values.tolist(),
     }
 
 

@@ -174,7 +174,7 @@ def test_configurations_are_not_pooled():
     results["translation_error_m"].values[..., 1, :] *= 3.0
     models = error_models(results)
     alone = error_models(results.isel(solver=[1]))
-    for name in ("coverage", "use", "judged", "exponent", "region_low", "region_seen"):
+    for name in ("coverage", "use", "judged", "exponent", "region_low", "region_high"):
         np.testing.assert_allclose(
             alone[name].isel(solver=0), models[name].isel(solver=1), rtol=1e-7)
 

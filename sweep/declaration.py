@@ -225,7 +225,6 @@ def plain_types(hint: Any) -> tuple[type, ...]:
     >>> plain_types(float | None), plain_types(tuple[float, ...])
     ((<class 'float'>,), (<class 'tuple'>,))
     """
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        kinds = [plain_types(part) for part in typing.get_args(hint) if part is not type(None)]
-        return tuple(kind for group in kinds for kind in group)
-    return (typing.get_origin(hint) or hint,)
+    joined = typing.get_origin(hint) in (types.UnionType, typing.Union)
+    parts = typing.get_args(hint) if joined else (hint,)
+    return tuple(typing.get_origin(each) or each for each in parts if each is not type(None))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError
-from sweep.measure.detectors import OPENCV, make_detector
+from sweep.measure.detectors import FITS, OPENCV, fitting_order, make_detector
 from sweep.measure.estimation import Estimates, pose_error
 from sweep.measure.estimators import SOLVERS, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -185,12 +184,9 @@ def judged_corners(
         away = np.linalg.norm((answers[row][1] - truth[i]).mean(axis=1), axis=1)
         best = np.lexsort([away, answers[row][0] != drawn[i]])[0]
         ids[i], found[i] = (part[best] for part in answers[row])
-    # Offsets are free, so that an order is recognised whatever the centre of the first pixel.
-    orders = list(itertools.permutations(range(4)))
-    spreads = [(found[:, each] - truth).std(axis=(0, 1)).max() for each in orders]
-    order = orders[int(np.argmin(spreads))]
+    x, y = offset = (found - truth).mean(axis=(0, 1))  # in whichever order
+    order, distance = fitting_order(found - offset, truth)
     error = found[:, order] - truth
-    x, y = offset = error.mean(axis=(0, 1))
     rms_px = float(np.sqrt(((error - offset) ** 2).sum(axis=2).mean()))
     numbers = {"offset_px": offset.tolist(), "rms_px": rms_px}
 
@@ -198,10 +194,10 @@ def judged_corners(
     if (wrong := ids != drawn).any():
         faults.append(f"IDs are wrong in {wrong.sum()} of {len(rows)} scenes: "
                       f"{ids[wrong][0]} for marker {drawn[wrong][0]}")
-    if min(spreads) > 0.1 * np.linalg.norm(truth[:, 1] - truth[:, 0], axis=1).mean():
+    if distance > FITS:
         faults.append("corners are in no fixed order of the marker, or are no pixels (x, y)")
-    elif order != orders[0]:
-        own = declared.corner_order if declared else orders[0]
+    elif order != (0, 1, 2, 3):
+        own = declared.corner_order if declared else range(4)
         faults.append("corners are in another order: declare "
                       f"corner_order = {tuple(own[index] for index in order)}")
     if faults:

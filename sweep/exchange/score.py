@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Sequence
@@ -20,8 +19,8 @@ from sweep.exchange.answers import CORNER_COLUMNS, CORNERS, Answers, Conventions
 from sweep.experiment.document import toml_item
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import FITS, fitting_order
 from sweep.messages import plain
-from sweep.model.polygon import side_lengths
 from sweep.plugins.recording import OF_TARGET, REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
@@ -47,24 +46,18 @@ def hints(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]
     corners, truth = corners[known], truth[known]
     if len(truth) < MIN_MARKERS:
         return []
-    side = side_lengths(truth).mean(axis=1)
-    orders = [list(order) for order in itertools.permutations(range(4))]
-    distance = [
-        float(np.median(np.linalg.norm(corners[:, order] - truth, axis=2).mean(axis=1) / side))
-        for order in orders
-    ]
-    best = int(np.argmin(distance))
+    order, distance = fitting_order(corners, truth)
     lines = []
-    if best and distance[best] < 0.2 < distance[0]:
+    if order != (0, 1, 2, 3) and distance < FITS:
         # corner k of the truth is corner order[k] of the answers, which they call ...
         theirs = [""] * 4
-        for k, j in enumerate(orders[best]):
+        for k, j in enumerate(order):
             theirs[conventions.corners.index(CORNERS[j])] = CORNERS[k]
         lines.append(
             f'the corners come in the order {" ".join(theirs)}: pass --corner-order '
             f'"{" ".join(theirs)}"'
         )
-        corners = corners[:, orders[best]]
+        corners = corners[:, order]
     offset = np.median((corners - truth).mean(axis=1), axis=0)
     if (np.abs(np.abs(offset) - 0.5) < 0.1).all() and offset[0] * offset[1] > 0:
         center = conventions.pixel_center + round(2 * float(offset[0])) / 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,9 +18,32 @@ from sweep.declaration import parameter
 from sweep.errors import PluginError
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary
+from sweep.model.polygon import side_lengths
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.loading import PluginSetting, call, made, real_numbers
 from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# Which corner of a detector is which of OpenCV's.
+
+#: Largest distance of corners from the truth that has them in the same order, in sides.
+FITS = 0.2
+
+
+def fitting_order(found: Floats, truth: Floats) -> tuple[tuple[int, ...], float]:
+    """Return the order in which found corners (n, 4, 2) are nearest to the true ones.
+
+    Beside it their distance, in the truth's sides: the median of the markers' means.
+    """
+    side = side_lengths(truth).mean(axis=1)
+
+    def away(order: tuple[int, ...]) -> float:
+        distance = np.linalg.norm(found[:, order] - truth, axis=2).mean(axis=1)
+        return float(np.median(distance / side))
+
+    order = min(itertools.permutations(range(4)), key=away)
+    return order, away(order)
+
 
 # --------------------------------------------------------------------------------------------------
 # OpenCV's ArUco detector, on a window as on the whole frame but for place-dependent rounding.

@@ -10,15 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis import error_models
 from sweep.analysis.dataset import each_cell
-from sweep.analysis.error_models import (
-    CONDITIONS,
-    PREDICTORS,
-    QUANTITIES,
-    Use,
-    cell_edges,
-    error_models,
-)
+from sweep.analysis.error_models import CONDITIONS, PREDICTORS, QUANTITIES, Use, cell_edges
 from sweep.analysis.estimator import INTERVAL
 from sweep.analysis.requirements import described
 from sweep.errors import ArgumentError

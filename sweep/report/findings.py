@@ -18,27 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis import comparisons, dataset, simulation_gap
 from sweep.analysis import requirements as judged
-from sweep.analysis import simulation_gap
-from sweep.analysis.comparisons import (
-    GAP_RATES,
-    GAP_STATISTICS,
-    SOURCES,
-    ComparedRate,
-    SolvedQuantile,
-    is_measured,
-    matched_sides,
-    regressions,
-    store_differences,
-)
-from sweep.analysis.dataset import (
-    DRAWS,
-    QUANTITIES,
-    axes_of,
-    configuration_axes,
-    each_cell,
-    is_replicated,
-)
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
 from sweep.errors import ArgumentError
@@ -134,12 +115,13 @@ def require(
     required = judged.parse_requirements(texts) if texts else ()
     table = judged.check_requirements(results, required, axes) if required else None
     found = [] if table is None else judged.verdicts(table)
-    worse = [] if against is None else regressions(
+    worse = [] if against is None else comparisons.regressions(
         selected_store(against, at)[0], results, [each.what.name for each in required], axes)
     decision = Decision.not_met if any(each.worse for each in worse) else (
         judged.combined(found) if found else Decision.met)
-    named = {*axes, DRAWS, *configuration_axes(results)}
-    pooled = [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
+    named = {*axes, dataset.DRAWS, *dataset.configuration_axes(results)}
+    pooled = [name for name in dataset.axes_of(results)
+              if name not in named and results.sizes[name] > 1]
     parts: list[Table | str] = [decision_table(found), Table.of(
         "Compared with the older store pose by pose, new minus old",
         ("", "quantity", "configuration", "difference", "condition"),
@@ -179,7 +161,7 @@ def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.D
     """
     kept: dict[str, list[int]] = {}
     for name, value in parse_selection(",".join(at), pipeline).items() if at else ():
-        axis, axes = pipeline.axis_of(name), axes_of(results)
+        axis, axes = pipeline.axis_of(name), dataset.axes_of(results)
         if axis is None or axis.name not in axes:
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
                                 f"there are {', '.join(axes)}")
@@ -208,7 +190,7 @@ def conditions_of(
     found = [
         {"condition": at, "decision": Decision(int(cell["decision"])),
          **{name: cell[name].item() for name in ("value", "low", "high", "draws")}}
-        for at, cell in each_cell(one, [str(dim) for dim in one["decision"].dims])
+        for at, cell in dataset.each_cell(one, [str(dim) for dim in one["decision"].dims])
         if every or cell["decision"] == each.decision]
     sign = -1 if one["relation"].item() in (">=", ">") else 1
     return sorted(found, key=lambda row: -sign * np.nan_to_num(row["value"], nan=sign * np.inf))
@@ -266,8 +248,8 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
                   if each.draws > 0 and math.isfinite(each.draws_needed)), default=0.0)
     if factor <= 1.0 or given:
         return f"sweep report {quoted(store)}"
-    unit = REPLICATES if is_replicated(results) else 1
-    count = math.ceil(results.sizes.get(DRAWS, 1) * factor / unit) * unit
+    unit = REPLICATES if dataset.is_replicated(results) else 1
+    count = math.ceil(results.sizes.get(dataset.DRAWS, 1) * factor / unit) * unit
     return (f"sweep run {quoted(store)} --set trial={count} --store more.zarr "
             f"--reuse {quoted(store)}")
 
@@ -405,7 +387,7 @@ def limit_rows(limits: xr.Dataset) -> list[dict[str, Any]]:
     units = str(along.attrs.get("units", ""))
     unit = UNITS.get(units, f" {units}")
     rows = []
-    for at, one in each_cell(limits, dimensions(limits)):
+    for at, one in dataset.each_cell(limits, dimensions(limits)):
         row: dict[str, Any] = {name: one[name].item() for name in LIMIT}
         place = {name: texts.get(row[name], coordinate(row[name])) for name in (
             "value", "low", "high", "start", "fails_at", "farthest_beyond")}
@@ -502,11 +484,11 @@ def compare(
     figure = figure_file(output)
     one, other = (selected_store(url)[0] for url in (first, second))
     then = (f"sweep report {quoted(second)}", "")
-    if is_measured(one) == is_measured(other):
+    if comparisons.is_measured(one) == comparisons.is_measured(other):
         for name, value in (("bins", bins), ("output", output)):
             if value:
                 raise ArgumentError(name, "", "expected a store of photographs and a simulation")
-        table = store_differences(one, other)
+        table = comparisons.store_differences(one, other)
         tables = store_difference_tables(table)
         return Findings([*tables.values()], {
             "first": first, "second": second,
@@ -539,19 +521,19 @@ def gap_table(gap: xr.Dataset) -> Table:
     groups = list(itertools.product(*(tables.group_cells(gap, dim) for dim in dims)))
     rows = [
         [STATISTICS[each.name], *group, *(
-            Value(_scale(each) * float(one[each.name].sel(source=source))) for source in SOURCES),
+            Value(_scale(each) * value) for value in one[each.name].values.tolist()),
          "ratio" if each.ratio else "difference",
          Column("", f"{each.name}_gap", 1.0 if each.ratio else _scale(each)).cells(one)[0]]
-        for each in GAP_STATISTICS
-        for group, (_, one) in zip(groups, each_cell(gap, dims), strict=True)]
+        for each in comparisons.GAP_STATISTICS
+        for group, (_, one) in zip(groups, dataset.each_cell(gap, dims), strict=True)]
     return Table.of(
         "Photographs and simulation, with 95 % intervals of the gap: the difference, or the ratio",
-        ["statistic", *dims, *SOURCES, "compared by", "gap"], rows, stub=1 + len(dims))
+        ["statistic", *dims, *comparisons.SOURCES, "compared by", "gap"], rows, stub=1 + len(dims))
 
 
 def gap_lines(gap: xr.Dataset) -> list[str]:
     """Return lines on the compared poses, and on the meaning of intervals."""
-    photographs, scenes = (int(gap["units"].sel(source=source).max()) for source in SOURCES)
+    photographs, scenes = (int(gap["units"].isel(source=k).max()) for k in (0, 1))
     markers, solved = (int(gap[name].max()) for name in ("looked_for", "solved"))
     first = tables.plural(photographs, "photograph")
     lines = [
@@ -565,8 +547,8 @@ def gap_lines(gap: xr.Dataset) -> list[str]:
     return lines
 
 
-def _scale(each: ComparedRate | SolvedQuantile) -> float:
-    return 100.0 if each in GAP_RATES else 1.0
+def _scale(each: comparisons.ComparedRate | comparisons.SolvedQuantile) -> float:
+    return 100.0 if each in comparisons.GAP_RATES else 1.0
 
 
 #: Configurations that are drawn, two panels each.
@@ -586,19 +568,19 @@ def gap_figures(
     For each configuration the distribution functions of the rotation error and of the depth error
     of all solved poses; of a simulation that is compared in bins, those within the bins.
     """
-    matched = matched_sides(photographs, simulated, bins)
+    matched = comparisons.matched_sides(photographs, simulated, bins)
     sides = matched.poses()
     values = ([f"{name} {coordinate(each)}" for each in matched.datasets[0][name].values.tolist()]
               for name in matched.kept)
     names = [", ".join(each) or "all markers" for each in itertools.product(*values)]
     figures = []
     for heading, errors_of in (
-        ("rotation error, deg", QUANTITIES[0].norm),
+        ("rotation error, deg", dataset.QUANTITIES[0].norm),
         ("depth error, % of the true depth", lambda poses: poses.range_percent[..., 0]),
     ):
         rows = [[name, source, Value(x), Value(share)]
                 for k, name in enumerate(names[:MAX_CONFIGURATIONS])
-                for source, side in zip(SOURCES, sides, strict=True)
+                for source, side in zip(comparisons.SOURCES, sides, strict=True)
                 for x, share in _distribution(errors_of(side)[k][side.solved[k]])]
         figures.append(Figure(
             heading.partition(" ")[0], heading, "", Table.of(

@@ -1,13 +1,14 @@
-"""The report of a store: its answer, and the page, HTML or Markdown, that begins with it."""
+"""The report of a store: figures and tables, the answer, and the page that begins with it."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import math
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from os import PathLike
@@ -15,46 +16,546 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import numpy as np
 import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from sweep import analysis
 from sweep.analysis import requirements as judged
 from sweep.analysis.dataset import of_photographs, sampling_text
-from sweep.analysis.requirements import Decision, Verdict, requirement_limits
+from sweep.analysis.estimator import Bins
+from sweep.analysis.requirements import BOARDS, Decision, Reached, Verdict, requirement_limits
+from sweep.analysis.summaries import ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError, StoreError
+from sweep.experiment.parameters import Stage
+from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.messages import byte_count, quoted
-from sweep.report import figures as drawings
-from sweep.report import findings
+from sweep.report import findings, output_file, report_data
 from sweep.report.error_model_file import check_error_model_file, model_findings
-from sweep.report.figure import Figure, Panel, caption_of, panels_file, sentences
-from sweep.report.output_file import (
-    check_output_file,
-    standard_stream,
-    write_errors_explained,
-    write_output_file,
+from sweep.report.figure import (
+    MAX_DOTS,
+    MAX_LINES,
+    Figure,
+    Panel,
+    caption_of,
+    panels_file,
+    sentences,
 )
-from sweep.report.report_data import (
-    CARDS,
-    CONFIGURATION,
-    ReportData,
-    comparison,
-    configurations,
-    course_of,
-    notes_of,
-    read_report_data,
-    store_errors,
-)
+from sweep.report.report_data import AREA, CARDS, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.scenes import LEGEND, Scene, scenes_of
-from sweep.report.table import (
-    Column,
-    Findings,
-    Table,
-    interval_text,
-    markdown_text,
-    number,
-    plural,
-)
+from sweep.report.table import Column, Findings, Table, markdown_text, number, plural, table_of
 from sweep.store.files import write_whole
+
+# --------------------------------------------------------------------------------------------------
+# Columns that several figures share.
+
+DETECTED, SOLVED, ROTATION_MEDIAN, _, _, RANGE_BIAS, _ = CARDS
+LOOKED_FOR = Column("looked for", "looked_for")
+SOLVED_COUNT = Column("n solved", "solved")
+FLIPS = Column("flips, % of the solved", "flip_rate", 100)
+ROTATION_P95 = Column("rotation p95, deg", "rotation_p95_deg")
+RANGE_MEDIAN = Column("range median, %", "range_median_percent")
+RANGE_P95 = Column("range p95, %", "range_p95_percent")
+RATES = (LOOKED_FOR, DETECTED)
+ERROR_CURVES = (ROTATION_MEDIAN, ROTATION_P95, RANGE_MEDIAN, RANGE_P95)
+ERRORS = (
+    SOLVED, ROTATION_MEDIAN, ROTATION_P95,
+    Column("rotation RMSE without flips, deg", "rotation_rmse_unflipped_deg"),
+    RANGE_MEDIAN, RANGE_P95, Column("range RMSE without flips, %", "range_rmse_unflipped_percent"),
+    RANGE_BIAS, Column("position median, mm", "position_median_m", 1000.0),
+    Column("position p95, mm", "position_p95_m", 1000.0), FLIPS)
+#: Kinds of errors, as `sweep.analysis.error_statistics` takes them.
+SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
+
+#: Bias and standard deviation along the camera's axes and about the angles.
+SIGNED_COLUMNS = (SOLVED_COUNT, RANGE_BIAS, *(
+    Column(f"{name} {words}, {unit}", f"{name}_{statistic}_{stored}", scale,
+           0.0 if words == "bias" else None)
+    for names, unit, stored, scale in (("xyz", "mm", "m", 1000.0),
+                                       (("yaw", "pitch", "roll"), "deg", "deg", 1.0))
+    for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))))
+
+EFFICIENCIES = tuple(
+    Column(f"{quantity} efficiency", f"{quantity}_efficiency", level=1.0)
+    for quantity in ("rotation", "range"))
+
+#: Angles that are lines of one configuration, and panels of several.
+MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
+
+
+# --------------------------------------------------------------------------------------------------
+# A figure, or a table alone, of an analysis by configuration and groups of poses.
+
+
+def figure(
+    data: ReportData, summary: xr.Dataset, groups: Groups, name: str, title: str, text: str,
+    columns: Sequence[Column], curves: Sequence[Column], *, by: str = "",
+    covers: Sequence[str] = (),
+) -> Figure:
+    """Return a figure of `grouped`, the last of whose groups are along x.
+
+    Its caption also names pooled axes, and values that are not drawn.
+    """
+    dims, count = list(groups), summary.sizes[CONFIGURATION]
+    if not by and (count > 1 or len(dims) > 1):
+        by = CONFIGURATION if count > 1 else data.label(dims[0])
+    return Figure(
+        name, title, sentences(
+            text,
+            caption_of("first_lines", drawn=MAX_LINES, count=count)
+            if dims and count > MAX_LINES else "",
+            report_data.notes_of(data, groups),
+            data.pooled(*dims, *report_data.configurations(data).axes)),
+        configuration_table(data, summary, dims, title, columns), curves,
+        data.label(dims[-1]) if dims else "", by, covers=covers)
+
+
+def configuration_table(
+    data: ReportData, summary: xr.Dataset, dims: Sequence[str], caption: str,
+    columns: Sequence[Column], counted: str = "looked_for",
+) -> Table:
+    """Return the table of an analysis (configuration, *dims), with 95 % intervals."""
+    if summary.sizes[CONFIGURATION] > 1 or not dims:
+        dims = [CONFIGURATION, *dims]
+    else:
+        summary = summary.isel({CONFIGURATION: 0})
+    return table_of(summary, f"{caption}, with 95 % intervals", dims, columns, data.results,
+                    counted=counted)
+
+
+# --------------------------------------------------------------------------------------------------
+# The figures.
+
+
+def _along(data: ReportData, name: str) -> Figure:
+    """Return the figure of rates and errors along an axis, the area, or a drawn parameter.
+
+    Along the size each angle is apart: a line of one configuration, a panel of several.
+    """
+    axis = data.pipeline.axis(name)
+    meaning = axis.meaning if axis is not None else (
+        "in the image" if name == AREA else data.pipeline.parameters[name].meaning)
+    groups = data.along(name)
+    if data.angle_axis and name == data.size:
+        several = data.setting_axes or data.pipeline.experiment.target_axes
+        most = MAX_ANGLE_PANELS if several else MAX_ANGLES
+        groups = {**data.along(data.angle_axis, most), **groups}
+    return figure(
+        data, grouped(data, analysis.error_statistics, groups), groups, f"by-{name}",
+        f"Rates and errors by {data.words(name)}",
+        caption_of("along", target=data.pipeline.target_word, axis=name, meaning=meaning),
+        (*RATES, *ERRORS), [DETECTED, *ERROR_CURVES, FLIPS, RANGE_BIAS], covers=tuple(groups))
+
+
+#: From this many values on, an axis of numbers has a figure along it beside its configurations.
+MIN_DRAWN = 3
+
+
+def _configurations(data: ReportData) -> Figure | None:
+    known = report_data.configurations(data)
+    if not known.several:
+        return None
+    covers = [
+        axis.name for axis in data.pipeline.axes
+        if len(known.axes.get(axis.name, ())) == len(axis)
+        and (not axis.is_numeric or len(axis) < MIN_DRAWN)]
+    return figure(
+        data, known.summary, {}, "configurations",
+        f"Configurations compared: {', '.join(known.axes)}",
+        caption_of("configurations"), (LOOKED_FOR, *ERRORS),
+        (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS), covers=covers)
+
+
+def _trade(data: ReportData) -> Figure | None:
+    if data.trade is None:
+        return None
+    lines = report_data.trade_lines(data, data.trade, data.trade.attrs.get("budget_ms"))
+    return findings.trade_figure(data.trade, lines=lines)
+
+
+def _outcomes(data: ReportData) -> Figure:
+    names = [name for name in (data.size_axis, *data.scene_axes, data.size)
+             if name is not None and name != IDS
+             and data.pipeline.axis(name) not in data.pipeline.experiment.target_axes]
+    groups = data.along(names[0]) if names else {}
+    summary = grouped(data, analysis.failure_composition, groups)
+    counts = summary["count"].sum(
+        [name for name in summary["count"].dims if name != "outcome"]).to_series()
+    excluded = counts[list(outcomes(counted=False))]
+    left_out = ", ".join(f"{count:,} {name}" for name, count in excluded.items() if count)
+    total = summary["count"].where(summary["share"].notnull(), 0).sum("outcome").astype(int)
+    happened = summary.sel(outcome=[
+        name for name, count in counts.items() if count and name not in excluded])
+    share = Column("share, %", "share", 100)
+    return figure(
+        data, happened.assign(looked_for=total),
+        {"outcome": None, **groups}, "failures", "Outcomes of the poses",
+        caption_of("outcomes", by=data.words(names[0]) if names else "", left_out=left_out),
+        (LOOKED_FOR, share), [share], by="outcome")
+
+
+def marker_ranking(results: xr.Dataset, per: Sequence[str], **_: Bins) -> xr.Dataset:
+    """Return the ranking of marker IDs, which are kept apart anyway."""
+    return analysis.marker_ranking(results, [name for name in per if name != IDS])
+
+
+def _ranking(data: ReportData) -> Figure | None:
+    """Return the detection rates of marker IDs, the weak ones first."""
+    if data.results.sizes.get(IDS, 1) < 2:
+        return None
+    table = configuration_table(
+        data, grouped(data, marker_ranking, {IDS: None}, [Stage.detection]), [IDS],
+        "IDs by detection rate", (
+            *RATES, Column("expected, %", "expected_rate", 100),
+            Column("p, adjusted", "p_adjusted"), Column("weak", "weak")))
+    rates, weak = (table.frame[name].tolist() for name in (DETECTED.heading, "weak"))
+    order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k]))
+    return Figure(
+        "ranking", "Marker IDs, the weakest first", sentences(
+            caption_of("ranking", shown=min(MAX_DOTS, len(weak)), weak=sum(weak), count=len(weak)),
+            data.pooled(IDS, *report_data.configurations(data).axes)),
+        dataclasses.replace(table, frame=table.frame.iloc[order]), [DETECTED], by="weak",
+        covers=[IDS])
+
+
+def _bound(data: ReportData) -> Figure | None:
+    if "bound" not in data.results or not data.once("has bound", lambda: bool(
+            data.results["bound"].isin(present_values(BoundStatus)).any())):
+        return None
+    along = data.size_axis or data.angle_axis
+    groups = data.along(along) if along else {}
+    return figure(
+        data, grouped(data, analysis.efficiency, groups), groups, "bound",
+        "Efficiency: the accuracy bound over the errors", caption_of("bound"),
+        EFFICIENCIES, EFFICIENCIES)
+
+
+# --------------------------------------------------------------------------------------------------
+# The figures of a store, in the order in which they stand.
+
+#: Makers of figures, None for a store that a figure does not fit; add one here.
+FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
+    lambda data: None if data.size is None else _along(data, data.size), _configurations, _trade,
+    _outcomes, _ranking, _bound,
+)
+
+
+def figures_of(data: ReportData) -> list[Figure]:
+    """Return the figures of a store, such that one shows each axis and drawn parameter."""
+    made = [figure for make in FIGURES if (figure := make(data)) is not None]
+    covered = {name for figure in made for name in figure.covers}
+    drawn = [name for name in data.pipeline.distributions if name in data.results.variables]
+    return made + [_along(data, name) for name in (*data.scene_axes, *data.setting_axes, *drawn)
+                   if name not in covered]
+
+
+# --------------------------------------------------------------------------------------------------
+# Tables of signed errors, of boards' markers, of thresholds, and of the precision that was reached.
+
+#: The threshold on the ambiguity that many programs use, and what it keeps.
+USUAL = 0.2
+KEPT_AT_USUAL = (
+    Column("solved", "solved"), Column("flips", "flipped"),
+    Column(f"kept at {USUAL:g}, %", "kept_rate", 100),
+    Column(f"flips kept at {USUAL:g}", "kept_flipped"),
+    Column(f"right of the rejected at {USUAL:g}, %", "rejected_right_rate", 100),
+    Column("threshold found?", "choice"), Column("threshold", "chosen_threshold"),
+    Column("kept there, %", "chosen_kept_rate", 100),
+    Column("flips there, %", "chosen_flip_rate", 100),
+    Column("right poses rejected there, %", "chosen_right_rejected_rate", 100))
+
+#: The most sizes, or angles, that a table of thresholds tells apart.
+MAX_SIZES = 8
+
+
+def tables_of(data: ReportData) -> list[Table]:
+    """Return the tables below a report's figures."""
+    rule, boards = data.pipeline.stopping, "marker_detection" in data.results
+    return [
+        *([board_table(data)] if boards else []),
+        configuration_table(
+            data, grouped(data, signed_error_statistics), (),
+            "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
+        *threshold_tables(data),
+        *([precision_table(data.once(
+            "precision_reached", lambda: analysis.precision_reached(data.results)))]
+          if rule is not None and rule.precision else [])]
+
+
+def board_table(data: ReportData) -> Table:
+    """Return the rates of boards' single markers, by board and detector setting."""
+    axes = [data.pipeline.axis_of(BOARDS), *data.pipeline.axes_of(Stage.detection)]
+    dims = [axis.name for axis in axes if axis is not None and len(axis) > 1]
+    rates = data.once(("markers of boards", *dims), lambda: analysis.detection_rate(
+        analysis.per_marker(data.results), dims))
+    return table_of(
+        rates, "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
+        data.results)
+
+
+def signed_error_statistics(
+    results: xr.Dataset, per: Sequence[str], bins: Bins
+) -> xr.Dataset:
+    """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
+    return analysis.error_statistics(results, per, bins, SIGNED_GROUPS)
+
+
+def threshold_tables(data: ReportData) -> list[Table]:
+    """Return what thresholds on the ambiguity keep, where poses have a mirror and some are flips.
+
+    At each size: the poses that the usual threshold keeps, and the largest that is shown to keep
+    few flips.
+    """
+    if "alternative_reprojection_error_px" not in data.results:
+        return []
+    along = data.size or data.angle_axis
+    groups = data.along(along, MAX_SIZES) if along else {}
+    table = grouped(data, analysis.ambiguity, groups)
+    if not ((table["without_alternative"] < table["solved"]) & (table["flipped"] > 0)).any():
+        return []
+    words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
+    choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
+    wanted = 100 * float(table.attrs["flip_rate"])
+    return [table_of(
+        table.sel(threshold=USUAL, drop=True).assign(choice=choice),
+        f"Thresholds on the ambiguity, with 95 % intervals; wanted: {wanted:g} % flips",
+        [CONFIGURATION, *groups], KEPT_AT_USUAL, data.results)]
+
+
+def precision_table(table: xr.Dataset) -> Table:
+    """Return a row for each quantity and configuration of `sweep.analysis.precision_reached`."""
+    kept = ["quantity", *table.attrs["configuration_dims"]]
+    reached, run = table["reached"], table["run"].isel(dict.fromkeys(kept[1:], 0)).values
+    pooled = [dim for dim in reached.dims if dim not in kept]
+    known = reached.isin((Reached.reached, Reached.not_reached))
+    counts = {each.name: (reached == each).sum(pooled) for each in Reached}
+    return table_of(
+        table[["wanted"]].assign(
+            counts | {"widest": table["half_width"].where(known).max(pooled)}),
+        f"Precision of {run.size:,} conditions, which took {int(run.min()):,} to "
+        f"{int(run.max()):,} poses each: conditions by what was reached; of rates the "
+        "half-width of the interval, of others relative to the value (bias: to the RMSE)",
+        kept, [Column(name.replace("_", " "), name) for name in ("wanted", "widest", *counts)])
+
+
+# --------------------------------------------------------------------------------------------------
+# The answer: whether requirements are met, how far, and with which configuration.
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer that a reader wants first.
+
+    Attributes
+    ----------
+    headline
+        One line.
+    paragraph
+        Warnings, and what the numbers do not tell.
+    of
+        The configuration that is named, of the tiles; empty if there is only one.
+    tiles
+        Its numbers over the whole grid, as cards and as JSON have them: ``name``, ``text`` and
+        ``detail``, ``value`` with ``low``, ``high`` and ``unit``, and what a share is of.
+    tables
+        By configuration, shown at once.
+    details
+        Tables that stand further below.
+    numbers
+        The numbers behind the line, for JSON.
+    """
+
+    headline: str
+    paragraph: str
+    of: str
+    tiles: Sequence[Mapping[str, Any]]
+    tables: Sequence[Table]
+    details: Sequence[Table]
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON values: numbers, and tables of text as a page shows them."""
+        return {
+            "answer": self.headline, "text": self.paragraph, "configuration": self.of or None,
+            "numbers": self.tiles, **self.numbers,
+            "tables": [table.as_json() for table in (*self.tables, *self.details)],
+        }
+
+
+def answer(data: ReportData) -> Answer:
+    """Return the answer: the decision on requirements, else the comparison of configurations.
+
+    Raises
+    ------
+    ArgumentError
+        For requirements, and conditions, that cannot be.
+    StoreError
+        If the store lacks what the requirements are of.
+    """
+    try:
+        decided = required(data) if data.require else None
+    except DatasetError as error:
+        raise StoreError(f"{data.store}: {error}") from None
+    compared = report_data.comparison(data, None if decided is None else (decided.best,))
+    known = compared.known
+    one = known.summary.isel({CONFIGURATION: compared.best})
+    tiles = [_tile(one, card) for card in CARDS]
+    name = compared.name if known.several else ""
+    line = decided.line if decided else f"{compared.line}." if compared.line else _in_numbers(tiles)
+    if not int(known.summary["looked_for"].sum()):
+        line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
+                "modelled in none.")
+    warnings = [f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings]
+    notes = sentences(
+        *warnings,
+        "A board counts as detected if at least one of its markers is."
+        if data.pipeline.shows_boards else "",
+        caption_of("intervals", photographs=of_photographs(data.results)),
+        report_data.notes_of(data, {}), data.pooled(*known.axes))
+    return Answer(
+        line, notes, name, tiles,
+        [*(decided.tables if decided else ()), compared.table()],
+        [*(decided.details if decided else ()), *tables_of(data)],
+        {"comparison": compared.as_json(), **(decided.numbers if decided else {})})
+
+
+# --------------------------------------------------------------------------------------------------
+# Requirements on a report's store: the decision, how far it holds, with which configuration.
+
+#: Decisions, the best first.
+ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
+
+
+class Required(NamedTuple):
+    """The decisions on all requirements.
+
+    Attributes
+    ----------
+    line
+        The answer in one line.
+    best
+        Number of the configuration that is named.
+    tables
+        How far, and the decisions, by configuration.
+    details
+        The decisions at each condition, of the configuration that is named.
+    numbers
+        For JSON: the decision on all together of the configuration that is named, verdicts as
+        `sweep require` and limits as `sweep limit` prints them.
+    """
+
+    line: str
+    best: int
+    tables: Sequence[Table]
+    details: Sequence[Table]
+    numbers: Mapping[str, Any]
+
+
+def required(data: ReportData) -> Required:
+    """Return the decisions on the requirements of a store.
+
+    The configuration that is named meets all requirements, or else follows them farthest along the
+    axis of the conditions; of equals it is the one that the comparison on the same images names.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As `sweep.analysis.check_requirements`.
+    """
+    known = report_data.configurations(data, targets=False)
+    results = data.results.isel(known.axes)
+    table = data.once("required", lambda: judged.check_requirements(
+        results, data.require, data.per))
+    places = [{name: [k] for name, k in at.items()} for at in known.combinations]
+    found = [judged.verdicts(table.isel(at)) for at in places]
+    combined = [judged.combined(each) for each in found]
+    along, others = report_data.course_of(data)
+    # At all other conditions together, and at each of them.
+    courses = [((), others), *([(others, ())] if others else [])] if along else []
+    limits = [
+        data.once(("limits", per), partial(
+            requirement_limits, results, data.require, str(along), per=per, at_all=at_all))
+        for per, at_all in courses]
+
+    rows = [[findings.limit_rows(part.isel(at)) for part in limits] for at in places]
+    ranks = [(known.wrong[k], ORDER.index(combined[k]),
+              *(-sum(row["count"] for row in part) for part in rows[k]))
+             for k in range(len(places))]
+    equal = [k for k in range(len(places)) if ranks[k] == min(ranks)]
+    best = report_data.comparison(data, tuple(equal)).best if len(equal) > 1 else equal[0]
+    whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
+    line = f"{' and '.join(data.require)}: {_decided(found[best], combined[best])}"
+    if limits:
+        line += f"; along {along}{_reached(rows[best], others)}"
+    every = judged.verdicts(table)
+    return Required(
+        f"{line}{whose}.", best,
+        [*map(findings.limit_table, limits), findings.decision_table(every)],
+        [findings.condition_table(found[best], table, every=True)],
+        {"decision": combined[best], "requirements": every,
+         "limits": findings.limits_as_json(limits[0]) if limits else None})
+
+
+def _decided(found: Sequence[Verdict], decision: Decision) -> str:
+    """Return the decision, at how many conditions, and the value that decides a single one."""
+    one = next((each for each in found if each.decision is decision), found[0])
+    words = findings.WORDS[decision]
+    if one.conditions > 1:
+        words += " at all " if decision is Decision.met else (
+            f" at {one.counts.get(one.decision, 0):,} of ")
+        words += f"{one.conditions:,} conditions"
+    elif one.decision is not Decision.not_applicable:
+        words += f" ({findings.valued(one.value, one.low, one.high, one.units)})"
+    return "; ".join(filter(None, (words, findings.needs(one))))
+
+
+def _reached(rows: Sequence[Sequence[Mapping[str, Any]]], others: Sequence[str]) -> str:
+    """Return how far along the axis: at all conditions, else at the one that reaches farthest."""
+    def met(row: Mapping[str, Any]) -> str:
+        return f"{row['text']} ({row['interval']})" if row["count"] else str(row["text"])
+
+    (together,), *by_condition = rows
+    line = f"{' at all values of ' * bool(others)}{', '.join(others)}: {met(together)}"
+    if not by_condition or together["count"]:
+        return line
+    farthest = max(by_condition[0], key=lambda row: row["count"])
+    at = {name: farthest["condition"][name] for name in others}
+    return f"{line}; at {judged.described(at)}: {met(farthest)}" if farthest["count"] else line
+
+
+# --------------------------------------------------------------------------------------------------
+# The numbers in the cards, and the line that they make where there is nothing to compare.
+
+#: Share -> the number of poses that it is of.
+COUNTED = {"detection_rate": ["looked_for"], "solved_rate": ["looked_for"], "flip_rate": ["solved"]}
+
+
+def _in_numbers(tiles: Sequence[Mapping[str, Any]]) -> str:
+    """Return the answer of a single configuration in one line."""
+    detected, _, median, _, rmse, *_ = tiles
+    errors = "".join(
+        f"; {tile['name']} {tile['text']}{f' ({detail})' if (detail := tile['detail']) else ''}"
+        for tile in (median, rmse) if not math.isnan(tile["value"]))
+    return f"Detected in {detected['text']} ({detected['detail']}){errors}."
+
+
+def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
+    """Return a number of one configuration, with its name and a detail."""
+    name, _, unit = column.heading.rpartition(", ")
+    unit = {"deg": "\u00b0"}.get(unit, f" {unit}")
+    (found,) = column.cells(one)
+    known = math.isfinite(found.low) and not math.isnan(found.high)
+    details = [f"{number(found.low)} to {number(found.high)}{unit}"] if known else []
+    counted = {name: int(one[name]) for name in COUNTED.get(column.variable, ())}
+    details += [f"of {count:,} {of.replace('_', ' ')}" for of, count in counted.items()]
+    text = number(found.value) + (unit if math.isfinite(found.value) else "")
+    if math.isinf(found.value):
+        details = ["more than half not solved"]
+    return {"name": name, "text": text, "detail": ", ".join(details), **found._asdict(),
+            "unit": unit.strip(), **counted}
+
+
+# --------------------------------------------------------------------------------------------------
+# The report written.
 
 #: Suffix of a report -> its form; of a stream, which has none, it is a page.
 FORMS = {".html": "html", ".htm": "html", ".md": "md", "": "html"}
@@ -113,16 +614,16 @@ def write_report(
         raise ArgumentError("output", str(file), "expected a file that ends in .html or .md")
     beside = file.with_name(f"{file.stem}_figures") if form == "md" else None
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
-    data = read_report_data(os.fspath(store), require, per, command)
+    data = report_data.read_report_data(os.fspath(store), require, per, command)
     if error_model:
         model_findings(data, error_model)
-    check_output_file(file)
+    output_file.check_output_file(file)
     for folder in folders:
-        check_output_file(folder / "figure.png" if folder.is_dir() else folder)
+        output_file.check_output_file(folder / "figure.png" if folder.is_dir() else folder)
     if data.results["estimate"].size == 0:
         raise StoreError(f"{data.store}: there are no results")
-    with store_errors(data.store):
-        found, drawn, scenes = answer(data), drawings.figures_of(data), scenes_of(data)
+    with report_data.store_errors(data.store):
+        found, drawn, scenes = answer(data), figures_of(data), scenes_of(data)
     pictures = {
         f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
         for figure in drawn for suffix in PICTURES if folders}
@@ -135,7 +636,7 @@ def write_report(
             f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
             if scene.picture is not None})
     # Invalid Unicode, which a file's name may hold, is written as a question mark.
-    write_output_file(file, text.encode("utf-8", errors="replace"))
+    output_file.write_output_file(file, text.encode("utf-8", errors="replace"))
     size = f", {byte_count(file.stat().st_size)}" if file.is_file() else ""
     then = (f"look at {file}", "")
     if data.trade is None and data.setting_axes:
@@ -144,14 +645,14 @@ def write_report(
         "report": str(file), "figures": len(drawn), "store": data.store,
         "required": list(data.require), "per": list(data.per)}
     # Into the page's own stream a line more would not be HTML.
-    lines = [] if standard_stream(file) else [
+    lines = [] if output_file.standard_stream(file) else [
         f"{file}: {plural(len(drawn), 'figure')}{size}", *data.warnings, found.headline]
     return Findings(lines, content | found.as_json(), None, 0, then if lines else ("", ""))
 
 
 def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
     """Write files into a folder; files and links of their names are replaced."""
-    with write_errors_explained(folder):
+    with output_file.write_errors_explained(folder):
         folder.mkdir(exist_ok=True)
         for name, content in pictures.items():
             write_whole(folder / name, content)
@@ -241,219 +742,3 @@ def _code(text: str, language: str) -> str:
     while fence in text:
         fence += "`"
     return f"{fence}{language}\n{text.rstrip()}\n{fence}"
-
-
-# --------------------------------------------------------------------------------------------------
-# The answer: whether requirements are met, how far, and with which configuration.
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """The answer that a reader wants first.
-
-    Attributes
-    ----------
-    headline
-        One line.
-    paragraph
-        Warnings, and what the numbers do not tell.
-    of
-        The configuration that is named, of the tiles; empty if there is only one.
-    tiles
-        Its numbers over the whole grid, as cards and as JSON have them: ``name``, ``text`` and
-        ``detail``, ``value`` with ``low``, ``high`` and ``unit``, and what a share is of.
-    tables
-        By configuration, shown at once.
-    details
-        Tables that stand further below.
-    numbers
-        The numbers behind the line, for JSON.
-    """
-
-    headline: str
-    paragraph: str
-    of: str
-    tiles: Sequence[Mapping[str, Any]]
-    tables: Sequence[Table]
-    details: Sequence[Table]
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as JSON values: numbers, and tables of text as a page shows them."""
-        return {
-            "answer": self.headline, "text": self.paragraph, "configuration": self.of or None,
-            "numbers": self.tiles, **self.numbers,
-            "tables": [table.as_json() for table in (*self.tables, *self.details)],
-        }
-
-
-def answer(data: ReportData) -> Answer:
-    """Return the answer: the decision on requirements, else the comparison of configurations.
-
-    Raises
-    ------
-    ArgumentError
-        For requirements, and conditions, that cannot be.
-    StoreError
-        If the store lacks what the requirements are of.
-    """
-    try:
-        decided = required(data) if data.require else None
-    except DatasetError as error:
-        raise StoreError(f"{data.store}: {error}") from None
-    compared = comparison(data, None if decided is None else (decided.best,))
-    known = compared.known
-    one = known.summary.isel({CONFIGURATION: compared.best})
-    tiles = [_tile(one, card) for card in CARDS]
-    name = compared.name if known.several else ""
-    line = decided.line if decided else f"{compared.line}." if compared.line else _in_numbers(tiles)
-    if not int(known.summary["looked_for"].sum()):
-        line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
-                "modelled in none.")
-    warnings = [f"{text.strip()[:1].upper()}{text.strip()[1:]}." for text in data.warnings]
-    notes = sentences(
-        *warnings,
-        "A board counts as detected if at least one of its markers is."
-        if data.pipeline.shows_boards else "",
-        caption_of("intervals", photographs=of_photographs(data.results)),
-        notes_of(data, {}), data.pooled(*known.axes))
-    return Answer(
-        line, notes, name, tiles,
-        [*(decided.tables if decided else ()), compared.table()],
-        [*(decided.details if decided else ()), *drawings.tables_of(data)],
-        {"comparison": compared.as_json(), **(decided.numbers if decided else {})})
-
-
-# --------------------------------------------------------------------------------------------------
-# Requirements on a report's store: the decision, how far it holds, with which configuration.
-
-#: Decisions, the best first.
-ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
-
-
-class Required(NamedTuple):
-    """The decisions on all requirements.
-
-    Attributes
-    ----------
-    line
-        The answer in one line.
-    best
-        Number of the configuration that is named.
-    tables
-        How far, and the decisions, by configuration.
-    details
-        The decisions at each condition, of the configuration that is named.
-    numbers
-        For JSON: the decision on all together of the configuration that is named, verdicts as
-        `sweep require` and limits as `sweep limit` prints them.
-    """
-
-    line: str
-    best: int
-    tables: Sequence[Table]
-    details: Sequence[Table]
-    numbers: Mapping[str, Any]
-
-
-def required(data: ReportData) -> Required:
-    """Return the decisions on the requirements of a store.
-
-    The configuration that is named meets all requirements, or else follows them farthest along the
-    axis of the conditions; of equals it is the one that the comparison on the same images names.
-
-    Raises
-    ------
-    ArgumentError, DatasetError
-        As `sweep.analysis.check_requirements`.
-    """
-    known = configurations(data, targets=False)
-    results = data.results.isel(known.axes)
-    table = data.once("required", lambda: judged.check_requirements(
-        results, data.require, data.per))
-    places = [{name: [k] for name, k in at.items()} for at in known.combinations]
-    found = [judged.verdicts(table.isel(at)) for at in places]
-    combined = [judged.combined(each) for each in found]
-    along, others = course_of(data)
-    # At all other conditions together, and at each of them.
-    courses = [((), others), *([(others, ())] if others else [])] if along else []
-    limits = [
-        data.once(("limits", per), partial(
-            requirement_limits, results, data.require, str(along), per=per, at_all=at_all))
-        for per, at_all in courses]
-
-    rows = [[findings.limit_rows(part.isel(at)) for part in limits] for at in places]
-    ranks = [(known.wrong[k], ORDER.index(combined[k]),
-              *(-sum(row["count"] for row in part) for part in rows[k]))
-             for k in range(len(places))]
-    equal = [k for k in range(len(places)) if ranks[k] == min(ranks)]
-    best = comparison(data, tuple(equal)).best if len(equal) > 1 else equal[0]
-    whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
-    line = f"{' and '.join(data.require)}: {_decided(found[best], combined[best])}"
-    if limits:
-        line += f"; along {along}{_reached(rows[best], others)}"
-    every = judged.verdicts(table)
-    return Required(
-        f"{line}{whose}.", best,
-        [*map(findings.limit_table, limits), findings.decision_table(every)],
-        [findings.condition_table(found[best], table, every=True)],
-        {"decision": combined[best], "requirements": every,
-         "limits": findings.limits_as_json(limits[0]) if limits else None})
-
-
-def _decided(found: Sequence[Verdict], decision: Decision) -> str:
-    """Return the decision, at how many conditions, and the value that decides a single one."""
-    one = next((each for each in found if each.decision is decision), found[0])
-    words = findings.WORDS[decision]
-    if one.conditions > 1:
-        words += " at all " if decision is Decision.met else (
-            f" at {one.counts.get(one.decision, 0):,} of ")
-        words += f"{one.conditions:,} conditions"
-    elif one.decision is not Decision.not_applicable:
-        words += f" ({findings.valued(one.value, one.low, one.high, one.units)})"
-    return "; ".join(filter(None, (words, findings.needs(one))))
-
-
-def _reached(rows: Sequence[Sequence[Mapping[str, Any]]], others: Sequence[str]) -> str:
-    """Return how far along the axis: at all conditions, else at the one that reaches farthest."""
-    def met(row: Mapping[str, Any]) -> str:
-        return f"{row['text']} ({row['interval']})" if row["count"] else str(row["text"])
-
-    (together,), *by_condition = rows
-    line = f"{' at all values of ' * bool(others)}{', '.join(others)}: {met(together)}"
-    if not by_condition or together["count"]:
-        return line
-    farthest = max(by_condition[0], key=lambda row: row["count"])
-    at = {name: farthest["condition"][name] for name in others}
-    return f"{line}; at {judged.described(at)}: {met(farthest)}" if farthest["count"] else line
-
-
-# --------------------------------------------------------------------------------------------------
-# The numbers in the cards, and the line that they make where there is nothing to compare.
-
-#: Share -> the number of poses that it is of.
-COUNTED = {"detection_rate": ["looked_for"], "solved_rate": ["looked_for"], "flip_rate": ["solved"]}
-
-
-def _in_numbers(tiles: Sequence[Mapping[str, Any]]) -> str:
-    """Return the answer of a single configuration in one line."""
-    detected, _, median, _, rmse, *_ = tiles
-    errors = "".join(
-        f"; {tile['name']} {tile['text']}{f' ({detail})' if (detail := tile['detail']) else ''}"
-        for tile in (median, rmse) if not math.isnan(tile["value"]))
-    return f"Detected in {detected['text']} ({detected['detail']}){errors}."
-
-
-def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
-    """Return a number of one configuration, with its name and a detail."""
-    name, _, unit = column.heading.rpartition(", ")
-    unit = {"deg": "\u00b0"}.get(unit, f" {unit}")
-    (found,) = column.cells(one)
-    known = math.isfinite(found.low) and not math.isnan(found.high)
-    details = [interval_text(found.low, found.high, unit)] if known else []
-    counted = {name: int(one[name]) for name in COUNTED.get(column.variable, ())}
-    details += [f"of {count:,} {of.replace('_', ' ')}" for of, count in counted.items()]
-    text = number(found.value) + (unit if math.isfinite(found.value) else "")
-    if math.isinf(found.value):
-        details = ["more than half not solved"]
-    return {"name": name, "text": text, "detail": ", ".join(details), **found._asdict(),
-            "unit": unit.strip(), **counted}

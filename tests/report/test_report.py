@@ -13,9 +13,9 @@ import pytest
 
 from support.reports import CAMERA, FULL, command, made
 from sweep.analysis import ambiguity, detection_rate, error_statistics, failure_composition
-from sweep.report.figures import figures_of
 from sweep.report.report_data import read_report_data
 from sweep.report.table import number
+from sweep.report.write_report import figures_of
 from sweep.store.lifecycle import open_dataset, open_store
 
 ODD = {

@@ -1,4 +1,4 @@
-"""The data of a report: roles of axes, analyses computed once, configurations compared."""
+"""The data of a report: roles of axes, analyses by configuration, configurations compared."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -55,7 +55,7 @@ def bins_of(values: Floats, most: int) -> tuple[float, ...]:
 
 
 # --------------------------------------------------------------------------------------------------
-# The data of a report: a store's results, the roles of its axes, and analyses computed once.
+# The data of a report: a store's results, and the roles of its axes.
 
 #: Results up to this size are read at once: many figures need the same values, and many small
 #: chunks are slow to read.
@@ -65,7 +65,6 @@ MAX_READ_BYTES = 600_000_000
 AREA_RATIO = 2.0
 
 Analysis = Callable[..., xr.Dataset]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +89,8 @@ class ReportData:
         Requirements, as `sweep.analysis.check_requirements` takes them, and the conditions.
     command
         The command line that asked for the report; empty if none did.
-    made
-        What `once` has returned, by key.
+    compared
+        The configurations, by whether targets are told apart (`configurations`).
     """
 
     store: str
@@ -103,7 +102,7 @@ class ReportData:
     require: tuple[str, ...] = ()
     per: tuple[str, ...] = ()
     command: str = ""
-    made: dict[Any, Any] = field(default_factory=dict, repr=False)
+    compared: dict[bool, Configurations] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Give a single pose, which has no axes, the one draw that it is."""
@@ -178,16 +177,6 @@ class ReportData:
         """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
         names = [name for name in self.scene_axes if name not in kept]
         return f"Pooled over {', '.join(names)}." if names else ""
-
-    # Analyses.
-
-    def once(self, key: Any, make: Callable[[], T]) -> T:
-        """Return the result of ``make``, a dataset loaded; it is called once for each key."""
-        if key not in self.made:
-            made = make()
-            self.made[key] = made.compute() if isinstance(made, xr.Dataset) else made
-        found: T = self.made[key]
-        return found
 
 
 def course_of(data: ReportData) -> tuple[str | None, tuple[str, ...]]:
@@ -317,11 +306,8 @@ def configurations(data: ReportData, *, targets: bool = True) -> Configurations:
     If there are more than `MAX_CONFIGURATIONS`, values of the longest axes are chosen, evenly
     spaced. Of a store with neither settings nor targets to compare, by the values of its effects.
     """
-    return data.once(
-        ("configurations", targets), lambda: _configurations(data, targets=targets))
-
-
-def _configurations(data: ReportData, *, targets: bool) -> Configurations:
+    if targets in data.compared:
+        return data.compared[targets]
     settings = [axis for axis in data.pipeline.axes_of(*BOTH) if len(axis) > 1]
     several = [*(data.pipeline.experiment.target_axes if targets else ()), *settings]
     if targets and not several and not of_photographs(data.results):
@@ -343,9 +329,10 @@ def _configurations(data: ReportData, *, targets: bool) -> Configurations:
     ranked = summary[[*RANKS]].to_dataframe().reset_index().assign(wrong=wrong)
     order = ranked.sort_values(
         ["wrong", *RANKS], ascending=[True, *RANKS.values()], kind="stable").index.tolist()
-    return Configurations(
+    data.compared[targets] = Configurations(
         axes, [kept[k] for k in order], [names[k] for k in order], [wrong[k] for k in order],
         summary.assign_coords({CONFIGURATION: names}).isel({CONFIGURATION: order}))
+    return data.compared[targets]
 
 
 def _of_each(
@@ -353,7 +340,7 @@ def _of_each(
 ) -> tuple[list[dict[str, int]], xr.Dataset]:
     """Return the combinations that differ in settings that they use, and an analysis of each.
 
-    It has the dimension ``configuration``, by label, in place of the axes; it is computed once.
+    It has the dimension ``configuration``, by label, in place of the axes.
     """
     every = [dict(zip(axes, index, strict=True)) for index in np.ndindex(*map(len, axes.values()))]
     values = {name: data.results[name].values[some].tolist() for name, some in axes.items()}
@@ -362,8 +349,7 @@ def _of_each(
     labels = [configuration_label(used_settings(data.pipeline, settings[k])) for k in kept]
     per = [*axes, *(name for name, edges in groups.items() if edges is None)]
     bins = {name: edges for name, edges in groups.items() if edges is not None}
-    table = data.once((analysis.__name__, *axes, *groups.items()), lambda: analysis(
-        data.results.isel(axes), per=per, bins=bins))
+    table = analysis(data.results.isel(axes), per=per, bins=bins)
     # Axes of settings with a single value tell nothing apart.
     single = [axis.name for axis in data.pipeline.axes_of(*BOTH) if len(axis) == 1]
     table = table.isel(dict.fromkeys(single, 0), missing_dims="ignore", drop=True)
@@ -378,7 +364,7 @@ def grouped(
     data: ReportData, analysis: Analysis, groups: Groups | None = None,
     stages: Sequence[Stage] = BOTH,
 ) -> xr.Dataset:
-    """Return an analysis by configuration and groups of poses, loaded; each is computed once.
+    """Return an analysis by configuration and groups of poses.
 
     Parameters
     ----------
@@ -587,8 +573,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
 
     def differences(k: int, best: int) -> tuple[Difference, ...]:
         one, other = (results.isel(known.combinations[at], drop=True) for at in (k, best))
-        return () if k == best else data.once(
-            ("differences", *known.axes, k, best), lambda: differences_of(one, other))
+        return () if k == best else differences_of(one, other)
 
     tried: dict[int, list[tuple[Difference, ...]]] = {}
     beaten: dict[int, int] = {}
@@ -643,7 +628,7 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
     lines = []
     for label, at, part in conditions_of(trade):
         keep = {name: np.flatnonzero(results[name].values == value) for name, value in at.items()}
-        here = dataclasses.replace(data, results=results.isel(keep), made={})
+        here = dataclasses.replace(data, results=results.isel(keep), compared={})
         known = configurations(here, targets=False)
         names, cost = known.names, part["cost_ms"].reindex(treatment=known.names).values.tolist()
         usable = [k for k in range(len(names)) if not known.wrong[k] and np.isfinite(cost[k])]

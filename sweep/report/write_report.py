@@ -10,7 +10,6 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -219,8 +218,8 @@ def _ranking(data: ReportData) -> Figure | None:
 
 
 def _bound(data: ReportData) -> Figure | None:
-    if "bound" not in data.results or not data.once("has bound", lambda: bool(
-            data.results["bound"].isin(present_values(BoundStatus)).any())):
+    if "bound" not in data.results or not bool(
+            data.results["bound"].isin(present_values(BoundStatus)).any()):
         return None
     along = data.size_axis or data.angle_axis
     groups = data.along(along) if along else {}
@@ -277,8 +276,7 @@ def tables_of(data: ReportData) -> list[Table]:
             data, grouped(data, signed_error_statistics), (),
             "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
         *threshold_tables(data),
-        *([precision_table(data.once(
-            "precision_reached", lambda: analysis.precision_reached(data.results)))]
+        *([precision_table(analysis.precision_reached(data.results))]
           if rule is not None and rule.precision else [])]
 
 
@@ -286,10 +284,9 @@ def board_table(data: ReportData) -> Table:
     """Return the rates of boards' single markers, by board and detector setting."""
     axes = [data.pipeline.axis_of(BOARDS), *data.pipeline.axes_of(Stage.detection)]
     dims = [axis.name for axis in axes if axis is not None and len(axis) > 1]
-    rates = data.once(("markers of boards", *dims), lambda: analysis.detection_rate(
-        analysis.per_marker(data.results), dims))
     return table_of(
-        rates, "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
+        analysis.detection_rate(analysis.per_marker(data.results), dims),
+        "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
         data.results)
 
 
@@ -395,7 +392,7 @@ def answer(data: ReportData) -> Answer:
         decided = required(data) if data.require else None
     except DatasetError as error:
         raise StoreError(f"{data.store}: {error}") from None
-    compared = report_data.comparison(data, None if decided is None else (decided.best,))
+    compared = decided.compared if decided else report_data.comparison(data)
     known = compared.known
     one = known.summary.isel({CONFIGURATION: compared.best})
     tiles = [_tile(one, card) for card in CARDS]
@@ -432,8 +429,8 @@ class Required(NamedTuple):
     ----------
     line
         The answer in one line.
-    best
-        Number of the configuration that is named.
+    compared
+        The configuration that is named against each.
     tables
         How far, and the decisions, by configuration.
     details
@@ -444,7 +441,7 @@ class Required(NamedTuple):
     """
 
     line: str
-    best: int
+    compared: report_data.Comparison
     tables: Sequence[Table]
     details: Sequence[Table]
     numbers: Mapping[str, Any]
@@ -463,32 +460,29 @@ def required(data: ReportData) -> Required:
     """
     known = report_data.configurations(data, targets=False)
     results = data.results.isel(known.axes)
-    table = data.once("required", lambda: judged.check_requirements(
-        results, data.require, data.per))
+    table = judged.check_requirements(results, data.require, data.per)
     places = [{name: [k] for name, k in at.items()} for at in known.combinations]
     found = [judged.verdicts(table.isel(at)) for at in places]
     combined = [judged.combined(each) for each in found]
     along, others = report_data.course_of(data)
     # At all other conditions together, and at each of them.
     courses = [((), others), *([(others, ())] if others else [])] if along else []
-    limits = [
-        data.once(("limits", per), partial(
-            requirement_limits, results, data.require, str(along), per=per, at_all=at_all))
-        for per, at_all in courses]
-
+    limits = [requirement_limits(results, data.require, str(along), per=per, at_all=at_all)
+              for per, at_all in courses]
     rows = [[findings.limit_rows(part.isel(at)) for part in limits] for at in places]
     ranks = [(known.wrong[k], ORDER.index(combined[k]),
               *(-sum(row["count"] for row in part) for part in rows[k]))
              for k in range(len(places))]
     equal = [k for k in range(len(places)) if ranks[k] == min(ranks)]
-    best = report_data.comparison(data, tuple(equal)).best if len(equal) > 1 else equal[0]
+    compared = report_data.comparison(data, equal)
+    best = compared.best
     whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
     line = f"{' and '.join(data.require)}: {_decided(found[best], combined[best])}"
     if limits:
         line += f"; along {along}{_reached(rows[best], others)}"
     every = judged.verdicts(table)
     return Required(
-        f"{line}{whose}.", best,
+        f"{line}{whose}.", compared,
         [*map(findings.limit_table, limits), findings.decision_table(every)],
         [findings.condition_table(found[best], table, every=True)],
         {"decision": combined[best], "requirements": every,

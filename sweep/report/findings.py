@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,7 @@ from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA, mark_front
 from sweep.tradeoff.pareto import UNITS as ERRORS
-from sweep.typing import Floats, Integers
+from sweep.typing import Integers
 
 if TYPE_CHECKING:
     from sweep.analysis.requirements import Answer
@@ -578,23 +578,20 @@ def gap_figures(
         ("rotation error, deg", dataset.QUANTITIES[0].norm),
         ("depth error, % of the true depth", lambda poses: poses.range_percent[..., 0]),
     ):
-        rows = [[name, source, Value(x), Value(share)]
-                for k, name in enumerate(names[:MAX_CONFIGURATIONS])
-                for source, side in zip(comparisons.SOURCES, sides, strict=True)
-                for x, share in _distribution(errors_of(side)[k][side.solved[k]])]
+        rows: list[list[Any]] = []
+        for k, name in enumerate(names[:MAX_CONFIGURATIONS]):
+            for source, side in zip(comparisons.SOURCES, sides, strict=True):
+                errors = errors_of(side)[k][side.solved[k]]
+                errors = errors[np.isfinite(errors)]
+                if errors.size:
+                    rows += [[name, source, *point] for point in zip(
+                        np.percentile(errors, PERCENT).tolist(), PERCENT.tolist(), strict=True)]
         figures.append(Figure(
             heading.partition(" ")[0], heading, "", Table.of(
                 "Shares of the solved poses with at most this error",
                 ["configuration", "source", heading, SHARE.heading], rows, stub=2),
             [SHARE], heading, "source"))
     return figures
-
-
-def _distribution(errors: Floats) -> Iterator[tuple[float, float]]:
-    """Yield error and share of the distribution of errors (n,); nothing without errors."""
-    errors = errors[np.isfinite(errors)]
-    if errors.size:
-        yield from zip(np.percentile(errors, PERCENT).tolist(), PERCENT.tolist(), strict=True)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -613,7 +610,7 @@ def calibration_table(summary: xr.Dataset) -> Table:
               for where in summary["direction"].values.tolist()}
     columns = [Column("calibrated", "calibrated"), Column("tried", "tried"), Column("bias", "bias"),
                Column("RMSE", "rmse"), Column("reported sd", "mean_std"),
-               Column("coverage", "coverage"), *(Column(name, name) for name in depths)]
+               Column("coverage", "coverage"), *map(Column, depths, depths)]
     caption = (
         f"Calibrations from the {summary.attrs['points']} points of a board: estimated minus "
         "true, px or 1; share of reported 95 % intervals that hold the truth; error of the depth "
@@ -749,9 +746,7 @@ def measure_tradeoff(
         for line in summary.warnings:
             notice(line)
         store = str(summary.store)
-    question: dict[str, str | float] = {"criterion": criterion}
-    if budget_ms is not None:
-        question["budget_ms"] = budget_ms
+    question = {"criterion": criterion} | ({} if budget_ms is None else {"budget_ms": budget_ms})
     with stage_display() if progress else contextlib.nullcontext() as stage:
         trade, renderers = measure_trade(store, per, limit_s, stage, question=question)
     if figure is not None:
@@ -764,8 +759,8 @@ def measure_tradeoff(
     return Findings(
         [*headlines(trade, criterion), tradeoff_table(trade, criterion),
          *([] if renderers is None else [renderer_table(renderers)]), *few, *found],
-        trade.to_dict() | {"advice": found}
-        | ({} if renderers is None else {"renderers": renderers.to_dict()}),
+        trade.to_dict() | {"advice": found} | (
+            {} if renderers is None else {"renderers": renderers.to_dict()}),
         trade, 0, (f"sweep report {quoted(store)}", "with these costs and a figure of them"))
 
 

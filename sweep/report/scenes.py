@@ -23,7 +23,7 @@ from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.evaluation.results import compare
 from sweep.experiment.pipeline import cell, coordinates_text, selection_text
 from sweep.experiment.schema import VARIABLES, Variable
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
 from sweep.messages import exception_line, quoted
 from sweep.report.report_data import AREA, ReportData
 from sweep.report.table import Table, coordinate, number, plural
@@ -159,15 +159,14 @@ def value_table(
         text = _value_text(variable, value)
         if stored is not None and variable.name in stored:
             other = stored[variable.name]
-            beside = _value_text(variable, other)
-            if beside == text:
-                same = np.array_equal(value, other, equal_nan=variable.flags is None)
-                beside = "" if same else "other last digits"
+            if not np.array_equal(value, other, equal_nan=variable.flags is None):
+                beside = _value_text(variable, other)
+                beside = "other last digits" if beside == text else beside
         rows.append([variable.name, text, variable.units, beside])
     return Table.of("Values of the cell", ["variable", "value", "unit", "stored"], rows, words=True)
 
 
-#: Numbers of a variable that are written out; of more, as of boards' corners, a summary is.
+#: Numbers of a variable that are written out; of more, as of boards' corners, the RMS is.
 MAX_NUMBERS = 12
 
 
@@ -179,9 +178,8 @@ def _value_text(variable: Variable, value: NDArray[Any]) -> str:
     if value.size <= MAX_NUMBERS:
         return " ".join(coordinate(float(number)) for number in value.ravel())
     known = value[np.isfinite(value)]
-    return f"{value.size} x nan" if not known.size else (
-        f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
-        f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
+    rms = f", RMS {coordinate(float(np.sqrt(np.mean(known**2))))}" if known.size else ""
+    return f"{known.size} of {value.size} numbers{rms}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -204,12 +202,11 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
         column = results[name].reset_coords(drop=True)
         return np.ravel(column.broadcast_like(results["estimate"]).transpose(*dims).values)
 
-    estimate, detection, area = values("estimate"), values("detection"), values(AREA)
-    error = values("rotation_error_deg").astype(np.float64)
-    area = np.nan_to_num(area, nan=-1.0, posinf=-1.0)
+    estimate, detection = values("estimate"), values("detection")
+    error, area = values("rotation_error_deg").astype(np.float64), np.nan_to_num(values(AREA))
     solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
     flipped = values("flipped") == Flipped.flipped
-    middle = np.quantile(error[solved], 0.5, method="lower") if solved.any() else math.nan
+    middle = np.median(error[solved]) if solved.any() else math.nan
     kinds = {
         "best: the smallest rotation error": (solved, -error),
         "median rotation error of the solved": (solved, -np.abs(error - middle)),
@@ -217,15 +214,15 @@ def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
         "worst without a flip": (solved & ~flipped, error),
         "flipped to the mirrored pose": (solved & flipped & (error > MIN_FLIP_DEG), area),
     }
-    failures: dict[str, Flag] = {}
-    for flag in (*DetectionStatus, *EstimateStatus):
-        if flag.counted and flag.ends and flag is not EstimateStatus.solved:
-            # A failure of the detection is flagged in the estimate, too: it is shown once.
-            failures.setdefault(flag.name, flag)
-    for name, failure in failures.items():
-        column = detection if isinstance(failure, DetectionStatus) else estimate
-        meaning = f"{failure.meaning[:1].lower()}{failure.meaning[1:]}".removesuffix(".")
-        kinds[f"{name.replace('_', ' ')}: {meaning}"] = column == failure, area
+    # A failure of the detection is flagged in the estimate, too: it is shown once.
+    for column, flags in ((estimate, EstimateStatus), (detection, DetectionStatus)):
+        for flag in flags:
+            if flag.counted and flag.ends and flag is not EstimateStatus.solved:
+                words = flag.name.replace("_", " ")
+                meaning = f"{flag.meaning[:1].lower()}{flag.meaning[1:]}".removesuffix(".")
+                kinds = {title: kind for title, kind in kinds.items()
+                         if title.partition(":")[0] != words}
+                kinds[f"{words}: {meaning}"] = column == flag, area
     shape = [results.sizes[dim] for dim in dims]
     for title, (mask, merit) in kinds.items():
         rows = np.flatnonzero(mask)

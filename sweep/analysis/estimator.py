@@ -168,7 +168,7 @@ def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
 # Who looks at an interval again and again and stops when it is narrow finds it narrow by chance,
 # too: it then covers less than its level. So all intervals of a store whose sampling was stopped
 # have smaller tails, by `TAIL_SHARE` (but those of mean squares, whose upper ends hold what was not
-# seen: `with_unseen_tail`), and those of rates are Clopper and Pearson's. By exact
+# seen: `PositiveMean`), and those of rates are Clopper and Pearson's. By exact
 # enumeration (`tests/sampling/test_stopped_rate.py`) those of rates then cover 95 % at least at any
 # rate; the others by simulation (`tests/sampling/test_stopped_coverage.py`).
 
@@ -369,15 +369,6 @@ def symmetric(estimate: MeanEstimate, level: float) -> Interval:
     return estimate.mean, estimate.mean - half, estimate.mean + half
 
 
-def exponential(estimate: MeanEstimate, level: float) -> Interval:
-    """Return the interval of positive means: Student's of the logarithm, by the delta method."""
-    mean, low, high = symmetric(estimate, level)
-    with np.errstate(all="ignore"):
-        factor = np.exp(half_width(estimate, level) / mean)
-        return (mean, np.where(mean == 0.0, low, mean / factor),
-                np.where(mean == 0.0, high, mean * factor))
-
-
 #: Errors that no draw showed are taken to be at most so many times as large as the largest seen.
 #:
 #: The first is that of intervals: they then cover a root mean square with 0.94 to 0.98, also of
@@ -387,61 +378,6 @@ def exponential(estimate: MeanEstimate, level: float) -> Interval:
 #: met in less than 5 % of the samples of 50, 100 and 400; without, in up to 49 % (`pytest -m
 #: evidence tests/analysis/test_requirements_at_the_limit.py`).
 UNSEEN_FACTOR, GUARDED_UNSEEN_FACTOR = 1.0, 2.0
-
-
-def with_unseen_tail(
-    high: Floats, largest: Floats, draws: Integers | Floats, level: float = LEVEL,
-    factor: float = UNSEEN_FACTOR,
-) -> Floats:
-    """Return upper ends of mean squares that hold rare large errors which no draw showed.
-
-    A sample without outliers says nothing of their size, but it bounds their share: with
-    probability 1 - a, a = (1 - level) / 2, less than p = 1 - a^(1/n) of the population is of a
-    kind that none of n draws is of (Clopper and Pearson's end without a success; over cells the
-    geometric mean of the shares seen is at most the arithmetic one, so that it holds there, too).
-    Errors of that share are taken to be at most ``factor`` times as large as the largest that was
-    seen. That is an assumption: no sample can tell. It lets the end be a p-th part of the square of
-    that and a (1 - p)-th part of the end for the draws that were seen.
-
-    The end of 100 normal errors of one component is then 1.24 times their root mean square, 1.11
-    times of 400 (1.15 and 1.07 without); with the factor of decisions 1.5 and 1.2 times.
-
-    Parameters
-    ----------
-    high
-        Upper ends (groups,) of the mean squares of the draws that were seen.
-    largest
-        Largest squares (groups,) that were seen.
-    draws
-        Independent draws (groups,).
-    level
-        Of the interval.
-    factor
-        Of the largest error that was seen.
-    """
-    with np.errstate(all="ignore"):
-        share = -np.expm1(np.log((1.0 - level) / 2.0) / draws)
-        end = (1.0 - share) * high + share * factor**2 * largest
-        return np.where(np.isfinite(largest), np.fmax(high, end), high)
-
-
-def length_interval(estimate: MeanEstimate, components: int, level: float = LEVEL) -> Interval:
-    """Return the interval of the length of a mean vector, at least 0.
-
-    Along its own direction the mean vector is a plain mean, and the upper end is Student's. The
-    mean's length grows by chance, so the lower end is Scheffé's: the length minus
-    sqrt(k d / (d - k + 1) · F(k, d - k + 1)) standard errors, k components, d degrees of freedom.
-    By the Cauchy-Schwarz inequality this holds a bias of 0 whenever Hotelling's T² does, in 95 %
-    at least. With 50 normal errors of 3 components it covers 0.97 (a large bias) to 0.995 (a bias
-    of its error).
-    """
-    length, low, high = symmetric(estimate, level)
-    rest = estimate.freedom - (components - 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        reach = np.sqrt(
-            components * estimate.freedom / rest * special.fdtri(components, rest, level))
-        low = np.where(rest > 0.0, np.fmax(0.0, length - reach * estimate.error), 0.0)
-    return length, np.where(np.isnan(estimate.error), np.nan, low), high
 
 
 # --------------------------------------------------------------------------------------------------
@@ -481,7 +417,7 @@ class Statistic(ABC, Generic[ViewT]):
     level
         Probability with which the interval is to hold the value.
     unseen_factor
-        Of upper ends of mean squares, as in `with_unseen_tail`.
+        Of upper ends of mean squares, as in `PositiveMean`.
     inputs
         Names of the arrays that it reads, as in `sweep.analysis.dataset.pose_arrays`.
     """
@@ -696,7 +632,15 @@ class Mean(Statistic[ViewT]):
 
 
 class MeanLength(Mean[ViewT]):
-    """The length of the mean of vectors, with the interval of `length_interval`."""
+    """The length of the mean of vectors, with an interval of at least 0.
+
+    Along its own direction the mean vector is a plain mean, and the upper end is Student's. The
+    mean's length grows by chance, so the lower end is Scheffé's: the length minus
+    sqrt(k d / (d - k + 1) · F(k, d - k + 1)) standard errors, k components, d degrees of freedom.
+    By the Cauchy-Schwarz inequality this holds a bias of 0 whenever Hotelling's T² does, in 95 %
+    at least. With 50 normal errors of 3 components it covers 0.97 (a large bias) to 0.995 (a bias
+    of its error).
+    """
 
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
         """Return value, low and high."""
@@ -707,7 +651,14 @@ class MeanLength(Mean[ViewT]):
             direction = np.where(
                 length[:, None] > 0.0, mean / length[:, None], np.eye(1, components))
         along = np.einsum("gcdk,gk->gcd", sums.values, direction)
-        return length_interval(sums.estimate(length, along), components, level)
+        estimate = sums.estimate(length, along)
+        length, low, high = symmetric(estimate, level)
+        rest = estimate.freedom - (components - 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            reach = np.sqrt(
+                components * estimate.freedom / rest * special.fdtri(components, rest, level))
+            low = np.where(rest > 0.0, np.fmax(0.0, length - reach * estimate.error), 0.0)
+        return length, np.where(np.isnan(estimate.error), np.nan, low), high
 
 
 class RootMeanSquareRatio(Mean[ViewT]):
@@ -731,8 +682,19 @@ class RootMeanSquareRatio(Mean[ViewT]):
 class PositiveMean(Mean[ViewT]):
     """The mean of squares, or of other values that are not negative.
 
-    Its interval is Student's of the logarithm, and the upper end also holds rare large values that
-    the draws did not show (`with_unseen_tail`).
+    Its interval is Student's of the logarithm, by the delta method, and the upper end also holds
+    rare large values that the draws did not show.
+
+    A sample without outliers says nothing of their size, but it bounds their share: with
+    probability 1 - a, a = (1 - level) / 2, less than p = 1 - a^(1/n) of the population is of a
+    kind that none of n draws is of (Clopper and Pearson's end without a success; over cells the
+    geometric mean of the shares seen is at most the arithmetic one, so that it holds there, too).
+    Errors of that share are taken to be at most ``unseen_factor`` times as large as the largest
+    that was seen. That is an assumption: no sample can tell. It lets the end be a p-th part of the
+    square of that and a (1 - p)-th part of the end for the draws that were seen.
+
+    The end of 100 normal errors of one component is then 1.24 times their root mean square, 1.11
+    times of 400 (1.15 and 1.07 without); with the factor of decisions 1.5 and 1.2 times.
     """
 
     def arrays(self, columns: Columns[ViewT], design: Design) -> Sequence[NDArray[Any]]:
@@ -754,9 +716,15 @@ class PositiveMean(Mean[ViewT]):
                                 out=np.full(sums.used.shape, -np.inf))
         most = largest.max(axis=(1, 2), initial=-np.inf)
         del largest  # of 10^7 poses it has 80 MB
-        value, low, high = exponential(
-            sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
-        return value, low, with_unseen_tail(high, most, draws, level, self.unseen_factor)
+        estimate = sums.estimate(sums.mean[:, 0], sums.values[..., 0])
+        value, low, high = symmetric(estimate, level)
+        with np.errstate(all="ignore"):
+            factor = np.exp(half_width(estimate, level) / value)
+            low = np.where(value == 0.0, low, value / factor)
+            high = np.where(value == 0.0, high, value * factor)
+            share = -np.expm1(np.log((1.0 - level) / 2.0) / draws)
+            end = (1.0 - share) * high + share * self.unseen_factor**2 * most
+        return value, low, np.where(np.isfinite(most), np.fmax(high, end), high)
 
     def scores(self, columns: Columns[ViewT], *, largest: bool) -> Sums:
         """Return the sums whose mean is taken, ``largest`` as for `sums`."""
@@ -1009,6 +977,7 @@ def read_bins(results: xr.Dataset, kept: Sequence[str], bins: Bins) -> Edges:
     if not isinstance(bins, Mapping):
         raise ArgumentError("bins", bins, "expected names with edges, such as "
                             '{"marker_area_px": [0, 100, 1000]}')
+    edges: dict[str, Floats] = {}
     for name in bins:
         if name not in results.variables or name in kept:
             possible = [str(other) for other, variable in results.variables.items()
@@ -1018,17 +987,13 @@ def read_bins(results: xr.Dataset, kept: Sequence[str], bins: Bins) -> Edges:
         scalar = name in results.coords and not array.dims
         if array.dtype.kind not in "fiu" or scalar or any(dim in LABELS for dim in array.dims):
             raise ArgumentError("bins", name, "expected a variable of one number for each scene")
-    return {name: _increasing(name, given) for name, given in bins.items()}
-
-
-def _increasing(name: str, given: Any) -> NDArray[np.float64]:
-    """Return the edges, if they are."""
-    try:
-        edges = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        edges = np.empty(0)
-    if edges.ndim != 1 or len(edges) < 2 or not (edges[1:] > edges[:-1]).all():
-        raise ArgumentError("bins", name, "expected at least two increasing edges")
+        try:
+            given = np.asarray(bins[name], dtype=np.float64)
+        except (TypeError, ValueError):
+            given = np.empty(0)
+        if given.ndim != 1 or len(given) < 2 or not (given[1:] > given[:-1]).all():
+            raise ArgumentError("bins", name, "expected at least two increasing edges")
+        edges[name] = given
     return edges
 
 

@@ -435,7 +435,7 @@ def check_requirements(
     the distribution. Means (bias, standard deviation, root mean square, efficiency, nees) have the
     intervals of `sweep.analysis.error_statistics` with 99 %, and are undecided below 50 draws. The
     upper ends of those of squares (all but the bias) also hold rare errors that no draw showed, up
-    to twice the largest that one did (`sweep.analysis.estimator.with_unseen_tail`): 100 draws
+    to twice the largest that one did (`sweep.analysis.estimator.PositiveMean`): 100 draws
     of normal errors decide a root mean square that is below 0.6 of its limit, 400 one below 0.75.
     By simulation at the limit a false "met" has a probability below 0.025 for rates and quantiles,
     below 0.05 for means (`pytest -m evidence tests/analysis/test_requirements_at_the_limit.py`), of

@@ -505,7 +505,7 @@ def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr
     """Return `error_statistics` with the intervals by which configurations are preferred.
 
     Upper ends of root mean squares and standard deviations hold rare errors that no draw showed, as
-    those of requirements do (`sweep.analysis.estimator.with_unseen_tail`).
+    those of requirements do (`sweep.analysis.estimator.PositiveMean`).
     """
     return _table(results, per, None, [*map(estimator.guarded, registered())])
 

@@ -371,6 +371,15 @@ class Export:
     seconds: float
 
 
+class ImageFile(NamedTuple):
+    """An image of an export: its path and digest, its bytes, and whether it was written now."""
+
+    name: str
+    digest: str
+    size: int
+    written: bool
+
+
 def export(
     pipeline: Pipeline,
     folder: str | Path,
@@ -416,7 +425,8 @@ def export(
         raise ArgumentError("workers", workers, "expected at least 1")
     target = Path(folder)
     count = len(pipeline.experiment.all_scenes)
-    with translate_errors(plain(folder, 300), "written"):
+    parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
+    with contextlib.ExitStack() as stack, translate_errors(plain(folder, 300), "written"):
         mark = _mark(pipeline, windowed)
         begun = _is_begun(target, mark)
         if not begun and not yes:
@@ -428,7 +438,12 @@ def export(
         finished = (target / CHECKSUMS).exists()
         files: list[ImageFile] = []
         truths: list[Truth] = []
-        for of_images, truth in _parts(pipeline, target, windowed, finished, workers):
+        mapped: Callable[..., Iterator[tuple[list[ImageFile], Truth]]] = map
+        if len(parts) > 1 and workers is not None and workers > 1:
+            mapped = stack.enter_context(ProcessPoolExecutor(
+                workers, mp_context=multiprocessing.get_context("spawn"))).map
+        work = functools.partial(write_images, pipeline, target, windowed, finished)
+        for of_images, truth in mapped(work, parts):
             files += of_images
             truths.append(truth)
             if progress is not None:
@@ -508,30 +523,6 @@ def _write_experiment(pipeline: Pipeline, folder: Path) -> None:
     write_whole(home / "pipeline.toml", pipeline.text.encode())
 
 
-class ImageFile(NamedTuple):
-    """An image of an export: its path and digest, its bytes, and whether it was written now."""
-
-    name: str
-    digest: str
-    size: int
-    written: bool
-
-
-def _parts(
-    pipeline: Pipeline, folder: Path, windowed: bool, finished: bool, workers: int | None
-) -> Iterator[tuple[list[ImageFile], Truth]]:
-    """Yield the parts of an export, in this process or from several."""
-    count = len(pipeline.experiment.all_scenes)
-    parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
-    work = functools.partial(write_images, pipeline, folder, windowed, finished)
-    if workers is None or workers == 1 or len(parts) == 1:
-        yield from map(work, parts)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(work, parts)
-
-
 def write_images(
     pipeline: Pipeline, folder: Path, windowed: bool, finished: bool, numbers: range
 ) -> tuple[list[ImageFile], Truth]:
@@ -562,10 +553,9 @@ def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) ->
     """Refuse an export that is large, or more than fits: StoreError; by a sample of the images."""
     numbers = np.unique(np.linspace(0, count - 1, SAMPLE).astype(np.intp)).tolist()
     images = images_of(pipeline, numbers, windowed=windowed)
-    # A file takes whole pages of the disk.
-    pages = [-(-len(encoded_image(images, row)) // 4096)
+    sizes = [len(encoded_image(images, row))
              for row in np.flatnonzero(images.batch.visible).tolist()]
-    total = int(count * 4096 * np.mean(pages)) if pages else 0
+    total = int(count * np.mean(sizes)) if sizes else 0
     free = free_disk(str(folder))
     if total > min(MAX_BYTES, free.bytes) or count > free.files:
         raise StoreError(

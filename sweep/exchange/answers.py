@@ -14,10 +14,10 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.experiment.document import file_text
 from sweep.messages import nearest, nearest_file, plain, refusal
 from sweep.model.pose import rotation_of_vector
 from sweep.plugins.recording import OF_TARGET, REJECTED
-from sweep.store.locations import reason_of
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -113,6 +113,9 @@ MOST = 1e6
 
 MAX_TOLD_COLUMNS = 12
 
+#: The largest file of answers.
+MAX_BYTES = 10**9
+
 #: What an ID counts that an image has twice.
 DOUBLED = ("refuse", "nearest")
 
@@ -124,20 +127,6 @@ def _refused(source: str, faults: Faults) -> PipelineError:
     """Return the error that lists faults in the order of the file."""
     return refusal([
         f"{source}: line {line}: {plain(faults[line], 300)}" for line in sorted(faults)])
-
-
-def _text(path: Path, source: str) -> str:
-    """Return a file's text, of UTF-8 with or without a byte order mark."""
-    try:
-        content = path.read_bytes()
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        fault = f"not text ({error.reason}); expected CSV in UTF-8"
-        raise _refused(source, {line: fault}) from None
-    except OSError as error:
-        raise StoreError(
-            f"{source}: cannot be read: {reason_of(error)}{nearest_file(path)}") from None
 
 
 def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
@@ -241,7 +230,11 @@ def read_answers(
     if doubled not in DOUBLED:
         raise ArgumentError("doubled", doubled, f"expected {' or '.join(DOUBLED)}")
     source, faults = plain(path, 300), Faults()
-    table = _table(_text(path, source), source, faults)
+    try:
+        text = file_text(path, MAX_BYTES)
+    except ValueError as error:
+        raise StoreError(f"{source}: {error}{nearest_file(path)}") from None
+    table = _table(text, source, faults)
 
     def judge(wrong: pd.Series, words: str, **more: pd.Series) -> None:
         """Note a fault, in words about a line's values, of lines that are wrong and had none."""

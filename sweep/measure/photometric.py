@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -22,32 +21,47 @@ from sweep.measure.solver import (
     poses_of_each_marker,
     reprojection_px,
 )
-from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
+from sweep.model.board import Board, box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.coverage import LEVELS, POSE
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.typing import Floats
+from sweep.typing import Floats, Grey, Integers
 
 # --------------------------------------------------------------------------------------------------
 # First poses of one target, marker or board, and the part of the image that is fitted.
 
-def first_poses(one: Detections, planar: Sequence[Pose], *, refined: bool) -> list[Pose]:
-    """Return poses of a target from its corners, and from those after ``cv2.cornerSubPix``.
+def marker_poses(detections: Detections, *, refined: bool) -> list[list[Pose]]:
+    """Return both planar solutions of each marker's corners, then of its refined corners."""
+    found = [detections.corners]
+    if refined:
+        found.append(np.stack([
+            refined_corners(
+                corners, detections.images[i], detections.origins[i], detections.targets[i])
+            for i, corners in enumerate(detections.corners)
+        ]))
+    solved = [
+        both_planar_solutions(corners, detections.cameras, detections.size_m) for corners in found
+    ] if len(detections) else []
+    return [
+        [(rotation[i, k], translation[i, k]) for rotation, translation in solved for k in range(2)]
+        for i in range(len(detections))
+    ]
 
-    Of one marker both planar solutions, of its corners as detected ``planar``. Of several the poses
-    from the corners of all of them, and that of the marker on which most of the others agree: one
-    marker that is wrong spoils the former.
+
+def board_poses(one: Detections, *, refined: bool) -> list[Pose]:
+    """Return poses of a board from its corners, and from those after ``cv2.cornerSubPix``.
+
+    The poses from the corners of all markers, and that of the marker on which most of the others
+    agree: one marker that is wrong spoils the former.
     """
-    if one.targets.are_markers:
-        poses = [*planar]
-        if refined:
-            rotation, translation = both_planar_solutions(
-                refined_corners(one), one.cameras, one.size_m
-            )
-            poses += zip(rotation[0], translation[0], strict=True)
-        return poses
-    poses, points = [], one.objects_m.reshape(-1, 3)
-    for corners in (one.corners, refined_corners(one)) if refined else (one.corners,):
+    poses: list[Pose] = []
+    points, found = one.objects_m.reshape(-1, 3), [one.corners]
+    if refined:
+        found.append(np.stack([
+            refined_corners(corners, one.images[0], one.origins[0], one.targets[0])
+            for corners in one.corners
+        ]))
+    for corners in found:
         pixels = corners.reshape(-1, 2)
         guard = GuardedPoints.of(points, pixels, one.cameras)
         poses += guard.poses(cv2.SOLVEPNP_IPPE) + guard.poses(cv2.SOLVEPNP_ITERATIVE)
@@ -67,20 +81,21 @@ def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
     return float(np.median(np.nan_to_num(errors, nan=math.inf)))
 
 
-def refined_corners(one: Detections) -> Floats:
-    """Return the corners (k, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    refined, (image,), (origin,) = one.corners.copy(), one.images, one.origins
-    modules, last = module_count(one.targets[0].dictionary), np.array(image.shape[::-1]) - 1
-    for k, corners in enumerate(one.corners - origin):
-        if ((corners >= 0) & (corners <= last)).all():
-            side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-            half = min(5, max(1, round(0.3 * (side / modules))))
-            moved = cv2.cornerSubPix(
-                image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
-                (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
-            )
-            refined[k] = np.asarray(moved[:, 0], dtype=np.float64) + origin
-    return refined
+def refined_corners(corners: Floats, image: Grey, origin: Integers, target: Board) -> Floats:
+    """Return a square's corners (4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers.
+
+    ``origin`` (2,) is the image's first pixel; a square that leaves the image keeps its corners.
+    """
+    inside = corners - origin
+    if not ((inside >= 0) & (inside <= np.array(image.shape[::-1]) - 1)).all():
+        return corners
+    side = float(np.linalg.norm(np.roll(inside, -1, axis=0) - inside, axis=1).mean())
+    half = min(5, max(1, round(0.3 * (side / module_count(target.dictionary)))))
+    moved = cv2.cornerSubPix(
+        image, np.ascontiguousarray(inside[:, None], dtype=np.float32), (half, half), (-1, -1),
+        (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+    )
+    return np.asarray(moved[:, 0].astype(np.float64) + origin)
 
 
 def start_states(poses: list[Pose], middle: Floats, spread_px: float) -> Floats:
@@ -174,36 +189,32 @@ class Photometric:
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with their covariances."""
         out = Estimates.none(len(detections), EstimateStatus.solver_failed)
-        planar = both_planar_solutions(
-            detections.corners, detections.cameras, detections.size_m
-        ) if detections.targets.are_markers else ()
+        other_translation = np.full((len(detections), 3), np.nan)
+        markers = detections.targets.are_markers
+        planar = marker_poses(detections, refined=self.refined) if markers else []
         for i in range(len(detections)):
             one = detections.take(np.array([i]))
             if one.corners.size < 2 * MIN_POINTS:
                 out.status[i] = EstimateStatus.too_few_points
                 continue
-            both = list(zip(*(each[i] for each in planar), strict=True))
-            poses = first_poses(one, both, refined=self.refined)
+            poses = planar[i] if markers else board_poses(one, refined=self.refined)
             middle = float(one.scale[0]) * likelihood.middle_m(one.targets[0])
             states = self._fitted(one, poses, middle, out, i) if poses else None
             if states is None:
                 continue
-            points, pixels = one.objects_m.reshape(-1, 3), one.corners.reshape(-1, 2)
             (rotation, position), (turned, moved) = (
                 (likelihood.rotation_of(state), state[POSITION]) for state in states
             )
             out.rotation[i], out.translation[i] = rotation, position
-            out.alternative_rotation[i] = turned
-            out.reprojection_px[i], out.alternative_reprojection_px[i] = (
-                reprojection_px(*pose, points, pixels, one.cameras) for pose in (
-                    (rotation, position - rotation @ middle), (turned, moved - turned @ middle)
-                )
-            )
-            out.point_count[i] = len(pixels)
-            arm = -out.rotation[i] @ middle
+            out.alternative_rotation[i], other_translation[i] = turned, moved - turned @ middle
+            out.point_count[i] = one.corners.size // 2
+            arm = -rotation @ middle
             if arm.any():
                 out.translation[i] += arm
                 out.covariance[i] = covariance_elsewhere(out.covariance[i], arm)
+        out.reprojection_px[:] = detections.reprojection_px(out.rotation, out.translation)
+        out.alternative_reprojection_px[:] = detections.reprojection_px(
+            out.alternative_rotation, other_translation)
         return out
 
     def _fitted(

@@ -670,16 +670,16 @@ def differentiate(
 
 
 @compiled_inline
-def _add_column(
-    matrix: Floats, vector: Floats, column: Floats, first: int, pixels: float, total: float
+def _add_run(
+    matrix: Floats, vector: Floats, column: Floats, free: int, pixels: float, total: float
 ) -> None:
-    """Add a number of pixels, the sum of whose levels is ``total``, with columns from ``first`` on.
+    """Add a number of pixels without slopes, the sum of whose levels is ``total``.
 
-    To the lower triangle of ``matrix``; the columns before ``first`` are 0.
+    To the lower triangle of ``matrix``; the columns before ``free`` are 0.
     """
-    for k in range(first, len(column)):
+    for k in range(free, len(column)):
         vector[k] += total * column[k]
-        for m in range(first, k + 1):
+        for m in range(free, k + 1):
             matrix[k, m] += pixels * column[k] * column[m]
 
 
@@ -708,9 +708,10 @@ def normal_equations(image: Floats, work: Work, free: int, matrix: Floats, vecto
                 pixels += 1.0
                 total += level
                 continue
-            # A run of pixels with the same areas ends.
-            column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
-            _add_column(matrix, vector, column, free, pixels, total)
+            if pixels > 0.0:
+                # A run of pixels with the same areas ends.
+                column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
+                _add_run(matrix, vector, column, free, pixels, total)
             black += more_black
             white += more_white
             shares[0, i, j] = shares[1, i, j] = 0.0
@@ -726,9 +727,12 @@ def normal_equations(image: Floats, work: Work, free: int, matrix: Floats, vecto
             column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
             for k in range(free):
                 column[k] = slopes[slot, k]
-            _add_column(matrix, vector, column, 0, 1.0, level)
+            for k in range(size):  # not a function: its arguments cost as much as the sums
+                vector[k] += level * column[k]
+                for m in range(k + 1):
+                    matrix[k, m] += column[k] * column[m]
         column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
-        _add_column(matrix, vector, column, free, pixels, total)
+        _add_run(matrix, vector, column, free, pixels, total)
         shares[0, i, width:] = 0.0
         shares[1, i, width:] = 0.0
     for k in range(size):

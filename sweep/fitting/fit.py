@@ -254,7 +254,7 @@ def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]
     direction along the axis, and the information of the shifts.
     """
     marker = state.marker
-    across, along = marker.modules * state.at[axis], marker.modules * state.at[1 - axis]
+    across, along = marker.modules * marker.at[axis], marker.modules * marker.at[1 - axis]
     line, module = np.rint(across), np.floor(along)
     near = (
         (np.abs(across - line) < REACH_MODULES) & (np.abs(along - module - 0.5) < ALONG_MODULES)
@@ -400,7 +400,7 @@ def _corners(state: MarkerState, noise: Floats) -> tuple[Floats, Floats, Floats,
     black, white = np.where(np.isfinite(noise), noise, noise[::-1])
     share = np.clip(state.share, 0.0, 1.0)
     variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
-    cells = np.clip(state.at * CELLS, 0, CELLS - 1).astype(np.int64)
+    cells = np.clip(marker.at * CELLS, 0, CELLS - 1).astype(np.int64)
     number = cells[1] * CELLS + cells[0]
 
     def in_cells(values: Floats) -> Floats:
@@ -599,10 +599,9 @@ def fit_scene(
     ArgumentError
         If nothing can be fitted, in a line.
     """
-    every = np.ones(len(START), dtype=bool)
-    tested_fits = _fitted(views, every, START, say) if known is None else {
-        number: fit for number, fit in known.items() if number in views
-    }
+    all_moved = np.ones(len(START), dtype=bool)
+    every = _fitted(views, all_moved, START, say) if known is None else known
+    tested_fits = {number: fit for number, fit in every.items() if number in views}
     if not tested_fits:
         raise ArgumentError(
             "folders", "no marker fits",

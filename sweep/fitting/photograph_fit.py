@@ -70,13 +70,13 @@ class FittedMarker(NamedTuple):
     ----------
     shown
         The marker and its true pose.
-    levels, used
-        (h, w) grey levels of a box, and which pixels are fitted.
+    used, levels
+        (h, w) which pixels of a box are fitted, and the (n,) grey levels of those.
     ends, sides
         (E, 2, 2) start and end of the print's edges at its true pose, in px of the box,
         none longer than a module; (E, 2) the areas beside them. Black beyond.
     ends_at, at
-        (E, 2, 2) of these points and (2, h, w) of the pixels: column and row as shares of the black
+        (E, 2, 2) of these points and (2, n) of the pixels: column and row as shares of the black
         square's side.
     corners_px
         (4, 2) the true corners of the black square in the box: TL, TR, BR, BL.
@@ -92,8 +92,8 @@ class FittedMarker(NamedTuple):
     """
 
     shown: Shown
-    levels: Floats
     used: Masks
+    levels: Floats
     ends: Floats
     sides: Integers
     ends_at: Floats
@@ -176,7 +176,8 @@ def marker_view(shown: Shown, image: Grey) -> FittedMarker | None:
     clear = marker.margin or 0.0 if shown.on_board is None else clear_modules(shown.on_board)
     beyond = SQUARE + (clear + 1.0) / modules * (2.0 * SQUARE - 1.0)
     return FittedMarker(
-        shown, box.levels, used, ends, sides, ends_at, 0.5 + (0.5 + ring / modules) * box.at,
+        shown, used, box.levels[used], ends, sides, ends_at,
+        0.5 + (0.5 + ring / modules) * box.at[:, used],
         corners - frame_px, modules, float(side_lengths(corners[None]).mean()) / modules,
         (overhang(marker.dictionary) + 0.5) / modules, frame_px,
         _along(image, shown.pixels(beyond)),
@@ -205,7 +206,7 @@ def _along(image: Grey, outline: Floats) -> float:
 
 def is_saturated(markers: Sequence[FittedMarker]) -> bool:
     """Return whether the brightest tenth of a photograph's fitted pixels is cut off at 255."""
-    levels = np.concatenate([each.levels[each.used] for each in markers])
+    levels = np.concatenate([each.levels for each in markers])
     return float(np.quantile(levels, 0.9)) >= SATURATED
 
 
@@ -311,11 +312,6 @@ class MarkerState(NamedTuple):
         return self.parameters[CORNERS:OWN]
 
     @property
-    def at(self) -> Floats:
-        """Column and row of the pixels as shares of the square's side, (2, n)."""
-        return self.marker.at[:, self.marker.used]
-
-    @property
     def noise(self) -> float:
         """Standard deviation of the residuals."""
         freedom = max(len(self.residuals) - OWN, 1)
@@ -354,9 +350,9 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     scale = contrast * inside
     along = scale * (gain * sharp[1:] - amount * wide[1:])
     slope = -along[:2]
-    corners = slope[:, :, None] * _of_corners(marker.at[:, used].T, marker.reach)
+    corners = slope[:, :, None] * _of_corners(marker.at.T, marker.reach)
     return MarkerState(
-        marker, parameters, marker.levels[used] - np.clip(level, 0.0, 255.0), share,
+        marker, parameters, marker.levels - np.clip(level, 0.0, 255.0), share,
         np.column_stack([
             corners.transpose(1, 2, 0).reshape(-1, CORNERS), inside, share * inside, along[2],
             scale * (sharp[0] - wide[0]), scale * tone,
@@ -370,7 +366,7 @@ def fresh_state(marker: FittedMarker, shared: Floats) -> MarkerState:
     parameters = np.concatenate([np.zeros(CORNERS), [0.0, 1.0], shared])
     share = state_at(marker, parameters).share
     design = np.stack([np.ones_like(share), share], axis=1)
-    parameters[CORNERS:OWN] = np.linalg.lstsq(design, marker.levels[marker.used], rcond=None)[0]
+    parameters[CORNERS:OWN] = np.linalg.lstsq(design, marker.levels, rcond=None)[0]
     return state_at(marker, parameters)
 
 
@@ -488,7 +484,7 @@ def _shared_step(
     for state in states:
         own = state.jacobian[:, :OWN]
         if uneven:
-            own = np.hstack([own, *((state.slope * at * (1 - at)).T for at in state.at)])
+            own = np.hstack([own, *((state.slope * at * (1 - at)).T for at in state.marker.at)])
         count = own.shape[1]
         sums = products(np.column_stack([own, state.jacobian[:, OWN:][:, moved], state.residuals]))
         inner, outer = sums[:count, count:], sums[count:, count:]

@@ -25,7 +25,7 @@ from sweep.model.image_file import read_regular
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.folder import FoundCorners
-from sweep.typing import Floats, Integers, Masks
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # A camera, which is a calibration, as OpenCV and as solvers take it.
@@ -134,30 +134,22 @@ def fit_pose(
     used
         (n,) the points to use.
     """
-    chosen = np.ones(len(points), dtype=bool) if used is None else used
-    for last in ((False, False, True) if used is None else (True,)):
-        if chosen.sum() < 4:
-            return None
-        solved = _gauss_newton(camera, points[chosen], pixels[chosen], rotation, translation)
-        if solved is None:
-            return None
-        rotation, translation, covariance = solved
-        residuals = project(camera, points, rotation, translation) - pixels
-        if not last:
-            length = np.linalg.norm(residuals, axis=1)
+    if used is None:
+        used = np.ones(len(points), dtype=bool)
+        for _ in range(2):
+            pose = fit_pose(camera, points, pixels, rotation, translation, used)
+            if pose is None:
+                return None
+            rotation, translation = pose.rotation, pose.translation
+            length = np.linalg.norm(pose.residuals, axis=1)
             # The median length of a two-dimensional normal residual is 1.177 standard deviations.
             spread = float(np.median(length)) / 1.177
-            chosen = length <= max(OUTLIER * spread, MIN_OUTLIER_PX)
-    return FittedPose(rotation, translation, covariance, residuals, chosen)
-
-
-def _gauss_newton(
-    camera: Calibration, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
-) -> tuple[Floats, Floats, Floats] | None:
-    """Return rotation, translation and covariance; None if the steps diverge."""
+            used = length <= max(OUTLIER * spread, MIN_OUTLIER_PX)
+    if used.sum() < 4:
+        return None
     for _ in range(MAX_STEPS):
-        image, design, _ = derivatives(camera, points, rotation, translation)
-        residual = (pixels - image).ravel()
+        image, design, _ = derivatives(camera, points[used], rotation, translation)
+        residual = (pixels[used] - image).ravel()
         if not (np.isfinite(design).all() and np.isfinite(residual).all()):
             return None
         step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
@@ -171,7 +163,9 @@ def _gauss_newton(
             if np.linalg.cond(normal) > 1e18:
                 return None
             variance = float(residual @ residual) / max(len(residual) - 6, 1)
-            return rotation, translation, np.asarray(variance * np.linalg.inv(normal), np.float64)
+            covariance = np.asarray(variance * np.linalg.inv(normal), dtype=np.float64)
+            residuals = project(camera, points, rotation, translation) - pixels
+            return FittedPose(rotation, translation, covariance, residuals, used)
     return None
 
 
@@ -204,11 +198,6 @@ class StereoCamera(NamedTuple):
     right: Calibration
     rotation: Floats
     translation: Floats
-
-    def swapped(self) -> StereoCamera:
-        """Return the same with left and right exchanged."""
-        back = self.rotation.T
-        return StereoCamera(self.right, self.left, back, -back @ self.translation)
 
 
 def camera_of_file(written: str, size: tuple[int, int] | None = None) -> Calibration:
@@ -319,7 +308,8 @@ SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "
 
 
 def check_resolution(
-    written: str, camera: Calibration, size: Integers, found: Sequence[FoundCorners], rms_px: float
+    written: str, camera: Calibration, size: tuple[int, int], found: Sequence[FoundCorners],
+    rms_px: float,
 ) -> None:
     """Refuse a camera of a file that fits the board far better in another resolution.
 

@@ -91,7 +91,7 @@ def read_folder(home: Path, part: Part = Part.whole) -> Folder:
         except ValueError as error:
             left_out.setdefault(str(error), []).append(path.name)
             continue
-        notes.update(_conversions(content))
+        notes.update(_conversions(content, image))
         photographs.append(Photograph(path, digest, image))
     name = plain(home.name, 300)
     lines = [f"{name}: left out {named(some)}: {why}" for why, some in left_out.items()]
@@ -120,17 +120,17 @@ def named(names: Sequence[str]) -> str:
     return f"{listed} and {rest} more" if rest > 0 else listed
 
 
-def _conversions(content: bytes) -> list[str]:
+def _conversions(content: bytes, upright: NDArray[np.uint8]) -> list[str]:
     """Return notes on the conversion of an encoded image to 8-bit grey, upright."""
-    encoded, grey = np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE
-    stored = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED))
-    upright = cv2.imdecode(encoded, grey)
-    straight = cv2.imdecode(encoded, grey | cv2.IMREAD_IGNORE_ORIENTATION)
+    stored, straight = (
+        np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), flags)) for flags in
+        (cv2.IMREAD_UNCHANGED, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    )
     colours = stored.reshape(*stored.shape[:2], -1)[..., :3]
     return [note for holds, note in (
         ((colours != colours[..., :1]).any(), "are in colour; their grey levels are measured"),
         (stored.dtype != np.uint8, "have 16 bits; their upper 8 are measured"),
-        (not np.array_equal(np.asarray(straight), np.asarray(upright)),
+        (not np.array_equal(straight, upright),
          "are turned as their EXIF tag says; a calibration must be of images turned so"),
     ) if holds]
 

@@ -34,36 +34,12 @@ from sweep.model.image_file import Part
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import side_lengths
 from sweep.model.pose import transform_points
-from sweep.photographs.cameras import (
-    MIN_CORNERS,
-    FittedPose,
-    StereoCamera,
-    calibrate,
-    camera_of_file,
-    cameras_of,
-    check_resolution,
-    covariance_of,
-    derivatives,
-    fit_pose,
-    fitted_board,
-    stereo_of_file,
-)
-from sweep.photographs.folder import (
-    Folder,
-    FoundCorners,
-    SeenMarkers,
-    check_board,
-    detect_markers,
-    fault_of,
-    find_corners,
-    named,
-    own_corners,
-    read_folder,
-    reference_detector,
-)
+from sweep.photographs import cameras, folder
+from sweep.photographs.cameras import FittedPose, cameras_of, fit_pose
+from sweep.photographs.folder import FoundCorners, SeenMarkers
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 PathName = str | os.PathLike[str]
 
@@ -88,6 +64,59 @@ class Prepared(NamedTuple):
     lines: tuple[str, ...]
     photographs: int
     markers: int
+
+
+class Side(NamedTuple):
+    """One camera's photographs, and what is known of them.
+
+    Attributes
+    ----------
+    shots
+        The photographs.
+    seen
+        The markers that are detected in each.
+    camera
+        The camera.
+    sizes_m
+        (M,) sides of the markers of the record.
+    record
+        The true poses, which has none before they are written.
+    """
+
+    shots: folder.Folder
+    seen: list[SeenMarkers]
+    camera: Calibration
+    sizes_m: Floats
+    record: PhotographRecord
+
+    def among(self, photograph: int) -> tuple[Integers, Floats]:
+        """Return the numbers (n,) of the markers that are seen, and their corners (n, 4, 2)."""
+        return self.seen[photograph].among(self.record.marker_id)
+
+    def put(
+        self, place: tuple[Any, Any], rotation: Floats, translation: Floats, source: TruthSource,
+        std: Floats | float = np.nan,
+    ) -> None:
+        """Write the poses of photographs and markers, by their numbers."""
+        self.record.rotation[place], self.record.translation[place] = rotation, translation
+        self.record.std[place], self.record.source[place] = std, source
+
+    def corners_px(self, corners_m: Floats, rotation: Floats, translation: Floats) -> Floats:
+        """Return the images (n, 4, 2) of corners (n, 4, 3) at n poses; NaN behind the camera."""
+        return cameras_of(self.camera, len(corners_m)).project(
+            transform_points(corners_m, rotation, translation)
+        )
+
+    def images(self, place: tuple[Any, ...]) -> Floats:
+        """Return the images (n, 4, 2) of n markers at their poses in the record."""
+        corners_m = marker_corners(self.sizes_m[place[1]])
+        return self.corners_px(corners_m, self.record.rotation[place],
+                               self.record.translation[place])
+
+    def are_within(self, pixels: Floats) -> Masks:
+        """Return which markers (n,), of corners (n, 4, 2), are wholly in the frame."""
+        inside = (pixels >= -0.5) & (pixels <= self.record.size - 0.5)
+        return np.asarray(inside.all(axis=(1, 2)))
 
 
 @single_threaded()  # OpenCV's calibration is the same to the bit only then
@@ -137,52 +166,55 @@ def prepare(
     target = None if board is None else board_of(document, plain(board))
     side_by_side = stereo is not None and len(folders) == 1
     halves = (Part.left, Part.right) if side_by_side else (Part.whole,)
-    found = [read_folder(Path(folder), part) for folder in folders for part in halves]
-    lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
+    found = [folder.read_folder(Path(each), part) for each in folders for part in halves]
+    lines = list(dict.fromkeys(line for shots in found for line in shots.lines))
     if stereo is not None:
         _check_pairs(found[0], found[1])
     first, place = found[0], Path(home)
     dictionary, sizes, seen = _detected(target, document, str(board), settings, found)
-    sizes_m = np.array(list(sizes.values()))
     corners = [] if target is None else [
-        find_corners(each.image, target, one)
+        folder.find_corners(each.image, target, one)
         for each, one in zip(first.photographs, seen[0], strict=True)
     ]
-    rig = None if stereo is None else stereo_of_file(str(stereo), first.size)
+    rig = None if stereo is None else cameras.stereo_of_file(str(stereo), first.size)
     if rig is not None:
-        cameras = [rig.left, rig.right]
+        known = [rig.left, rig.right]
     elif str(camera) != CALIBRATE:
-        cameras = [camera_of_file(str(camera), first.size)]
+        known = [cameras.camera_of_file(str(camera), first.size)]
     elif target is not None:
-        calibration, line = calibrate(first.size, corners)
-        cameras, lines = [calibration], [*lines, line]
+        calibrated, line = cameras.calibrate(first.size, corners)
+        known, lines = [calibrated], [*lines, line]
     else:
         raise ArgumentError(
             "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
         )
     described = json.dumps(document, sort_keys=True) if document else ""
-    records = [
-        _without_truth(folder, sizes, described, place)
-        for folder in (found[:1] if one_camera else found)
+    sizes_m = np.array(list(sizes.values()))
+    sides = [
+        Side(*each, sizes_m, _without_truth(each[0], sizes, described, place))
+        for each in zip(found, seen, known, strict=True)
     ]
+    one, *others = sides
     if poses is not None:
-        lines += poses_of_file(records[0], Path(poses), cameras[0], sizes_m, seen[0])
+        lines += poses_of_file(one, Path(poses))
     elif target is not None and (rig is None or one_camera):
-        rms_px, said = board_poses(records[0], target, cameras[0], corners)
+        rms_px, said = board_poses(one, target, corners)
         if rig is None and str(camera) != CALIBRATE:
-            check_resolution(str(camera), cameras[0], records[0].size, corners, rms_px)
+            cameras.check_resolution(str(camera), one.camera, first.size, corners, rms_px)
         lines += said
     elif rig is None:
-        own_poses(records[0], cameras[0], sizes_m, seen[0])
+        own_poses(one)
     else:
-        for k, (record, one) in enumerate(zip(records, (rig, rig.swapped()), strict=False)):
-            partner_poses(record, one, sizes_m, seen[k], seen[1 - k])
-    lines += _summary(records, first, dictionary)
+        back = rig.rotation.T
+        partner_poses(one, others[0], rig.rotation, rig.translation)
+        partner_poses(others[0], one, back, -back @ rig.translation)
+    sides = sides[:1] if one_camera else sides
+    lines += _summary([each.record for each in sides], first, dictionary)
     name = name or name_of(Path(folders[0]))
-    _write_records(records, place, name, overwrite=overwrite)
-    pipeline = _experiment(records, cameras, dictionary, sizes, settings, place, name, first)
-    known = sum(int(each.shown.sum()) for each in records)
-    return Prepared(pipeline, tuple(lines), len(first.photographs), known)
+    _write_records([each.record for each in sides], place, name, overwrite=overwrite)
+    pipeline = _experiment(sides, dictionary, sizes, settings, place, name)
+    markers = sum(int(each.record.shown.sum()) for each in sides)
+    return Prepared(pipeline, tuple(lines), len(first.photographs), markers)
 
 
 def record_home(store: PathName | None) -> tuple[str, str]:
@@ -227,7 +259,7 @@ def _check_arguments(
         raise ArgumentError(*fault)
 
 
-def _check_pairs(left: Folder, right: Folder) -> None:
+def _check_pairs(left: folder.Folder, right: folder.Folder) -> None:
     """Demand photographs of the same names and sizes of both cameras."""
     odd = {(each.path.name, *each.image.shape) for each in left.photographs} ^ {
         (each.path.name, *each.image.shape) for each in right.photographs
@@ -242,7 +274,7 @@ def _check_pairs(left: Folder, right: Folder) -> None:
 
 def _detected(
     board: Board | None, document: Mapping[str, Any], name: str, settings: Sequence[str],
-    found: Sequence[Folder],
+    found: Sequence[folder.Folder],
 ) -> tuple[str, dict[int, float], list[list[SeenMarkers]]]:
     """Return dictionary and sides (m, by increasing ID) of the markers, and those that are seen.
 
@@ -260,14 +292,14 @@ def _detected(
     fixed: dict[str, Any] = {"dictionary": board.dictionary} if board is not None else dict(
         Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set").fixed
     )
-    find, dictionary = reference_detector(), str(fixed["dictionary"])
+    find, dictionary = folder.reference_detector(), str(fixed["dictionary"])
     seen = [
-        [detect_markers(find, each.image, dictionary) for each in folder.photographs]
-        for folder in found
+        [folder.detect_markers(find, each.image, dictionary) for each in shots.photographs]
+        for shots in found
     ]
     every = [each for side in seen for each in side]
     if board is not None:
-        check_board(name, document, board, every, find, found[0].photographs)
+        folder.check_board(name, document, board, every, find, found[0].photographs)
         sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
         sizes = dict(sorted(zip(board.marker_ids, np.round(sides, 12).tolist(), strict=True)))
         return dictionary, sizes, seen
@@ -276,19 +308,19 @@ def _detected(
 
 
 def _summary(
-    records: Sequence[PhotographRecord], folder: Folder, dictionary: str
+    records: Sequence[PhotographRecord], shots: folder.Folder, dictionary: str
 ) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
     shown = np.array([each.shown for each in records])
     if not shown.any():
-        raise fault_of(
-            folder.photographs[0].path.parent,
+        raise folder.fault_of(
+            shots.photographs[0].path.parent,
             f"no photograph shows a whole marker of {dictionary} whose pose is known",
         )
     with_pose = shown.any(axis=2)
     empty = [Path(records[k].paths[i]).name for k, i in np.argwhere(~with_pose).tolist()]
     count = int(with_pose.any(axis=0).sum())
-    lines = [f"no pose of a marker is known in {named(empty)}: not counted"] if empty else []
+    lines = [f"no pose of a marker is known in {folder.named(empty)}: not counted"] if empty else []
     std, translation, sources = (
         np.array([getattr(each, name) for each in records])[shown]
         for name in ("std", "translation", "source")
@@ -305,33 +337,6 @@ def _summary(
 
 
 # --------------------------------------------------------------------------------------------------
-# Poses of M markers in P photographs are written into their record, which has none before.
-
-def put(
-    record: PhotographRecord, place: tuple[Any, Any], rotation: Floats, translation: Floats,
-    source: TruthSource, std: Floats | float = np.nan,
-) -> None:
-    """Write the poses of photographs and markers, by their numbers, into a record."""
-    record.rotation[place], record.translation[place] = rotation, translation
-    record.std[place], record.source[place] = std, source
-
-
-def corners_px(
-    camera: Calibration, corners_m: Floats, rotation: Floats, translation: Floats
-) -> Floats:
-    """Return the images (n, 4, 2) of corners (n, 4, 3) at n poses; NaN behind the camera."""
-    return cameras_of(camera, len(corners_m)).project(
-        transform_points(corners_m, rotation, translation)
-    )
-
-
-def are_within(record: PhotographRecord, pixels: Floats) -> Masks:
-    """Return which markers (n,), of corners (n, 4, 2), are wholly in the frame."""
-    inside = (pixels >= -0.5) & (pixels <= record.size - 0.5)
-    return np.asarray(inside.all(axis=(1, 2)))
-
-
-# --------------------------------------------------------------------------------------------------
 # Poses from markers' own corners, where no board knows better: of one image, or of two.
 #
 # Corners by OpenCV's subpix refinement, poses by IPPE: the better of the two planar solutions in
@@ -344,24 +349,19 @@ MIN_PAIRS = 12
 MAD_TO_STD = 1.4826
 
 
-def own_poses(
-    record: PhotographRecord, camera: Calibration, sizes_m: Floats, seen: Sequence[SeenMarkers]
-) -> None:
-    """Write the poses of markers, of sides (M,), by their own corners."""
-    for photograph, one in enumerate(seen):
-        marker, quads = one.among(record.marker_id)
+def own_poses(side: Side) -> None:
+    """Write the poses of markers by their own corners."""
+    for photograph in range(len(side.seen)):
+        marker, quads = side.among(photograph)
         rotation, translation = both_planar_solutions(
-            quads, cameras_of(camera, len(quads)), sizes_m[marker]
+            quads, cameras_of(side.camera, len(quads)), side.sizes_m[marker]
         )
         good = np.isfinite(rotation[:, 0]).all(axis=(1, 2)) & (translation[:, 0, 2] > 0)
-        put(record, (photograph, marker[good]), rotation[good, 0], translation[good, 0],
-            TruthSource.none)
+        side.put((photograph, marker[good]), rotation[good, 0], translation[good, 0],
+                 TruthSource.none)
 
 
-def partner_poses(
-    record: PhotographRecord, stereo: StereoCamera, sizes_m: Floats, left: Sequence[SeenMarkers],
-    right: Sequence[SeenMarkers],
-) -> None:
+def partner_poses(left: Side, right: Side, turn: Floats, shift: Floats) -> None:
     """Write the poses in left photographs, from the right ones of the same moment.
 
     Their standard deviations are computed from the differences between left and right poses, over
@@ -369,39 +369,35 @@ def partner_poses(
 
     Parameters
     ----------
-    record
-        Of the left photographs.
-    stereo
-        The cameras.
-    sizes_m
-        (M,) sides of the markers.
     left, right
-        P each.
+        Both cameras' photographs; the left one's record gets the poses.
+    turn, shift
+        (3, 3) and (3,) m: a point X in the left camera's frame is ``turn @ X + shift`` in the
+        right one's.
     """
     differences = []
-    for photograph, (own, partner) in enumerate(zip(left, right, strict=True)):
+    for photograph in range(len(left.seen)):
         (own_marker, own_quads), (marker, quads) = (
-            each.among(record.marker_id) for each in (own, partner)
+            each.among(photograph) for each in (left, right)
         )
-        sides = sizes_m[marker]
-        by_partner = both_planar_solutions(quads, cameras_of(stereo.right, len(quads)), sides)
-        rotation = stereo.rotation.T @ by_partner[0]
-        translation = (by_partner[1] - stereo.translation) @ stereo.rotation
-        error = _errors(stereo.right, quads, sides, *by_partner)
+        sides = left.sizes_m[marker]
+        by_partner = both_planar_solutions(quads, cameras_of(right.camera, len(quads)), sides)
+        rotation, translation = turn.T @ by_partner[0], (by_partner[1] - shift) @ turn
+        error = _errors(right.camera, quads, sides, *by_partner)
         _, at_own, at = np.intersect1d(own_marker, marker, return_indices=True)
         error[at] += _errors(
-            stereo.left, own_quads[at_own], sides[at], rotation[at], translation[at]
+            left.camera, own_quads[at_own], sides[at], rotation[at], translation[at]
         )
         # The solution that fits both images better, of markers that have one in the frame.
         row, best = np.arange(len(marker)), np.where(np.isnan(error), np.inf, error).argmin(axis=1)
         rotation, translation = rotation[row, best], translation[row, best]
-        images = corners_px(stereo.left, marker_corners(sides), rotation, translation)
-        good = np.isfinite(error[row, best]) & are_within(record, images)
-        put(record, (photograph, marker[good]), rotation[good], translation[good],
-            TruthSource.stereo_partner)
+        images = left.corners_px(marker_corners(sides), rotation, translation)
+        good = np.isfinite(error[row, best]) & left.are_within(images)
+        left.put((photograph, marker[good]), rotation[good], translation[good],
+                 TruthSource.stereo_partner)
         at_own, at = at_own[good[at]], at[good[at]]
         own_rotation, own_translation = both_planar_solutions(
-            own_quads[at_own], cameras_of(stereo.left, len(at)), sides[at]
+            own_quads[at_own], cameras_of(left.camera, len(at)), sides[at]
         )
         for k, both, shifts in zip(at.tolist(), own_rotation, own_translation, strict=True):
             turns = rotation_difference(both, np.repeat(rotation[k][None], 2, axis=0))
@@ -411,18 +407,17 @@ def partner_poses(
                 differences.append([*turns[j], *(shifts[j] - translation[k])])
     if len(differences) >= MIN_PAIRS:
         spread = MAD_TO_STD * np.median(np.abs(np.array(differences)), axis=0) / np.sqrt(2.0)
-        record.std[record.shown] = spread
+        left.record.std[left.record.shown] = spread
 
 
 def _errors(
     camera: Calibration, quads: Floats, sides: Floats, rotation: Floats, translation: Floats
 ) -> Floats:
     """Return the RMS reprojection errors (k, 2) of both solutions of k markers."""
-    cameras = cameras_of(camera, len(quads))
-    return np.stack([
-        reprojection_errors_px(rotation[:, j], translation[:, j], sides, quads, cameras)
-        for j in range(2)
-    ], axis=1)
+    return reprojection_errors_px(
+        rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), np.repeat(sides, 2),
+        np.repeat(quads, 2, axis=0), cameras_of(camera, 2 * len(quads)),
+    ).reshape(-1, 2)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -435,10 +430,7 @@ NEAR_SHARE = 0.5
 OTHER_UNIT = 1.5
 
 
-def poses_of_file(
-    record: PhotographRecord, path: Path, camera: Calibration, sizes_m: Floats,
-    seen: Sequence[SeenMarkers],
-) -> list[str]:
+def poses_of_file(side: Side, path: Path) -> list[str]:
     """Write a file's poses of markers wholly in their photographs; return lines on them.
 
     Raises
@@ -447,7 +439,8 @@ def poses_of_file(
         If it cannot be read, is of other images or markers, or if most detected markers are not
         where its poses have them; in lines.
     """
-    names, faults = {Path(each).stem: k for k, each in enumerate(record.paths)}, []
+    record, faults = side.record, []
+    names = {Path(each).stem: k for k, each in enumerate(record.paths)}
     if len(names) < len(record.paths):
         raise refusal([f"{plain(path)}: expected photographs of different names without suffixes"])
     try:
@@ -462,40 +455,31 @@ def poses_of_file(
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
     if not faults:
-        own = copy.deepcopy(record)
-        own_poses(own, camera, sizes_m, seen)
-        put(record, (answers.image, marker), answers.rotation, answers.translation,
-            TruthSource.poses_file)
-        faults += _faults(record, own, camera, sizes_m)
+        own = side._replace(record=copy.deepcopy(record))
+        own_poses(own)
+        side.put((answers.image, marker), answers.rotation, answers.translation,
+                 TruthSource.poses_file)
+        faults += _faults(side, own)
     if faults:
         raise refusal([f"{plain(path)}: {fault}" for fault in faults])
     given = np.nonzero(record.shown)
-    cut = ~are_within(record, _of_record(record, given, camera, sizes_m))
+    cut = ~side.are_within(side.images(given))
     record.translation[given[0][cut], given[1][cut]] = np.nan
     line = f"{int(cut.sum()):,} poses of markers that are not wholly in the frame: not counted"
     return [line] if cut.any() else []
 
 
-def _of_record(
-    record: PhotographRecord, place: tuple[Any, ...], camera: Calibration, sizes_m: Floats
-) -> Floats:
-    """Return the images (n, 4, 2) of markers at their poses in a record."""
-    return corners_px(
-        camera, marker_corners(sizes_m[place[1]]), record.rotation[place], record.translation[place]
-    )
-
-
-def _faults(
-    record: PhotographRecord, own: PhotographRecord, camera: Calibration, sizes_m: Floats
-) -> list[str]:
+def _faults(side: Side, own: Side) -> list[str]:
     """Return the fault of poses that are not where markers have their ``own``, if there is one."""
-    both = np.nonzero(record.shown & own.shown)
-    seen = _of_record(own, both, camera, sizes_m)
-    away = np.linalg.norm(_of_record(record, both, camera, sizes_m) - seen, axis=2).max(axis=1)
+    both = np.nonzero(side.record.shown & own.record.shown)
+    seen = own.images(both)
+    away = np.linalg.norm(side.images(both) - seen, axis=2).max(axis=1)
     shares = np.nan_to_num(away / side_lengths(seen).mean(axis=1), nan=np.inf)
     if not len(shares) or np.median(shares) < NEAR_SHARE:
         return []
-    given, detected = (np.linalg.norm(each.translation[both], axis=1) for each in (record, own))
+    given, detected = (
+        np.linalg.norm(each.record.translation[both], axis=1) for each in (side, own)
+    )
     ratio = float(np.median(given / detected))
     return [(
         "most markers are not where its poses have them; expected rotation vectors and positions "
@@ -520,16 +504,16 @@ MIN_HALF = 5
 
 
 def board_poses(
-    record: PhotographRecord, board: Board, camera: Calibration, found: Sequence[FoundCorners]
+    side: Side, board: Board, found: Sequence[FoundCorners]
 ) -> tuple[float, list[str]]:
     """Write the poses of a board's markers in photographs, of markers wholly in them.
 
     Parameters
     ----------
-    record
-        The photographs, and all markers of the board.
-    board, camera
-        The board and the camera.
+    side
+        The photographs, with a record of all markers of the board.
+    board
+        The board.
     found
         The board's corners in each photograph.
 
@@ -539,17 +523,17 @@ def board_poses(
         The RMS in px of the corners of the median photograph, NaN if none has corners enough; and
         a line on it.
     """
-    camera_covariance = covariance_of(camera)
-    boards = [fitted_board(camera, each) for each in found]
+    camera, covariance = side.camera, cameras.covariance_of(side.camera)
+    boards = [cameras.fitted_board(camera, each) for each in found]
     ratio = _halves_ratio(camera, boards, found, 1 if len(board.chessboard_m) else 4)
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
     column = np.argsort(np.argsort(board.marker_ids)).tolist()
-    own = own_corners(board)
+    own = folder.own_corners(board)
     for photograph, (pose, corners) in enumerate(zip(boards, found, strict=True)):
         if pose is None:
             continue
         same = [np.repeat(each[None], len(board), axis=0) for each in pose[:2]]
-        shown = are_within(record, corners_px(camera, board.corners_m, *same))
+        shown = side.are_within(side.corners_px(board.corners_m, *same))
         for k in np.flatnonzero(shown).tolist():
             without = pose.used & ~np.isin(corners.number, own[k])
             _, (axes, centre) = marker_frame(board.corners_m[k])
@@ -557,17 +541,17 @@ def board_poses(
             fitted = fit_pose(
                 camera, points, corners.pixels, pose.rotation @ axes,
                 pose.rotation @ centre + pose.translation, without,
-            ) if without.sum() >= MIN_CORNERS else None
+            ) if without.sum() >= cameras.MIN_CORNERS else None
             if fitted is None:
                 continue
             variance = raised**2 * np.diag(fitted.covariance)
-            if camera_covariance is not None:
+            if covariance is not None:
                 variance = variance + unshared_variance(
-                    camera, camera_covariance, fitted, points[without],
+                    camera, covariance, fitted, points[without],
                     (board.corners_m[k] - centre) @ axes,
                 )
-            put(record, (photograph, column[k]), fitted.rotation, fitted.translation,
-                TruthSource.board_without_this_marker, np.sqrt(variance))
+            side.put((photograph, column[k]), fitted.rotation, fitted.translation,
+                     TruthSource.board_without_this_marker, np.sqrt(variance))
     known = [each.rms_px for each in boards if each is not None]
     if not known:
         return np.nan, []
@@ -585,7 +569,8 @@ def unshared_variance(
     """
     by_points, by_own = (
         np.linalg.lstsq(by_pose, by_camera, rcond=None)[0] for _, by_pose, by_camera in (
-            derivatives(camera, each, pose.rotation, pose.translation) for each in (points, own)
+            cameras.derivatives(camera, each, pose.rotation, pose.translation)
+            for each in (points, own)
         )
     )
     change = np.asarray(by_points - by_own, dtype=np.float64)
@@ -624,14 +609,14 @@ def _halves_ratio(
 # The record of photographs beside their store, and the pipeline that names it.
 
 def _without_truth(
-    folder: Folder, sizes: Mapping[int, float], board: str, home: Path
+    shots: folder.Folder, sizes: Mapping[int, float], board: str, home: Path
 ) -> PhotographRecord:
     """Return the record, in ``home``, of photographs whose markers' poses are not known."""
     numbers = np.array(list(sizes), dtype=np.int64)
-    grid = len(folder.photographs), len(numbers)
+    grid = len(shots.photographs), len(numbers)
     return PhotographRecord(
-        tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in folder.photographs),
-        tuple(each.digest for each in folder.photographs), folder.part, *folder.size, numbers,
+        tuple(os.path.relpath(each.path.resolve(), home.resolve()) for each in shots.photographs),
+        tuple(each.digest for each in shots.photographs), shots.part, *shots.size, numbers,
         np.full((*grid, 3, 3), np.nan), np.full((*grid, 3), np.nan), np.full((*grid, 6), np.nan),
         np.zeros(grid, dtype=np.uint8), board,
     )
@@ -661,21 +646,22 @@ def _write_records(
 
 
 def _experiment(
-    records: Sequence[PhotographRecord], cameras: Sequence[Calibration], dictionary: str,
-    sizes: Mapping[int, float], settings: Sequence[str], home: Path, name: str, folder: Folder,
+    sides: Sequence[Side], dictionary: str, sizes: Mapping[int, float], settings: Sequence[str],
+    home: Path, name: str,
 ) -> Pipeline:
     """Return the experiment on records, of the markers of some sides by their IDs."""
     columns = {
-        "photographs": _record_names(records, name),
-        **{key: [getattr(each, key) for each in cameras[: len(records)]] for key in VIEW},
-        "distortion": [list(each.distortion) for each in cameras[: len(records)]],
+        "photographs": _record_names([each.record for each in sides], name),
+        **{key: [getattr(each.camera, key) for each in sides] for key in VIEW},
+        "distortion": [list(each.camera.distortion) for each in sides],
     }
-    (width, height), shots = folder.size, folder.photographs
+    first = sides[0]
+    (width, height), shots = first.shots.size, first.shots.photographs
     values = {"width_px": width, "height_px": height, "dictionary": dictionary}
     axes: dict[str, Any] = {"trial": len(shots)}
-    if len(records) == 1:
+    if len(sides) == 1:
         values |= {key: column[0] for key, column in columns.items()}
-        values |= {"calibration_sd": list(cameras[0].sd)} if cameras[0].sd else {}
+        values |= {"calibration_sd": list(first.camera.sd)} if first.camera.sd else {}
     else:
         axes["stereo_camera"] = {"zip": columns}
     if len(set(sizes.values())) == 1:

@@ -398,10 +398,11 @@ def twins(
     """
     named = "twins" if isinstance(scene, Mapping) else scene
     measured = library.lifecycle.read_pipeline(photographs)
-    parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene, measured)
+    parameters = (
+        scene if isinstance(scene, Mapping) else library.prepare.read_scene(scene, measured))
     return run(
-        library.twins.twin_pipeline(measured, parameters, repeats),
-        store=store or library.twins.twin_store(photographs, named), progress=progress, **options)
+        library.prepare.twin_pipeline(measured, parameters, repeats),
+        store=store or library.prepare.twin_store(photographs, named), progress=progress, **options)
 
 
 def size(
@@ -510,7 +511,7 @@ def compare(
     one, other = os.fspath(first), os.fspath(second)
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
-        place = os.fspath(store or library.twins.twin_store(one, other))
+        place = os.fspath(store or library.prepare.twin_store(one, other))
         twins(one, other, repeats=repeats, store=place, progress=progress, **options)
         other = place
     else:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sweep.experiment import parameters, pipeline, sampling
     from sweep.fitting import fit
     from sweep.integrity import verification
-    from sweep.photographs import prepare, twins
+    from sweep.photographs import prepare
     from sweep.plugins import loading
     from sweep.report import (
         error_model_file,

@@ -25,7 +25,7 @@ from sweep.cli import main
 from sweep.experiment.parameters import Stage
 from sweep.experiment.photographs import read_board
 from sweep.experiment.pipeline import Pipeline
-from sweep.photographs.twins import read_scene
+from sweep.photographs.prepare import read_scene
 
 TOP = Path(__file__).parent.parent
 FOLDERS = ("pipelines", "sweep", "tests", "notebooks")

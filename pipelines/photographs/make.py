@@ -30,13 +30,12 @@ from sweep.fitting.photograph_fit import (
     START,
     VARIANCE,
     fit_photograph,
-    is_saturated,
     photograph_views,
 )
 from sweep.model.exposure import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.photographs.twins import read_scene, twin_pipeline
+from sweep.photographs.prepare import read_scene, twin_pipeline
 from sweep.report.findings import gap_table
 from sweep.store.lifecycle import read_pipeline
 
@@ -138,8 +137,8 @@ def older_scene(photographs: sweep.Pipeline, fitted: Mapping[str, Any]) -> dict[
     moved = np.zeros(len(START), dtype=bool)
     moved[VARIANCE] = True
     fits = [
-        fit for each in photograph_views(photographs, MARKERS).values()
-        if not is_saturated(each) and (fit := fit_photograph(each, moved, START)) is not None
+        fit for each in photograph_views(photographs, MARKERS)[0].values()
+        if (fit := fit_photograph(each, moved, START)) is not None
     ]
     variance = float(np.mean([fit.parameters[VARIANCE] for fit in fits]))
     deviations = fitted.get("noise_table", [])[1::2] or [0.0]

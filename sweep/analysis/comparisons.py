@@ -1043,7 +1043,7 @@ def simulation_gap(
     photographs
         The dataset of photographs, as `sweep.photos` returns it.
     simulated
-        Their twins (`sweep.photographs.twins`), which are compared marker by marker, or any other
+        Their twins (`sweep.twins`), which are compared marker by marker, or any other
         simulation, which is compared bin by bin.
     bins
         Edges (n + 1,) of bins [low, high) of variables of the scene, by name. Default: none for

@@ -27,17 +27,16 @@ from sweep.experiment.parameters import PHOTOGRAPHS
 from sweep.experiment.photographs import SUFFIX, PhotographRecord
 from sweep.experiment.pipeline import Pipeline
 from sweep.fitting.photograph_fit import (
-    AMOUNT,
-    BLOOM,
     CORNERS,
+    MARKERS,
     OWN,
+    SHARED,
     START,
     VARIANCE,
     MarkerState,
     PhotographFit,
     Views,
     fit_photograph,
-    is_saturated,
     photograph_views,
     products,
 )
@@ -46,9 +45,8 @@ from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.measure.solver import marker_frame, of_board
 from sweep.measure.surroundings import clear_modules
 from sweep.messages import notice, plain
-from sweep.photographs.cameras import derivatives, fit_pose
-from sweep.photographs.prepare import PathName, name_of, prepare, setting_name
-from sweep.photographs.twins import record_of, twin_pipeline
+from sweep.photographs import cameras, prepare
+from sweep.photographs.prepare import PathName
 from sweep.store.files import write_whole
 from sweep.store.lifecycle import open_dataset
 from sweep.typing import Floats, Integers, Masks
@@ -346,10 +344,10 @@ def _beside_truth(
     ])
     first, used = places[0], np.ones(len(points), dtype=bool)
     start = of_board(first.rotation, first.translation, marker_frame(corners[0])[1])
-    pose = fit_pose(first.camera, points, pixels, *start, used)
+    pose = cameras.fit_pose(first.camera, points, pixels, *start, used)
     if pose is None:
         return None
-    _, explained, _ = derivatives(first.camera, points, pose.rotation, pose.translation)
+    _, explained, _ = cameras.derivatives(first.camera, points, pose.rotation, pose.translation)
     return -pose.residuals.ravel(), explained
 
 
@@ -533,53 +531,13 @@ class SceneFit(NamedTuple):
 # --------------------------------------------------------------------------------------------------
 # A camera's scene from photographs of known markers: every term with its interval.
 
-#: Markers of a photograph that are fitted: more of them narrow the intervals little, since
-#: photographs differ by more than the estimates of one.
-MARKERS = 12
-
 #: Photographs from one line of progress to the next.
 SAID = 5
-
-#: Effects that are absent unless needed -> their parameter of a photograph's fit.
-FITTED = {"sharpening": AMOUNT, "bloom": BLOOM}
-
-#: Is told, in a line, how far a fit is.
-Say = Callable[[str], None]
-
-
-def scene_views(pipeline: Pipeline, markers: int = MARKERS) -> tuple[Views, list[str]]:
-    """Return the pixels of photographs that are fitted, and lines on photographs left out.
-
-    Parameters
-    ----------
-    pipeline
-        The experiment of the photographs.
-    markers
-        The most markers of a photograph that are fitted, well spread over the frame.
-
-    Raises
-    ------
-    ArgumentError
-        If nothing can be fitted, in a line.
-    """
-    views = photograph_views(pipeline, markers)
-    good = {number: each for number, each in views.items() if not is_saturated(each)}
-    if not good:
-        raise ArgumentError("folders", *(
-            ("white at level 255",
-             "white is saturated in all photographs: expose less, so that levels are seen")
-            if views else
-            ("no marker", "expected photographs of markers of at least 12 px a side")
-        ))
-    cut = len(views) - len(good)
-    return good, [
-        f"left out {cut} of {len(views)} photographs, in which white is saturated: expose less"
-    ] if cut else []
 
 
 def fit_scene(
     views: Views, refused: Collection[str] = (),
-    known: Mapping[int, PhotographFit] | None = None, say: Say = lambda _: None,
+    known: Mapping[int, PhotographFit] | None = None,
 ) -> SceneFit:
     """Return the scene of a camera from its photographs.
 
@@ -591,8 +549,6 @@ def fit_scene(
         Switches of effects that are left out, for errors are nearer without them.
     known
         Fits of all effects, of an earlier scene's (:attr:`SceneFit.tested_fits`).
-    say
-        Gets lines of progress.
 
     Raises
     ------
@@ -600,7 +556,7 @@ def fit_scene(
         If nothing can be fitted, in a line.
     """
     all_moved = np.ones(len(START), dtype=bool)
-    every = _fitted(views, all_moved, START, say) if known is None else known
+    every = _fitted(views, all_moved, START) if known is None else known
     tested_fits = {number: fit for number, fit in every.items() if number in views}
     if not tested_fits:
         raise ArgumentError(
@@ -610,11 +566,11 @@ def fit_scene(
         )
     tested = _optics(tested_fits)
     kept = np.array([each.excludes(0.0) or not math.isfinite(each.low) for each in tested])
-    kept[[number for name, number in FITTED.items() if name in refused]] = False
+    kept &= [name not in refused for name in SHARED]
     start = START.copy()
     if not (kept[VARIANCE] and tested[VARIANCE].value > 0):
         kept[VARIANCE], start[VARIANCE] = False, 0.0
-    found = tested_fits if kept.all() else _fitted(views, kept, start, say)
+    found = tested_fits if kept.all() else _fitted(views, kept, start)
     # Of effects that are not kept, the estimates with all effects are shown.
     optics = [
         each if keep else test
@@ -638,14 +594,12 @@ def fit_scene(
     return SceneFit(tuple(terms), len(fits), markers, lines, tested_fits)
 
 
-def _fitted(
-    views: Views, moved: Masks, start: Floats, say: Say
-) -> dict[int, PhotographFit]:
+def _fitted(views: Views, moved: Masks, start: Floats) -> dict[int, PhotographFit]:
     """Return the fits of photographs by number, of those in which a marker can be fitted."""
     fits = {}
     for count, (number, markers) in enumerate(views.items()):
         if count % SAID == 0:
-            say(f"fitting photograph {count + 1} of {len(views)}")
+            notice(f"fitting photograph {count + 1} of {len(views)}")
         fit = fit_photograph(markers, moved, start)
         if fit is not None:
             fits[number] = fit
@@ -701,6 +655,7 @@ def _terms(
     ragged = with_reach("ragged edges", "edge_px", edges, "no pixels that say it")
     # The mean profile of edges that are shifted is wider by the variance of their shifts.
     widened = edges.size_px.value**2 if ragged[0].kept else 0.0
+    variance, amount, bloom = zip(optics, tested, strict=True)
     scale, geometry, unknown = UNKNOWN, Field(), "only beside a board or exact poses"
     source = fits[0].states[0].marker.shown.source
     if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
@@ -709,10 +664,9 @@ def _terms(
     return [
         Term("black", "black", black), Term("white", "white", white),
         Term("around the marker", "background", ground),
-        judge("blur", "blur_px", optics[VARIANCE].mapped(lambda square: _root(square - widened)),
-              tested[VARIANCE]),
-        judge("sharpening", "sharpening", optics[AMOUNT], tested[AMOUNT]),
-        judge("bloom (tone)", "bloom", optics[BLOOM], tested[BLOOM]),
+        judge("blur", "blur_px", variance[0].mapped(lambda square: _root(square - widened)),
+              variance[1]),
+        judge("sharpening", "sharpening", *amount), judge("bloom (tone)", "bloom", *bloom),
         *(replace(each, kept=noisy, setting=table) for each in noise), *ragged,
         judge("print's size", "marker_scale", scale, absent=1.0, unknown=unknown),
         *with_reach("geometry", "geometry_px", geometry, unknown),
@@ -789,7 +743,7 @@ def needed(whole: xr.Dataset, without: Mapping[str, xr.Dataset]) -> dict[str, bo
 
 def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
     """Return the pipeline of some of the photographs, by number; their record goes to a folder."""
-    record, name = record_of(pipeline), "held-out"
+    record, name = prepare.record_of(pipeline), "held-out"
     chosen = dataclasses.replace(
         record, **{
             each: getattr(record, each)[numbers]
@@ -811,7 +765,7 @@ def held_out(pipeline: Pipeline, numbers: Integers, folder: Path) -> Pipeline:
 
 
 def checked(
-    found: SceneFit, views: Views, pipeline: Pipeline, home: Path, say: Say
+    found: SceneFit, views: Views, pipeline: Pipeline, home: Path
 ) -> tuple[SceneFit, xr.Dataset]:
     """Return the scene with what moves errors of held-out photographs, and the gap that is left.
 
@@ -820,7 +774,7 @@ def checked(
     """
     numbers, known = list(views), found.tested_fits
     others, held = {number: views[number] for number in numbers[::2]}, np.array(numbers[1::2])
-    say(f"measuring {len(held)} photographs that the scene of the others is compared with")
+    notice(f"measuring {len(held)} photographs that the scene of the others is compared with")
     photographs = held_out(pipeline, held, home)
 
     def measured(experiment: Pipeline, name: str) -> xr.Dataset:
@@ -829,8 +783,8 @@ def checked(
         return open_dataset(store)
 
     def gap_with(scene: Mapping[str, Any], name: str) -> xr.Dataset:
-        say(f"simulating them with {name}")
-        twins = twin_pipeline(photographs, scene, REPEATS)
+        notice(f"simulating them with {name}")
+        twins = prepare.twin_pipeline(photographs, scene, REPEATS)
         return simulation_gap(results, measured(twins, name)).load()
 
     results = measured(photographs, photographs.name)
@@ -862,7 +816,7 @@ TRIALS = 200
 
 def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[str, Any]:
     """Return a pipeline of the fitted camera, with poses as in the photographs."""
-    record, fixed = record_of(pipeline), pipeline.fixed
+    record, fixed = prepare.record_of(pipeline), pipeline.fixed
     first = next(iter(views.values()))[0].shown
     marker = {
         "dictionary": first.marker.dictionary, "marker_id": first.marker.marker_ids[0],
@@ -876,21 +830,20 @@ def scene_document(pipeline: Pipeline, views: Views, found: SceneFit) -> dict[st
     bearing = np.abs(translation[:, :2] / translation[:, 2:])
     wide = np.degrees(np.arctan(MAX_BEARING * np.quantile(bearing, 0.9, axis=0))).tolist()
     turned = {"uniform": [0.0, 360.0]}
+    pose = {
+        "distance_m": _between(translation[:, 2]), "tilt_deg": _between(tilt),
+        "azimuth_deg": turned, "roll_deg": turned,
+    }
+    for name, each in zip(("bearing_x_deg", "bearing_y_deg"), wide, strict=True):
+        if each > 0:
+            pose[name] = {"uniform": [-shortened(each), shortened(each)]}
     return {
         "title": f"The camera of {plain(pipeline.name)}",
         "camera": {
             name: list(fixed[name]) if name == "distortion" else fixed[name] for name in CAMERA
         },
         "marker": marker,
-        "pose": {
-            "distance_m": _between(translation[:, 2]), "tilt_deg": _between(tilt),
-            "azimuth_deg": turned, "roll_deg": turned,
-            **{
-                name: {"uniform": [-shortened(each), shortened(each)]}
-                for name, each in zip(("bearing_x_deg", "bearing_y_deg"), wide, strict=True)
-                if each > 0
-            },
-        },
+        "pose": pose,
         "scene": found.scene,
         "axes": {"trial": TRIALS, "cornerRefinementMethod": ["none", "subpix"]},
     }
@@ -1002,26 +955,26 @@ def fit(
     """
     if not 1 <= markers <= 1000:
         raise ArgumentError("markers", markers, "expected a whole number from 1 to 1000")
-    if all(setting_name(each) in OF_MARKERS for each in settings):
+    if all(prepare.setting_name(each) in OF_MARKERS for each in settings):
         settings = [*settings, COMPARED]
     with tempfile.TemporaryDirectory() as written:
         home = Path(written).resolve()
-        prepared = prepare(
+        prepared = prepare.prepare(
             folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
             one_camera=True,
         )
-        pipeline, name = prepared.pipeline, name_of(Path(folders[0]))
-        views, lines = scene_views(pipeline, markers)
-        found, gap = fit_scene(views, say=notice), None
+        pipeline, name = prepared.pipeline, prepare.name_of(Path(folders[0]))
+        views, lines = photograph_views(pipeline, markers)
+        found, gap = fit_scene(views), None
         if check and len(views) >= 2 * MIN_HELD_OUT:
-            found, gap = checked(found, views, pipeline, home, notice)
+            found, gap = checked(found, views, pipeline, home)
         elif check:
             lines.append(
                 f"fewer than {2 * MIN_HELD_OUT} photographs: no half of them is held out, to see "
                 "which effects move errors"
             )
         document = scene_document(pipeline, views, found)
-        text = scene_text(document, found, record_of(pipeline), name, lines)
+        text = scene_text(document, found, prepare.record_of(pipeline), name, lines)
     for line in (*prepared.lines, *lines):
         notice(line)
     return FittedScene(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
+from sweep.errors import ArgumentError
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
@@ -21,11 +22,15 @@ from sweep.model.image_file import photograph_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
 from sweep.photographs.cameras import cameras_of, project
-from sweep.photographs.twins import record_of
+from sweep.photographs.prepare import record_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Pixels that are fitted: of some markers, well spread over each frame.
+
+#: Markers of a photograph that are fitted: more of them narrow the intervals little, since
+#: photographs differ by more than the estimates of one.
+MARKERS = 12
 
 #: Pixels that get more than this share from outside the print through that point spread are left
 #: out: nothing is known of what lies there.
@@ -110,16 +115,28 @@ class FittedMarker(NamedTuple):
 Views = dict[int, list[FittedMarker]]
 
 
-def photograph_views(pipeline: Pipeline, most: int) -> Views:
-    """Return the fitted pixels of each photograph that shows a marker: of at most ``most`` markers.
+def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, list[str]]:
+    """Return the fitted pixels of photographs, and lines on photographs left out.
 
-    They are those farthest from one another, beginning with the one nearest the frame's centre.
+    Parameters
+    ----------
+    pipeline
+        The experiment of the photographs.
+    most
+        The most markers of a photograph that are fitted: those farthest from one another, beginning
+        with the one nearest the frame's centre.
+
+    Raises
+    ------
+    ArgumentError
+        If nothing can be fitted, in a line.
     """
     record, fixed = record_of(pipeline), pipeline.fixed
     fx, fy, cx, cy, distortion = (
         pipeline.values_of(name)[0] for name in (*VIEW, "distortion")
     )
-    camera, views = Calibration(None, None, fx, fy, cx, cy, tuple(distortion), (), ()), Views()
+    camera = Calibration(None, None, fx, fy, cx, cy, tuple(distortion), (), ())
+    views, count = Views(), 0
     on_board = record.on_board(record.marker_id)
     sizes = np.broadcast_to(pipeline.values_of("size_m"), len(on_board)).tolist()
     for number, (path, digest) in enumerate(zip(record.paths, record.digests, strict=True)):
@@ -133,9 +150,23 @@ def photograph_views(pipeline: Pipeline, most: int) -> Views:
                 ), sizes[k], on_board[k],
             ) for k in np.flatnonzero(record.shown[number]).tolist()
         ]
-        markers = [marker_view(shown, image) for shown in _spread(every, image.shape, most)]
-        views[number] = [each for each in markers if each is not None]
-    return {number: each for number, each in views.items() if each}
+        seen = [marker_view(shown, image) for shown in _spread(every, image.shape, most)]
+        markers = [each for each in seen if each is not None]
+        count += bool(markers)
+        # Whether the brightest tenth of its pixels is cut off at 255.
+        levels = np.concatenate([[0.0], *(each.levels for each in markers)])
+        if markers and np.quantile(levels[1:], 0.9) < SATURATED:
+            views[number] = markers
+    if not views:
+        raise ArgumentError("folders", *(
+            ("white at level 255",
+             "white is saturated in all photographs: expose less, so that levels are seen")
+            if count else
+            ("no marker", "expected photographs of markers of at least 12 px a side")
+        ))
+    cut = count - len(views)
+    line = f"left out {cut} of {count} photographs, in which white is saturated: expose less"
+    return views, [line] if cut else []
 
 
 def _spread(every: Sequence[Shown], shape: tuple[int, ...], most: int) -> list[Shown]:
@@ -204,12 +235,6 @@ def _along(image: Grey, outline: Floats) -> float:
     return float(np.median(image[rows, columns])) if inside.any() else np.nan
 
 
-def is_saturated(markers: Sequence[FittedMarker]) -> bool:
-    """Return whether the brightest tenth of a photograph's fitted pixels is cut off at 255."""
-    levels = np.concatenate([each.levels for each in markers])
-    return float(np.quantile(levels, 0.9)) >= SATURATED
-
-
 # --------------------------------------------------------------------------------------------------
 # The image of printed edges in pixels, and its slopes.
 
@@ -256,8 +281,12 @@ def drawn(ends: Floats, sides: Integers, size: tuple[int, int], sigma_px: float)
 #: Parameters of a marker: the shifts of its four corners, then b and c; with the photograph's.
 CORNERS, OWN, ALL = 8, 10, 13
 
-#: Parameters of a photograph: variance of the point spread in px², amount of sharpening, bloom.
-VARIANCE, AMOUNT, BLOOM = range(3)
+#: First of a photograph's parameters: variance of the point spread in px², amount of sharpening,
+#: bloom.
+VARIANCE = 0
+
+#: The effects of a photograph's parameters, by their names in pipelines.
+SHARED = ("blur_px", "sharpening", "bloom")
 
 #: Radius of the sharpening: what ``sharpening_px`` is unless it is given.
 RADIUS_PX = 1.0
@@ -361,29 +390,29 @@ def state_at(marker: FittedMarker, parameters: Floats) -> MarkerState:
     )
 
 
-def fresh_state(marker: FittedMarker, shared: Floats) -> MarkerState:
-    """Return the state of a marker at its true corners, its levels by least squares."""
+def start_of(marker: FittedMarker, shared: Floats) -> Floats:
+    """Return the parameters of a marker at its true corners, its levels by least squares."""
     parameters = np.concatenate([np.zeros(CORNERS), [0.0, 1.0], shared])
     share = state_at(marker, parameters).share
     design = np.stack([np.ones_like(share), share], axis=1)
     parameters[CORNERS:OWN] = np.linalg.lstsq(design, marker.levels, rcond=None)[0]
-    return state_at(marker, parameters)
+    return parameters
 
 
-def fitted_state(state: MarkerState, moved: Masks) -> MarkerState:
+def fitted_state(marker: FittedMarker, start: Floats, moved: Masks) -> MarkerState:
     """Return the state of least squares; ``moved`` (13,) says which parameters are moved."""
-    at = state
+    at = state_at(marker, start)
 
     def residuals(values: Floats) -> Floats:
         nonlocal at
-        parameters = state.parameters.copy()
+        parameters = start.copy()
         parameters[moved] = values
-        at = state_at(state.marker, np.clip(parameters, LOW, HIGH))
+        at = state_at(marker, np.clip(parameters, LOW, HIGH))
         return -at.residuals
 
     # MINPACK: in one thread, unlike LAPACK's factors of so small matrices.
     found = optimize.least_squares(
-        residuals, state.parameters[moved],
+        residuals, start[moved],
         lambda _: at.jacobian[:, moved],  # of the values for which residuals were computed last
         method="lm", x_scale="jac", ftol=1e-6, xtol=1e-6, max_nfev=MAX_STEPS,
     )
@@ -446,29 +475,28 @@ def fit_photograph(
         (3,) the parameters at which it starts.
     """
     own, shared = np.arange(ALL) < OWN, start.copy()
-    states = [fresh_state(each, shared) for each in markers]
+    starts = [start_of(each, shared) for each in markers]
     states = _good([
-        fitted_state(each, np.append(own[:OWN], moved)) for each in states
-        if abs(each.levels[1]) > MIN_CONTRAST
+        fitted_state(marker, start, np.append(own[:OWN], moved))
+        for marker, start in zip(markers, starts, strict=True)
+        if abs(start[CORNERS + 1]) > MIN_CONTRAST
     ])
     if not states:
         return None
     shared[moved] = np.median([state.parameters[OWN:][moved] for state in states], axis=0)
-    for _ in range(ROUNDS if moved.any() else 0):
-        states = [_with_shared(state, shared, own) for state in states]
-        shared[moved] += _shared_step(states, moved)
-        shared = np.clip(shared, LOW[OWN:], HIGH[OWN:])
-    states = [_with_shared(state, shared, own) for state in states]
+    for number in range(1 + ROUNDS if moved.any() else 1):
+        if number:
+            shared[moved] += _shared_step(states, moved)
+            shared = np.clip(shared, LOW[OWN:], HIGH[OWN:])
+        # Each marker's own parameters at the photograph's ones.
+        states = [
+            fitted_state(each.marker, np.concatenate([each.parameters[:OWN], shared]), own)
+            for each in states
+        ]
     result = shared.copy()
     if moved.any():
         result[moved] += _shared_step(states, moved, uneven=True)
     return PhotographFit(result, tuple(states), photograph_noise(states))
-
-
-def _with_shared(state: MarkerState, shared: Floats, own: Masks) -> MarkerState:
-    """Return the fit of a marker's own parameters at the photograph's ones."""
-    parameters = np.concatenate([state.parameters[:OWN], shared])
-    return fitted_state(state_at(state.marker, parameters), own)
 
 
 def _shared_step(

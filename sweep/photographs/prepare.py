@@ -1,4 +1,4 @@
-"""Photographs made ready to be measured: a record of their truth, and a pipeline that names it."""
+"""Photographs made ready to be measured: the record of their truth, their pipeline, their twins."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.errors import ArgumentError, PipelineError, PluginError, StoreError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.exchange.answers import Conventions, read_answers
-from sweep.experiment.document import section_of
+from sweep.experiment.document import file_text, read_document, refusing, section_of
+from sweep.experiment.grid import TRIAL
+from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
 from sweep.experiment.photographs import (
     SUFFIX,
     PhotographRecord,
@@ -27,7 +29,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
-from sweep.messages import plain, refusal
+from sweep.messages import notice, plain, refusal
 from sweep.model.board import Board
 from sweep.model.calibration import VIEW, Calibration
 from sweep.model.image_file import Part
@@ -198,10 +200,10 @@ def prepare(
     if poses is not None:
         lines += poses_of_file(one, Path(poses))
     elif target is not None and (rig is None or one_camera):
-        rms_px, said = board_poses(one, target, corners)
+        rms_px = board_poses(one, target, corners)
         if rig is None and str(camera) != CALIBRATE:
             cameras.check_resolution(str(camera), one.camera, first.size, corners, rms_px)
-        lines += said
+        lines.append(f"board: {rms_px:.2f} px RMS of its corners in the median photograph")
     elif rig is None:
         own_poses(one)
     else:
@@ -212,7 +214,7 @@ def prepare(
     lines += _summary([each.record for each in sides], first, dictionary)
     name = name or name_of(Path(folders[0]))
     _write_records([each.record for each in sides], place, name, overwrite=overwrite)
-    pipeline = _experiment(sides, dictionary, sizes, settings, place, name)
+    pipeline = _experiment(sides, dictionary, settings, place, name)
     markers = sum(int(each.record.shown.sum()) for each in sides)
     return Prepared(pipeline, tuple(lines), len(first.photographs), markers)
 
@@ -503,9 +505,7 @@ def _faults(side: Side, own: Side) -> list[str]:
 MIN_HALF = 5
 
 
-def board_poses(
-    side: Side, board: Board, found: Sequence[FoundCorners]
-) -> tuple[float, list[str]]:
+def board_poses(side: Side, board: Board, found: Sequence[FoundCorners]) -> float:
     """Write the poses of a board's markers in photographs, of markers wholly in them.
 
     Parameters
@@ -519,9 +519,8 @@ def board_poses(
 
     Returns
     -------
-    tuple
-        The RMS in px of the corners of the median photograph, NaN if none has corners enough; and
-        a line on it.
+    float
+        The RMS in px of the corners of the median photograph, NaN if none has corners enough.
     """
     camera, covariance = side.camera, cameras.covariance_of(side.camera)
     boards = [cameras.fitted_board(camera, each) for each in found]
@@ -553,10 +552,7 @@ def board_poses(
             side.put((photograph, column[k]), fitted.rotation, fitted.translation,
                      TruthSource.board_without_this_marker, np.sqrt(variance))
     known = [each.rms_px for each in boards if each is not None]
-    if not known:
-        return np.nan, []
-    rms_px = float(np.median(known))
-    return rms_px, [f"board: {rms_px:.2f} px RMS of its corners in the median photograph"]
+    return float(np.median(known)) if known else np.nan
 
 
 def unshared_variance(
@@ -646,16 +642,15 @@ def _write_records(
 
 
 def _experiment(
-    sides: Sequence[Side], dictionary: str, sizes: Mapping[int, float], settings: Sequence[str],
-    home: Path, name: str,
+    sides: Sequence[Side], dictionary: str, settings: Sequence[str], home: Path, name: str
 ) -> Pipeline:
-    """Return the experiment on records, of the markers of some sides by their IDs."""
+    """Return the experiment on records."""
     columns = {
         "photographs": _record_names([each.record for each in sides], name),
         **{key: [getattr(each.camera, key) for each in sides] for key in VIEW},
         "distortion": [list(each.camera.distortion) for each in sides],
     }
-    first = sides[0]
+    first, ids, sizes = sides[0], sides[0].record.marker_id.tolist(), sides[0].sizes_m.tolist()
     (width, height), shots = first.shots.size, first.shots.photographs
     values = {"width_px": width, "height_px": height, "dictionary": dictionary}
     axes: dict[str, Any] = {"trial": len(shots)}
@@ -664,10 +659,10 @@ def _experiment(
         values |= {"calibration_sd": list(first.camera.sd)} if first.camera.sd else {}
     else:
         axes["stereo_camera"] = {"zip": columns}
-    if len(set(sizes.values())) == 1:
-        values["size_m"], axes["marker_id"] = next(iter(sizes.values())), list(sizes)
+    if len(set(sizes)) == 1:
+        values["size_m"], axes["marker_id"] = sizes[0], ids
     else:
-        axes["marker"] = {"zip": {"marker_id": list(sizes), "size_m": list(sizes.values())}}
+        axes["marker"] = {"zip": {"marker_id": ids, "size_m": sizes}}
     title = f"Photographs of {plain(shots[0].path.parent.name, 150)}"
     document: dict[str, Any] = {"title": title}
     for key, value in values.items():
@@ -675,3 +670,102 @@ def _experiment(
     document["axes"] = axes
     others = [each for each in settings if setting_name(each) not in ("dictionary", "size_m")]
     return Pipeline.from_dict(document, others, name=name, source="photographs", folder=home)
+
+
+# --------------------------------------------------------------------------------------------------
+# Twins of photographs: images of their markers, simulated at the same poses.
+
+def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1) -> Pipeline:
+    """Return the pipeline that simulates the markers of photographs at their true poses.
+
+    Each image has one marker on a plain ground, with what its board has printed around it. Camera,
+    detectors, estimators, rows and flags are the photographs' own, so that results pair: trial
+    k has the poses of photograph k modulo their number. What is drawn of the scene is drawn for
+    each photograph and repeat, and is the same for all its markers; noise and shifts are each
+    marker's own.
+
+    Parameters
+    ----------
+    pipeline
+        The pipeline of a store of photographs.
+    scene
+        Parameters of the section [scene] by name, as a document has them: values, or
+        distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` is as ``black`` unless
+        it is given.
+    repeats
+        How often each photograph is simulated.
+
+    Raises
+    ------
+    ArgumentError, PipelineError
+        If the pipeline is not one of photographs, or the scene is not valid.
+    """
+    if not pipeline.shows_photographs:
+        raise ArgumentError(
+            "photographs", plain(pipeline.name),
+            "expected a store of photographs, as `sweep photos` makes it",
+        )
+    axis, photographs = pipeline.axis(TRIAL), len(record_of(pipeline).paths)
+    trials = 1 if axis is None else len(axis)
+    if repeats != 1 and (repeats < 1 or trials != photographs):
+        raise ArgumentError(
+            "repeats", repeats, f"expected at least 1; 1 of the first of {photographs} photographs"
+        )
+    document = read_document(pipeline.to_toml())
+    document["title"] = plain(f"Twins of {pipeline.heading}", 200)
+    ground = {"background": scene["black"]} if "black" in scene else {}
+    document["scene"] = {**document.get("scene", {}), SIMULATED: True, **ground, **scene}
+    document.setdefault("axes", {})[TRIAL] = trials * repeats
+    return Pipeline.from_dict(
+        document, name=f"{pipeline.name}-twins", source="scene", folder=pipeline.folder
+    )
+
+
+def record_of(pipeline: Pipeline) -> PhotographRecord:
+    """Return the record of photographs of a pipeline; of two cameras the left one's.
+
+    Raises
+    ------
+    ArgumentError
+        If it cannot be read.
+    """
+    name = str(pipeline.values_of(PHOTOGRAPHS)[0])
+    try:
+        return PhotographRecord.read(Path(pipeline.folder) / name)[0]
+    except PluginError as error:
+        raise ArgumentError(PHOTOGRAPHS, plain(name), f"expected {error}") from None
+
+
+def twin_store(photographs: PathName, scene: PathName) -> str:
+    """Return the store of the twins of a store of photographs with a file's scene.
+
+    >>> twin_store("runs/shots.zarr", "fitted/webcam.toml")
+    'runs/shots-webcam.zarr'
+    """
+    return f"{os.fspath(photographs).rstrip('/').removesuffix('.zarr')}-{Path(scene).stem}.zarr"
+
+
+def read_scene(path: PathName, like: Pipeline | None = None) -> dict[str, Any]:
+    """Return the section [scene] of a TOML file, such as `sweep fit` writes.
+
+    Warns if its camera has other pixels than the camera of ``like``, whose twins get the scene.
+
+    Raises
+    ------
+    ArgumentError, PipelineError
+        If it cannot be read, or has no such section.
+    """
+    name = plain(path, 300)
+    with refusing(name):
+        document = read_document(file_text(os.fspath(path)))
+    scene, camera = document.get("scene"), document.get("camera")
+    if not isinstance(scene, dict):
+        raise ArgumentError("scene", name, "expected a section [scene]")
+    own, other = (
+        "{width_px} x {height_px}".format_map({"width_px": None, "height_px": None, **known})
+        for known in (camera if isinstance(camera, dict) else {}, like.fixed if like else {})
+    )
+    if own != other and "None" not in own + other:
+        notice(f"{name}: fitted to images of {own}, not of {other}: its blur, noise and shifts in "
+               "px are of those")
+    return scene

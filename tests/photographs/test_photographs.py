@@ -33,8 +33,7 @@ from sweep.photographs.cameras import (
     project,
 )
 from sweep.photographs.folder import FoundCorners
-from sweep.photographs.prepare import prepare, unshared_variance
-from sweep.photographs.twins import twin_pipeline
+from sweep.photographs.prepare import prepare, twin_pipeline, unshared_variance
 
 
 @pytest.fixture(scope="module")

@@ -592,9 +592,6 @@ OF_CELLS = ("quantity", *CELLS)
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "sigma": (AT_KNOTS, "standard deviation of the error", "m, radian"),
     "bias": (AT_KNOTS, "mean error, estimated minus true", "m, radian"),
-    "exponent": (
-        ("quantity",),
-        "power of the distance (of the side, if only that varies) with which sigma goes", "1"),
     "coverage": (OF_CELLS, "share of held-out errors within two sigma of the bias", "1"),
     "use": (OF_CELLS, "whether the model may be used", ""),
     "judged": (CELLS, "held-out poses that were judged", "1"),
@@ -633,8 +630,6 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
           the bias (of positions: over the distance) are linear in ln(distance), ln(side) and the
           angle. With two knots of the distance sigma is a power of it. A predictor that does not
           vary, or follows from the distance (``side_px``: one size and camera), has one knot.
-        - ``exponent`` (quantity): of the distance (or the side, where only that varies), if sigma
-          is a power of it at every angle, with its interval.
         - ``coverage`` (quantity, cells): share of errors within two sigma of the bias, by a model
           of the other half of the trials (even, odd); ``judged`` poses.
         - ``use`` (quantity, cells): whether the model may be used there (`Use`): the coverage lies
@@ -704,9 +699,8 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         # The model of each half, by which the other is judged: (halves, knots, quantities, 2).
         fitted = np.stack([_at_knots(half, own, knots)[:2].transpose(2, 1, 0) for half in sums])
         judged = sum(within_of(cells, knots, fitted, block) for block in model)
-        whole = sums.sum(axis=0)
         tables.append({
-            **_of_knots(_at_knots(whole, own, knots), knots), **_exponents(whole),
+            **_of_knots(_at_knots(sums.sum(axis=0), own, knots), knots),
             **_of_cells(np.asarray(judged)),
             **_of_region(model, directions, results.sizes[DRAWS]),
             "knots": np.array([[*map(len, each)] for each in own])})
@@ -771,11 +765,10 @@ def _check_drawn(results: xr.Dataset) -> None:
 def _check_solved(moments: Floats, results: xr.Dataset, kept: Sequence[str]) -> None:
     """Raise DatasetError if a configuration has too few solved poses."""
     solved = moments[..., 0].sum(axis=(2, 3, 4)).min(axis=1).astype(int) * HALVES
-    for number, count in enumerate(solved.tolist()):
+    for count, (at, _) in zip(
+            solved.tolist(), dataset.each_cell(results[[*kept]], kept), strict=True):
         if count < MIN_POSES:
-            index = np.unravel_index(number, [results.sizes[name] for name in kept])
-            which = ", ".join(f"{name} = {results[name].values[k]}"
-                              for name, k in zip(kept, index, strict=True))
+            which = ", ".join(f"{name} = {value}" for name, value in at.items())
             raise DatasetError(
                 f"{which + ': ' if which else ''}{count:,} solved poses that are not flipped; an "
                 f"error model needs {MIN_POSES} or more: more trials, or larger sides")
@@ -847,23 +840,6 @@ def _of_cells(judged: Floats) -> Values:
         Use.holds).astype(np.uint8)
     return {"coverage": np.moveaxis(coverage, -1, 0), "use": np.moveaxis(use, -1, 0), "judged": n,
             "looked_for": looked_for, "solved_rate": solved_rate, "flip_rate": flip_rate}
-
-
-def _exponents(moments: Floats) -> Values:
-    """Return the power of the distance, or of the side, with which sigma goes."""
-    values = np.full((3, len(QUANTITIES)), np.nan)
-    for k in range(len(QUANTITIES)):
-        sums = BinSums.of(moments, k)
-        axis = 0 if np.ptp(sums.at[:, 0]) > 0.05 or np.ptp(sums.at[:, 1]) < 0.05 else 1
-        if np.ptp(sums.at[:, axis]) < 0.05:
-            continue
-        angles = np.unique(np.quantile(sums.at[:, 2], [0, 0.25, 0.5, 0.75, 1]).round(3))
-        design = np.concatenate([sums.at[:, [axis]], hat_basis(sums.at[:, [2]], [angles])], axis=1)
-        fit = fit_error(sums, design, np.zeros([design.shape[1]] * 2))
-        metres = 1.0 if axis == 0 and k < 3 else 0.0
-        half = DEVIATIONS * 0.5 * math.sqrt(max(fit.log_variance_covariance[0, 0], 0.0))
-        values[:, k] = 0.5 * fit.log_variance[0] + metres + half * np.array([0.0, -1.0, 1.0])
-    return {f"exponent{ending}": each for ending, each in zip(INTERVAL, values, strict=True)}
 
 
 # --------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Column, Findings, Table, Value, table_of
+from sweep.report.table import Column, Findings, Table, number, table_of
 from sweep.typing import Integers
 from sweep.version import __version__
 
@@ -28,7 +28,7 @@ TEMPLATE = Path(__file__).parent / "templates" / "error_model.json"
 
 #: Variables of the models that the file has of each quantity.
 OF_QUANTITIES = (
-    *(f"{name}{end}" for name in ("sigma", "bias", "exponent") for end in INTERVAL), "knots",
+    *(f"{name}{end}" for name in ("sigma", "bias") for end in INTERVAL), "knots",
     "coverage")
 
 #: Of the usual rule for one tag: sigma = 0.02 d² metres.
@@ -116,7 +116,7 @@ def _quantity(model: xr.Dataset) -> dict[str, Any]:
 
 def models_apart(models: xr.Dataset) -> list[tuple[dict[str, Any], str, xr.Dataset]]:
     """Return the values of the axes by which models are kept apart, these in words, and each."""
-    dims = [str(dim) for dim in models["exponent"].dims if dim != "quantity"]
+    dims = [str(dim) for dim in models["knots"].dims if dim not in ("quantity", "predictor")]
     return [(at, described(at, " = ") or "the configuration", model)
             for at, model in each_cell(models, dims)]
 
@@ -210,7 +210,7 @@ def error_model_table(models: xr.Dataset) -> Table:
         seen=(use != Use.no_poses).any("quantity").astype(int),
         use=xr.apply_ufunc(_use, use, input_core_dims=[["quantity"]], vectorize=True,
                            output_dtypes=[object]))
-    kept = [str(dim) for dim in models["exponent"].dims if dim != "quantity"]
+    kept = [str(dim) for dim in models["knots"].dims if dim not in ("quantity", "predictor")]
     return table_of(
         table, CAPTION, [*kept, *PREDICTORS],
         [Column("held-out check", "use"), *(
@@ -226,14 +226,14 @@ def _use(flags: Integers) -> str:
 
 
 def exponent_lines(models: xr.Dataset) -> list[str]:
-    """Return, for each configuration, with which power of the distance sigma of z goes."""
-    of = "distance" if models.sizes["distance_m"] > 1 else "side"
+    """Return, for each configuration, with which power of the distance sigma of z goes, if any."""
+    along = "distance_m" if models.sizes["distance_m"] > 1 else "side_px"
     lines = []
     for _, name, model in models_apart(models):
         z = model.sel(quantity="z")
-        power = Value(*(float(z[f"exponent{end}"]) for end in INTERVAL))
-        fits = (z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all()
-        if np.isfinite(power.value):
-            lines.append(f"{name}: sigma of z goes with the {of} to the power {power}" + (
-                "" if fits else "; a power law does not describe it, the knots do"))
+        if models.sizes[along] > 1 and (
+                z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all():
+            first, last = (np.log(z["sigma"].isel({along: k}).values).mean() for k in (0, -1))
+            power = (last - first) / np.log(models[along].values[-1] / models[along].values[0])
+            lines.append(f"{name}: sigma of z goes with {along} to the power {number(power)}")
     return lines

@@ -178,41 +178,40 @@ def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
 
 
 def read_cells(
-    pipeline: Pipeline, block: Block, sources: Sequence[Source]
-) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_], set[str]]:
-    """Read a block's reusable cells from old stores; of several, the first that has a cell.
+    pipeline: Pipeline, block: Block, sources: Sequence[Source], cells: CellsResult
+) -> tuple[Masks, set[str]]:
+    """Take a block's finished cells from old stores; of several, from the first that has a cell.
+
+    Parameters
+    ----------
+    pipeline, block
+        The block of the new grid.
+    sources
+        The old stores.
+    cells
+        Results of the block's N scenes, which are filled.
 
     Returns
     -------
-    Variable -> values in the dataset's dimensions, fill values in cells that are missing; (N,
-    detector settings, estimators) the cells that need not be computed; features of the processors
-    that computed the blocks which cells come from.
+    (N, detector settings, estimators) the cells that need not be computed; features of the
+    processors that computed the blocks which cells come from.
     """
-    settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
-    # The last axis stands in for a grid without any.
-    order = [*(axis.name for axis in (*pipeline.experiment.scene_axes, *settings)), ""]
-    parts = [range(*cut) for cut in zip(block.starts, block.stops, strict=True)]
-    parts += [*(range(len(axis)) for axis in settings), range(1)]
-    cuts = dict(zip(order, parts, strict=True))
-    variables = pipeline.experiment.variables
-    values = {
-        v.name: np.full(
-            [len(cuts[n]) for n in v.dimensions(pipeline) if n in cuts] + list(v.inner_shape),
-            v.fill, dtype=v.dtype,
-        )
-        for v in variables
-    }
-    available = np.zeros([len(part) for part in parts], dtype=bool)
-    processors: set[str] = set()
+    experiment, processors = pipeline.experiment, set[str]()
+    parts = {axis.name: range(*cut) for axis, *cut in zip(
+        experiment.scene_axes, block.starts, block.stops, strict=True)}
+    for stage in (Stage.detection, Stage.estimation):
+        parts |= {axis.name: range(len(axis)) for axis in pipeline.axes_of(stage)}
+    shape = len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
+    available = np.zeros(shape, dtype=bool)
     for source in sources:
         at: dict[str, NDArray[np.intp]] = {}
         for key in source.keys:
-            along = {axis.name: cuts.get(axis.name, range(1)) for axis in key.new}
-            shape = [len(cuts[name]) if name in along else 1 for name in order]
-            rows = np.array([*key.rows([*along.values()])]).reshape(shape)
-            at[key.axis.name] = np.broadcast_to(rows, available.shape)
+            along = {axis.name: parts.get(axis.name, range(1)) for axis in key.new}
+            rows = np.array([*key.rows([*along.values()])]).reshape(
+                [len(part) if name in along else 1 for name, part in parts.items()])
+            at[key.axis.name] = np.broadcast_to(rows, [*map(len, parts.values())]).reshape(shape)
         wanted = ~available & np.all([rows >= 0 for rows in at.values()], axis=0)
-        old, numbers = source.store.blocks, np.zeros(available.shape, dtype=np.intp)
+        old, numbers = source.store.blocks, np.zeros(shape, dtype=np.intp)
         for axis, extent, count in zip(
             source.store.pipeline.experiment.scene_axes, old.extents, old.counts, strict=True
         ):
@@ -220,32 +219,33 @@ def read_cells(
         present = {variable.name for variable in source.store.variables}
         taken = np.zeros_like(available)
         for number in source.done & {*np.unique(numbers[wanted]).tolist()}:
-            cells = np.nonzero(wanted & (numbers == number))
-            inside = {name: index[cells] for name, index in at.items()}
+            inside = wanted & (numbers == number)
             # A cell is finished if its flags say that it was run. With a configuration of a scene
             # (or of a detection), what it shares is copied.
+            where = {name: index[inside] for name, index in at.items()}
             ended = ~np.any([
-                np.isin(source.read(name, number, inside), lost) for name, lost in LOST.items()],
+                np.isin(source.read(name, number, where), lost) for name, lost in LOST.items()],
                 axis=0)
-            inside = {name: index[ended] for name, index in inside.items()}
-            finished = tuple(index[ended] for index in cells)
-            taken[finished] = True
-            for variable in variables if ended.any() else ():
-                if variable.name in present:
-                    target = tuple(finished[order.index(name)]
-                                   for name in variable.dimensions(pipeline) if name in order)
-                    values[variable.name][target] = variable.fitted(
-                        source.read(variable.name, number, inside))
-        rows = np.flatnonzero(taken.reshape(len(block), -1).any(axis=1))
-        if len(rows):  # what follows from the parameters alone
-            drawn = pipeline.experiment.scene_values(block.indices(rows))
-            for v in variables:
+            inside[inside] = ended
+            taken |= inside
+            scene, setting, estimator = np.nonzero(inside)
+            column = {Stage.scene: 0 * scene, Stage.detection: setting,
+                      Stage.estimation: setting * shape[2] + estimator}
+            where = {name: index[ended] for name, index in where.items()}
+            for v in experiment.variables if len(scene) else ():
+                if v.name in present:
+                    cells.columns[v.name][column[v.stage], scene] = v.fitted(
+                        source.read(v.name, number, where))
+        scenes = np.flatnonzero(taken.any(axis=(1, 2)))
+        if len(scenes):  # what follows from the parameters alone
+            drawn = experiment.scene_values(block.indices(scenes))
+            for v in experiment.variables:
                 if v.name not in present:
-                    values[v.name].reshape(-1)[rows] = drawn[v.drawn_as].broadcast(len(rows))
+                    cells.columns[v.name][0, scenes] = drawn[v.drawn_as].broadcast(len(scenes))
         for _, receipt in blocks.receipts(source.store, np.unique(numbers[taken]).tolist()):
             processors.update(receipt.processors)
         available |= taken
-    return values, available.reshape(len(block), pipeline.size(Stage.detection), -1), processors
+    return available, processors
 
 
 # --------------------------------------------------------------------------------------------------
@@ -389,36 +389,29 @@ def _computed(
 
     Cells that a source has are taken from it, the others are computed.
     """
-    pipeline = store.pipeline
-    values, available, processors = read_cells(
-        pipeline, block, sources if needed.any() else ())
+    pipeline, experiment = store.pipeline, store.pipeline.experiment
+    cells = CellsResult.not_run(experiment, len(block))
+    available, processors = read_cells(
+        pipeline, block, sources if needed.any() else (), cells)
     need = needed[:, None, None] & ~available
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
-    cells = CellsResult.not_run(pipeline.experiment, len(block))
     seconds: dict[str, list[float]] = {stage: [] for stage in cells.seconds}
     if len(rows):
         some = _compute(pipeline, block.indices(rows), need[rows], time_limit_s, isolated=isolated)
-        for name, columns in some.columns.items():
-            cells.columns[name][:, rows] = columns
+        # A cell is computed or reused as a whole.
+        computed = {Stage.scene: np.ones((1, len(rows)), dtype=bool),
+                    Stage.detection: need[rows].any(axis=2).T,
+                    Stage.estimation: need[rows].reshape(len(rows), -1).T}
+        for v in experiment.variables:
+            column, row = np.nonzero(computed[v.stage])
+            cells.columns[v.name][column, rows[row]] = some.columns[v.name][column, row]
         seconds, cells.failures = some.seconds, some.failures
         processors.add(processor())
-    computed = {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
-                for v in store.variables}
-    lengths = dict(zip(
-        (axis.name for axis in pipeline.experiment.scene_axes), block.shape, strict=True))
-    for v in store.variables:
-        # A cell is computed or reused as a whole, as the flag of the variable's stage says.
-        new = computed[v.name]
-        flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(v.stage)
-        if flag is None:
-            missing = np.isnan(new) if v.flags is None else new == v.fill
-        else:
-            missing = computed[flag] == 0
-            missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
-        mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
-        whole = np.where(missing, values[v.name], new)
-        values[v.name] = np.where(mask, whole, v.not_needed).astype(v.dtype)
+    for v in experiment.variables:
+        cells.columns[v.name][:, ~needed] = v.not_needed
+    values = {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
+              for v in experiment.variables}
     return values, Receipt(
         run_id=store.run_id,
         processors=tuple(sorted(processors)),

@@ -26,7 +26,6 @@ from sweep.errors import (
     StoreError,
     SweepError,
 )
-from sweep.execution import BLOCK_TASK
 from sweep.isolation.child_process import Child
 from sweep.messages import notice
 from sweep.version import __version__
@@ -177,7 +176,7 @@ def run(
     {'side_px': 2, 'trial': 10}
     """
     # The child imports its packages while this process does.
-    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
+    with Child() as child, library.progress.progress_report(progress) as report:
         read = library.lifecycle.read_pipeline(pipeline)
         if store is None and not isinstance(pipeline, library.pipeline.Pipeline | Mapping):
             store = pipeline if library.lifecycle.names_store(pipeline) else None
@@ -249,7 +248,7 @@ def limit(
     40.0
     """
     # The child imports its packages while this process does.
-    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
+    with Child() as child, library.progress.progress_report(progress) as report:
         source = (
             library.pipeline.Pipeline.from_dict(pipeline) if isinstance(pipeline, Mapping)
             else pipeline)
@@ -447,7 +446,7 @@ def size(
     """
     if not 0.0 < limit_s < float("inf"):
         raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
-    with (Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report,
+    with (Child() as child, library.progress.progress_report(progress) as report,
           library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
             library.lifecycle.read_pipeline(pipeline), store, limit_s=limit_s, progress=report,

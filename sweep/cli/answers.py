@@ -28,7 +28,6 @@ from sweep.cli.command import (
     summarised,
 )
 from sweep.errors import ArgumentError
-from sweep.execution import BLOCK_TASK
 from sweep.isolation.child_process import Child
 from sweep.messages import byte_count, notice, quoted
 
@@ -183,7 +182,7 @@ def limit(
     quiet_matplotlib()
     figure = library.output_file.figure_file(output)
     SESSION.stopped = CONTINUES
-    with Child(BLOCK_TASK) as child, library.progress.progress_display() as display:
+    with Child() as child, library.progress.progress_display() as display:
         limits, summary = library.runner.search_limits(
             pipeline, require=requirements, along=along, per=per, at_all=at_all,
             max_trials=max_trials, settings=settings, store=store, begin=announce_compilation,

@@ -26,7 +26,6 @@ from sweep.cli.command import (
     summarised,
 )
 from sweep.errors import ArgumentError
-from sweep.execution import BLOCK_TASK
 from sweep.isolation.child_process import Child
 from sweep.messages import byte_count, duration, plain, quoted
 
@@ -89,7 +88,7 @@ def run(
         raise ArgumentError("pipeline", pipeline or "",
                             "expected a TOML file, a store, or --example smoke")
     source = pipeline or str(Path(library.__file__).parent / "examples" / f"{example}.toml")
-    with Child(BLOCK_TASK) as child, library.progress.progress_display() as display:
+    with Child() as child, library.progress.progress_display() as display:
         read = read_pipeline(source, settings, precision, max_trials)
         announce_compilation(read)
         SESSION.stopped = f"{CONTINUES}, without --overwrite" if overwrite else CONTINUES
@@ -216,6 +215,8 @@ def _expected(pipeline: Pipeline, expected: SimpleNamespace) -> list[str]:
     if pipeline.stopping is not None:
         poses = f"at least {round(expected.least_share * expected.poses):,}, {poses}"
     over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
+    sampled = f"{expected.sampled} sampled" if expected.sampled else (
+        "assumed: a sampled one raises or ends its process")
     how = "in one process" if expected.workers == 1 else f"with {expected.workers} workers"
     rows = {
         "poses": poses,
@@ -223,7 +224,7 @@ def _expected(pipeline: Pipeline, expected: SimpleNamespace) -> list[str]:
         "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
         "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
-        "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled{ended})",
+        "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({sampled}{ended})",
         "time": f"{most}{over}{duration(expected.seconds)} {how}",
     }
     return [f"{name:8} {text}" for name, text in rows.items()]

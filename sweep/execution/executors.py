@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, Self
 
 from sweep.errors import StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
-from sweep.execution import BLOCK_TASK
 from sweep.execution.block_task import compute_block
 from sweep.isolation.child_process import POLL_S, Child, ChildDiedError, Interrupts
 from sweep.messages import exception_line, notice
@@ -228,7 +227,7 @@ class Children(Executor):
         """
         while len(self._children) < self._count and time.monotonic() >= self._grow_at:
             try:
-                self._children.append(Child(BLOCK_TASK))
+                self._children.append(Child())
             except OSError as error:
                 notice(f"{len(self._children)} of {self._count} processes could be started: "
                        f"{exception_line(error)}")

@@ -16,14 +16,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.errors import ArgumentError, MachineFaultError, RunError, StoreError
+from sweep.errors import ArgumentError, MachineFaultError, StoreError
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.executors import SMALL_RUN_S
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.isolation.child_process import Child, ChildDiedError, ChildError, default_workers
+from sweep.isolation.child_process import (
+    Child,
+    ChildDiedError,
+    ChildRaisedError,
+    default_workers,
+)
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
 from sweep.sampling.rules import Stopping, block_unit, make_rule
@@ -51,7 +56,7 @@ GROWTH = 8
 #: How long a measurement may compile; its own limit stands still meanwhile.
 COMPILATION_LIMIT_S = 900.0
 
-#: Assumed cost of a scene if the measurement crashed.
+#: Assumed cost of a scene if the measurement crashes or raises.
 UNMEASURED_S = 0.01
 
 
@@ -114,10 +119,11 @@ def timed(pipeline: Pipeline, budget_s: float = TIMING_S) -> Timing:
         count = min(wanted, GROWTH * count)
 
 
-def measure(
-    child: Child, pipeline: Pipeline, block_limit_s: float, *, assumed_s: float | None = None
-) -> Timing:
+def measure(child: Child, pipeline: Pipeline, block_limit_s: float) -> Timing:
     """Time a batch of scenes in a child process, which ends if that takes too long.
+
+    If a scene crashes or raises, or this machine is at fault, a cost is assumed: whether machines
+    are is seen by their blocks.
 
     Parameters
     ----------
@@ -125,26 +131,15 @@ def measure(
         The process, and the experiment.
     block_limit_s
         A block's timeout in seconds, of which the measurement takes a small share.
-    assumed_s
-        Seconds that a scene is assumed to take if one crashes or raises, or if this machine is at
-        fault: whether the workers' are is seen by their blocks. Without it, that is an error.
-
-    Raises
-    ------
-    ChildError, MachineFaultError
-        If scenes cannot be measured.
     """
     limit_s = min(TIMING_SHARE * block_limit_s, TIMING_LIMIT_S)
     try:
         return child.call(timed, pipeline, limit_s=limit_s, grace_s=COMPILATION_LIMIT_S)
-    except (ChildError, MachineFaultError) as error:
-        if isinstance(error, ChildDiedError):
-            child.restart()
-            if error.timed_out:
-                return Timing(limit_s, 1, over=True)
-        if assumed_s is None:
-            raise
-        return Timing(assumed_s, 0)
+    except (ChildRaisedError, MachineFaultError):
+        return Timing(UNMEASURED_S, 0)
+    except ChildDiedError as error:
+        child.restart()
+        return Timing(limit_s, 1, over=True) if error.timed_out else Timing(UNMEASURED_S, 0)
 
 
 #: Committed blocks from which the cost of a scene is estimated.
@@ -317,19 +312,11 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     ------
     ArgumentError
         If there are no workers.
-    RunError
-        If a measured scene crashes its process, or raises.
     """
     if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
-    try:
-        with Child("sweep.execution.forecast") as child:
-            timing = measure(child, pipeline, PLAN_S)
-    except ChildError as error:
-        raise RunError(
-            f"a measured scene crashed its process ({error.line}); "
-            "`sweep run` isolates it and computes the others"
-        ) from None
+    with Child() as child:
+        timing = measure(child, pipeline, PLAN_S)
     least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.scene_s
     here = default_workers()
     count = workers or (1 if least < SMALL_RUN_S else here)

@@ -21,7 +21,7 @@ from sweep.errors import (
     StoreError,
     StoreReplacedError,
 )
-from sweep.execution import BLOCK_TASK, TIME_LIMIT_S, forecast, status
+from sweep.execution import TIME_LIMIT_S, forecast, status
 from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
@@ -103,7 +103,7 @@ def execute(
         Called before the first block and after each one.
     child
         The process that measures scenes and computes small runs, if the caller started it earlier
-        (`Child(BLOCK_TASK)`), so that it has imported its packages by now.
+        (`Child()`), so that it has imported its packages by now.
 
     Raises
     ------
@@ -145,14 +145,13 @@ def execute(
         notice(f"{url}: another process is writing it, too: each of the two may compute a block")
 
     with contextlib.ExitStack() as stack:
-        child = stack.enter_context(child or Child(BLOCK_TASK))
+        child = stack.enter_context(child or Child())
         check_plugins(child, pipeline)
         if begun is not None and done:
             timing = forecast.timing_of(begun, done)
             left = 1 - len(done) / len(begun.blocks)
         else:
-            timing = forecast.measure(
-                child, pipeline, time_limit_s or TIME_LIMIT_S, assumed_s=forecast.UNMEASURED_S)
+            timing = forecast.measure(child, pipeline, time_limit_s or TIME_LIMIT_S)
             # In waves, nobody knows how much more than the first one is needed.
             left = forecast.least_share(rule)
         interrupts = stack.enter_context(Interrupts())

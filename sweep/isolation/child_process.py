@@ -57,6 +57,9 @@ GRACE_S = 30.0
 #: How often a child looks whether its caller still lives.
 PARENT_S = 1.0
 
+#: The module that computes scenes and blocks, which most calls need.
+BLOCK_TASK = "sweep.execution.block_task"
+
 
 class ChildError(Exception):
     """A call in a child process has no result."""
@@ -111,7 +114,7 @@ class Child:
     1024
     """
 
-    def __init__(self, module: str = "sweep.isolation.watchdog") -> None:
+    def __init__(self, module: str = BLOCK_TASK) -> None:
         self._module = module
         self._closing = threading.Lock()
         self._start()

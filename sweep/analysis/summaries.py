@@ -17,7 +17,7 @@ from scipy import special, stats
 from sweep.analysis import dataset, estimator
 from sweep.analysis.dataset import DRAWS, QUANTITIES, Poses, Quantity, as_names, describes, stacked
 from sweep.analysis.estimator import INTERVAL, Bins, Count, Mean, Rate, Statistic, aggregate
-from sweep.analysis.intervals import LEVEL, TAIL, clopper_pearson
+from sweep.analysis.intervals import LEVEL
 from sweep.errors import ArgumentError
 from sweep.experiment.schema import POSE_PARAMETERS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, flag, outcomes
@@ -875,17 +875,36 @@ def ambiguity(
               poses.solved & np.isnan(poses["alternative_reprojection_error_px"]))]
     levels = np.unique([*tried, np.inf])
     inputs = dataset.pose_arrays(results, RATIO_INPUTS)
+    together = 1.0 - (1.0 - LEVEL) / len(levels)
     table, *at_levels = estimator.aggregates(
-        results, inputs, kept, [counts, *map(_rates_at, levels)], AmbiguousPoses, bins)
+        results, inputs, kept, [counts, *(_rates_at(each, together) for each in levels)],
+        AmbiguousPoses, bins)
     table = table.assign(stacked(at_levels, "threshold")).assign_coords(
         threshold=("threshold", levels, cf_attributes(
             "largest ratio of both reprojection errors that is kept", "1")))
-    tail = TAIL * estimator.TAIL_SHARE if dataset.is_sampling_stopped(results) else TAIL
-    return _with_choice(table, flip_rate, min_kept, tail)
+    useful = (table["kept_rate"] >= min_kept) | np.isinf(table["threshold"])
+    low = table["kept_flip_rate_low"]
+    meets = useful & (table["bound_high"] <= flip_rate)
+    of_all = {"threshold": -1}
+    choice = table["solved"].copy(data=np.select(
+        [table["kept"].isel(of_all) == 0, low.isel(of_all).isnull(), meets.isel(of_all),
+         meets.any("threshold"), ((low > flip_rate) | ~useful).all("threshold")],
+        [ThresholdChoice.not_run, ThresholdChoice.nothing_drawn, ThresholdChoice.not_needed,
+         ThresholdChoice.found, ThresholdChoice.none],
+        ThresholdChoice.too_few_draws).astype(np.uint8))
+    # The largest threshold that meets.
+    at = (meets * np.arange(table.sizes["threshold"])).argmax("threshold")
+    columns = table.isel(threshold=at).reset_coords("threshold").where(meets.any("threshold"))
+    chosen = {f"chosen_{name}": columns[source].assign_attrs(cf_attributes(meaning, "1"))
+              for name, (source, meaning) in CHOSEN.items()}
+    chosen["choice"] = choice.assign_attrs(
+        cf_attributes("whether a threshold keeps the wanted flip rate", flags=ThresholdChoice))
+    return table.drop_vars([f"bound{end}" for end in INTERVAL]).assign(chosen).assign_attrs(
+        flip_rate=flip_rate, min_kept=min_kept)
 
 
-def _rates_at(threshold: float) -> list[Rate[AmbiguousPoses]]:
-    """Return the rates at a threshold."""
+def _rates_at(threshold: float, together: float) -> list[Rate[AmbiguousPoses]]:
+    """Return the rates at a threshold, and one with an interval for all thresholds together."""
     def kept(poses: AmbiguousPoses) -> Masks:
         return np.asarray(poses.solved & (poses.ratio <= threshold))
 
@@ -903,7 +922,8 @@ def _rates_at(threshold: float) -> list[Rate[AmbiguousPoses]]:
             ("right_rejected_rate", "rejected of the poses that are not flipped", rejected,
              attrgetter("unflipped")),
             ("rejected_right_rate", "not flipped of the rejected poses", attrgetter("unflipped"),
-             rejected))]
+             rejected))
+    ] + [Rate("bound", "", attrgetter("flipped"), kept, exact=True, level=together)]
 
 
 #: Variables at the chosen threshold: name there -> description.
@@ -911,36 +931,7 @@ CHOSEN = {
     "threshold": ("threshold", "largest threshold that is shown to keep the wanted flip rate"),
     "kept_rate": ("kept_rate", "kept of the solved poses, at the chosen threshold"),
     "flip_rate": ("kept_flip_rate", "flips of the kept poses, at the chosen threshold"),
-    "flip_rate_bound": ("bound", "upper bound of the flip rate at the chosen threshold"),
+    "flip_rate_bound": ("bound_high", "upper bound of the flip rate at the chosen threshold"),
     "right_rejected_rate": (
         "right_rejected_rate", "rejected of the poses not flipped, at the chosen threshold"),
 }
-
-
-def _with_choice(
-    table: xr.Dataset, flip_rate: float, min_kept: float, tail: float
-) -> xr.Dataset:
-    """Return the table with the chosen threshold of each group."""
-    _, most = estimator.scaled_to_draws(*(
-        table[name].values for name in ("kept_flipped", "kept", "draws")))
-    level = 1.0 - 2.0 * tail / table.sizes["threshold"]
-    bound = table["kept"].copy(data=clopper_pearson(most, table["draws"], level)[1])
-    useful = (table["kept_rate"] >= min_kept) | np.isinf(table["threshold"])
-    low = table["kept_flip_rate_low"]
-    meets = useful & low.notnull() & (bound <= flip_rate)
-    of_all = {"threshold": -1}
-    choice = table["solved"].copy(data=np.select(
-        [table["kept"].isel(of_all) == 0, low.isel(of_all).isnull(), meets.isel(of_all),
-         meets.any("threshold"), ((low > flip_rate) | ~useful).all("threshold")],
-        [ThresholdChoice.not_run, ThresholdChoice.nothing_drawn, ThresholdChoice.not_needed,
-         ThresholdChoice.found, ThresholdChoice.none],
-        ThresholdChoice.too_few_draws).astype(np.uint8))
-    # The largest threshold that meets.
-    at = (meets * np.arange(table.sizes["threshold"])).argmax("threshold")
-    columns = table.assign(bound=bound).isel(threshold=at).reset_coords("threshold").where(
-        meets.any("threshold"))
-    chosen = {f"chosen_{name}": columns[source].assign_attrs(cf_attributes(meaning, "1"))
-              for name, (source, meaning) in CHOSEN.items()}
-    chosen["choice"] = choice.assign_attrs(
-        cf_attributes("whether a threshold keeps the wanted flip rate", flags=ThresholdChoice))
-    return table.assign(chosen).assign_attrs(flip_rate=flip_rate, min_kept=min_kept)

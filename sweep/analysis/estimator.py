@@ -16,8 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, replace
-from enum import Enum
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -47,6 +46,9 @@ class DrawnPoses(Protocol):
 
 ViewT = TypeVar("ViewT", bound=DrawnPoses)
 ResultT = TypeVar("ResultT")
+
+#: Arrays (groups, cells, draws, ...) of a block's view and its groups.
+Parts = Callable[[ViewT, slice], Sequence[NDArray[Any]]]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -108,9 +110,7 @@ class Columns(Generic[ViewT]):
             self._views[number] = view
         return self._views[number]
 
-    def joined(
-        self, function: Callable[[ViewT, slice], Sequence[NDArray[Any]]]
-    ) -> list[NDArray[Any]]:
+    def joined(self, function: Parts[ViewT]) -> list[NDArray[Any]]:
         """Return arrays (groups, cells, draws, ...) of all blocks.
 
         ``function`` gives the arrays of a block's view and its groups.
@@ -125,9 +125,7 @@ class Columns(Generic[ViewT]):
         self.map(fill)
         return out
 
-    def by_draw(
-        self, function: Callable[[ViewT, slice], Sequence[NDArray[Any]]]
-    ) -> list[NDArray[Any]]:
+    def by_draw(self, function: Parts[ViewT]) -> list[NDArray[Any]]:
         """Return the sums over settings (groups, cells, draws, ...) of arrays of poses.
 
         ``function`` gives arrays (groups, cells, draws, settings, ...) of a block's view and its
@@ -195,12 +193,8 @@ def stopped_level(level: float) -> float:
     return 1.0 - (1.0 - level) * TAIL_SHARE
 
 
-class Unit(Enum):
-    """The unit that is drawn independently of all else."""
-
-    trial = "trial"
-    photograph = "photograph"
-    replicate = "replicate"
+#: The unit that is drawn independently of all else.
+Unit = Literal["trial", "photograph", "replicate"]
 
 
 @dataclass(frozen=True)
@@ -217,7 +211,7 @@ class Design:
         Whether sampling stopped when intervals were narrow, or a decision was sure.
     """
 
-    unit: Unit = Unit.trial
+    unit: Unit = "trial"
     points: int = 1
     stopped: bool = False
 
@@ -242,10 +236,10 @@ class Design:
             Of the interval.
         """
         sample = Sample(used)
-        if self.unit is Unit.trial:
+        if self.unit == "trial":
             return sample.draws.astype(np.float64)
         n, successes = sample.n.astype(np.float64), hits.sum(axis=(1, 2), dtype=np.float64)
-        of_points = self.unit is Unit.replicate
+        of_points = self.unit == "replicate"
         tail = (1.0 - level) / 2.0
         with np.errstate(all="ignore"):
             rate = successes / n
@@ -703,7 +697,7 @@ class PositiveMean(Mean[ViewT]):
 
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:
         """Return value, low and high."""
-        of_points = design.unit is Unit.replicate
+        of_points = design.unit == "replicate"
         sums = self.scores(columns, largest=of_points)
         sample = Sample(sums.used)
         # A draw with all its poses may be unseen, or a point of the replicates.
@@ -879,7 +873,7 @@ def quantile_intervals(
     for at, percent in enumerate(percents):
         ranks, share = np.zeros((len(n), 3), dtype=np.int64), percent / 100.0
         ranks[:, 0] = -(-n * percent // 100)
-        if design.unit is Unit.photograph:
+        if design.unit == "photograph":
             value = values_at(ascending, ranks[:, :1])
             below = sum_of_settings(errors <= value.reshape(-1, 1, 1, 1))
             worth = design.worth(below, used, level)
@@ -1120,8 +1114,8 @@ def arranged(
     settings = [name for name in pooled if name not in (*cells, *draws)]
     axes = {"groups": kept, "cells": cells, "draws": draws, "settings": settings}
     order = dataset.replicate_order(results, draws)
-    unit = Unit.replicate if order is not None else (
-        Unit.photograph if dataset.of_photographs(results) else Unit.trial)
+    unit: Unit = "replicate" if order is not None else (
+        "photograph" if dataset.of_photographs(results) else "trial")
     points = math.prod(sizes[name] for name in settings)
     return ({name: _column(array, axes, sizes, order) for name, array in inputs.items()},
             Design(unit, points, stopped))

@@ -7,7 +7,7 @@ from scipy import stats
 
 from support.photograph_results import PHOTOGRAPHS, REFINEMENTS, results_of, twins
 from sweep.analysis import detection_rate, flip_rate, simulation_gap
-from sweep.analysis.estimator import Design, Unit, quantile_intervals
+from sweep.analysis.estimator import Design, quantile_intervals
 from sweep.analysis.intervals import percentile_interval, resampled_quantiles, unit_counts
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -17,7 +17,7 @@ def interval(values, used, percent):
     """Return a quantile of (photographs, markers) and the ends of its interval."""
     found = quantile_intervals(
         np.where(used, values, np.nan)[None, None], used.sum(axis=1)[None, None], [percent],
-        Design(Unit.photograph))
+        Design("photograph"))
     return found[0, 0].tolist()
 
 

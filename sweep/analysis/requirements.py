@@ -121,7 +121,7 @@ def requirable_arrays(
     Raises
     ------
     DatasetError
-        If the dataset lacks a variable, one line for each requirable.
+        If the dataset lacks a variable, one line for each quantity.
     """
     lacking = [f"{each.name}: cannot be computed, for this store lacks {', '.join(missing)}"
                for each in required
@@ -1051,7 +1051,7 @@ def requirement_limits(
     if not along:
         raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
     required = parse_requirements(require)
-    values = axis_values(results, along)
+    require_order(results, along)
     together = [name for name in as_names(at_all or ()) if name != along]
     names = [name for name in (as_names(per) if per is not None else axes_of(results, Stage.scene))
              if name != along and (per is not None or name not in (DRAWS, *together))]
@@ -1060,13 +1060,13 @@ def requirement_limits(
     count = len(required) * math.prod(results.sizes.get(name, 1) for name in (along, *together))
     table = decide(results, required, [*names, *together, along],
                    shares=error_shares(looks_factor(looks), count))
-    upwards = is_harder_upwards(
-        along, table["keeps"].transpose(along, ...).to_numpy()[np.argsort(values)])
-    order = np.argsort(values if upwards else -values, kind="stable")
+    table = table.sortby(along)
+    upwards = is_harder_upwards(along, table["keeps"].transpose(along, ...).to_numpy())
+    table = table.isel({along: slice(None, None, 1 if upwards else -1)})
     inner = (along, *together, "requirement")
     kept = [str(dim) for dim in table["decision"].dims if dim not in inner]
     rows = [_limit(part.transpose(along, ...), along, together, upwards=upwards)
-            for _, part in each_cell(table.isel({along: order}), kept)]
+            for _, part in each_cell(table, kept)]
     columns = {}
     for name in rows[0]:
         column = np.array([row[name] for row in rows])
@@ -1076,33 +1076,26 @@ def requirement_limits(
     computed = dataset.computed_scenes(results)
     cells = [name for name in computed.dims if name not in (*names, along, DRAWS)]
     trials = computed.sum(DRAWS).compute()
-    found = xr.Dataset(columns).isel({along: np.argsort(order)}).assign(
+    coordinates = table.drop_dims([*together, "requirement"]).coords
+    found = xr.Dataset(columns, coordinates).sel({along: results[along].to_numpy()}).assign(
         trials=trials.max(cells), poses=trials.sum([*cells, along]))
     units = results[along].attrs.get("units", "")
     for name, (meaning, own, *flags) in LIMITS.items():
         found[name].attrs = cf_attributes(
             meaning.format(along), units if own is None else own, *flags)
-    return found.assign_coords(table.drop_dims([*together, "requirement"]).coords).assign_attrs(
+    return found.assign_attrs(
         along=along, harder="upwards" if upwards else "downwards",
         configuration_dims=table.attrs["configuration_dims"],
         per=[*names], at_all=together, require=[*require])
 
 
-def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the values of an axis of the scene that has an order.
-
-    Raises
-    ------
-    ArgumentError
-        If there is no such axis, or its values are no numbers, or it is one of configurations.
-    """
-    axes = [name for name in axes_of(results)
-            if name != DRAWS and name not in dataset.configuration_axes(results)
-            and name in results.coords and results[name].dtype.kind in "fiu"]
+def require_order(results: xr.Dataset, along: str) -> None:
+    """Raise ArgumentError unless an axis of the scene has numbers."""
+    axes = [name for name in axes_of(results, Stage.scene)
+            if name != DRAWS and name in results.coords and results[name].dtype.kind in "fiu"]
     if along not in axes:
         raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
                             f"are {', '.join(axes) or 'none'}")
-    return results[along].to_numpy().astype(np.float64)
 
 
 #: Whether markers are smaller in the image at large values of an axis that changes their size.

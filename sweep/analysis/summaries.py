@@ -373,35 +373,28 @@ def quantiles_of(quantity: Quantity) -> Statistic[Poses]:
 
 def statistics_of(quantity: Quantity) -> list[Statistic[Poses]]:
     """Return the statistics of a kind of error; of `SIGNED` ones the last two."""
-    words = quantity.words
-    described: dict[str, Any] = {"units": quantity.units, "inputs": quantity.inputs}
-
-    def solved(poses: Poses) -> Masks:
-        return poses.solved
-
-    def unflipped(poses: Poses) -> Masks:
-        return poses.unflipped
-
+    words, unflipped = f"{quantity.words}, solved and not flipped", attrgetter("unflipped")
     # A mean error is signed if the error is, else it is the mean vector's length. Flips make most
     # of a rotation's RMSE, and it is bounded.
     mean, of = (Mean, "mean") if quantity.signed else (estimator.MeanLength, "length of the mean")
     square: Callable[..., Statistic[Poses]] = estimator.RootMeanSquare
     if quantity.bound is not None:
         square = functools.partial(estimator.FlipMixture, bound=quantity.bound)
-    return [
-        *([] if quantity not in QUANTITIES else [
-            quantiles_of(quantity),
-            square(quantity.named("rmse"), f"RMS {words}, solved", quantity.squares, solved,
-                   **described),
-            estimator.RootMeanSquare(
-                quantity.named("rmse_unflipped"), f"RMS {words}, solved and not flipped",
-                quantity.squares, unflipped, **described)]),
-        mean(quantity.named("bias"), f"{of} {words}, solved and not flipped", quantity.vector,
-             unflipped, **described),
-        estimator.StandardDeviation(
-            quantity.named("sd"), f"standard deviation of the {words}, solved and not flipped",
-            quantity.vector, unflipped, **described),
-    ]
+
+    def part(kind: Callable[..., Statistic[Poses]], name: str, *args: Any) -> Statistic[Poses]:
+        return kind(quantity.named(name), *args, units=quantity.units, inputs=quantity.inputs)
+
+    found = [
+        part(mean, "bias", f"{of} {words}", quantity.vector, unflipped),
+        part(estimator.StandardDeviation, "sd", f"standard deviation of the {words}",
+             quantity.vector, unflipped)]
+    return found if quantity not in QUANTITIES else [
+        quantiles_of(quantity),
+        part(square, "rmse", f"RMS {quantity.words}, solved", quantity.squares,
+             attrgetter("solved")),
+        part(estimator.RootMeanSquare, "rmse_unflipped", f"RMS {words}", quantity.squares,
+             unflipped),
+        *found]
 
 
 def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[Statistic[Poses]]:

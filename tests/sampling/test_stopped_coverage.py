@@ -61,10 +61,10 @@ def intervals(wanted, values):
     """Return low and high ends (groups,) of poses, as they are where sampling stopped."""
     arrays = {key: array[:, None, :, None] for key, array in values.items()}
     columns, table = Columns(arrays, Poses), {}
-    for statistic in wanted.requirable.computed("", LEVEL):
+    for statistic in wanted.what.statistics(LEVEL):
         table |= zip((each.name for each in statistic.outputs()),
                      statistic.arrays(columns, Design(stopped=True)), strict=True)
-    return [table[f"{wanted.name}_{end}"] for end in ("low", "high")]
+    return [table[f"{wanted.what.name}_{end}"] for end in ("low", "high")]
 
 
 STRATA = np.array([0.02, 0.3, 0.9])

@@ -29,8 +29,9 @@ from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.scene import build_cameras
 from sweep.typing import Floats
 
-#: Where in the frame the target is whose position is estimated with the calibrated camera.
-DIRECTIONS = ("centre", "corner")
+#: Where in the frame the target is whose position is estimated with the calibrated camera: share
+#: of the way from the principal point to the frame's corner.
+DIRECTIONS = {"centre": 0.0, "corner": 0.8}
 
 #: The points of a calibration -> the variable that has their errors.
 POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_error_px"}
@@ -44,9 +45,6 @@ OUTPUTS: dict[str, tuple[Any, ...]] = {
     "intrinsic_std": (("intrinsic",), "standard deviation that OpenCV reports", "px, 1"),
     "position_error_m": (("direction", "xyz"), "error of a target's position, camera frame", "m"),
 }
-
-#: Share of the way from the principal point to the frame's corner.
-_AT_CORNER = 0.8
 
 
 @describes
@@ -242,7 +240,7 @@ def _views(
     Of each view there are the points (k, 3) of the board that were found, in metres, and their
     pixels (k, 2).
     """
-    count = results.sizes.get(DRAWS, 1)
+    count = results.sizes[DRAWS]
     values = pipeline.experiment.scene_values([
         np.arange(count, dtype=np.intp) if axis.name == DRAWS
         else np.full(count, at[axis.name], dtype=np.intp)
@@ -250,8 +248,6 @@ def _views(
     cameras = build_cameras(values, count)
     width, height = (int(values[key].broadcast(count)[0]) for key in ("width_px", "height_px"))
     cell = results.isel({dim: k for dim, k in at.items() if dim in results.dims})
-    if DRAWS not in cell.dims:
-        cell = cell.expand_dims(DRAWS)
     rotation, translation, errors = (
         cell[each].transpose(DRAWS, ...).values
         for each in ("true_rvec", "true_tvec_m", POINTS[name]))
@@ -281,11 +277,9 @@ def _position_errors(
     target = np.array([(x, y, 0.0) for y in line for x in line])
     rotation = np.diag([1.0, -1.0, -1.0])[None]
     focal, centre = np.split(camera.view[0], 2)
-    assumed = Cameras(
-        one.values[None, :4], np.array([pack(tuple(one.values[4:].tolist()))]),
-        np.array([one.values[4:].any()]),
-    )
-    for k, share in enumerate((0.0, _AT_CORNER)):
+    view, lens = np.split(one.values, [4])
+    assumed = Cameras(view[None], np.array([pack(tuple(lens.tolist()))]), np.array([lens.any()]))
+    for k, share in enumerate(DIRECTIONS.values()):
         bearing = share * (np.array(frame) - 1 - centre) / focal
         position = np.array([*(bearing * distance_m), distance_m])
         pixels = camera.project(transform_points(target[None], rotation, position[None]))[0]

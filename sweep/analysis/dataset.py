@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -114,8 +113,7 @@ def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
     """
     metadata = results.attrs.get("sweep")
     if isinstance(metadata, str):
-        with contextlib.suppress(ValueError, RecursionError):
-            metadata = json.loads(metadata)
+        metadata = json.loads(metadata)
     return metadata if isinstance(metadata, Mapping) else {}
 
 

@@ -679,18 +679,17 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         for k, (name, condition) in enumerate(CONDITIONS.items())}
     if not all(map(len, found.values())):
         raise DatasetError("no pose was looked for: there are no errors to model")
-    poses = math.prod(
-        size for name, size in results["true_tvec_m"].sizes.items() if name != "xyz")
+    poses = results["true_tvec_m"].isel(xyz=0).size
     least, most = float(focal_size.min()), float(focal_size.max())
     bins, cells = bins_and_cells(found, poses, collinear=not CONDITIONS["side_px"].varies(
         np.log([least, most])))
     directions = region_directions(found)
     moments = np.stack([sum(moments_of(bins, block) for block in model) for model in models])
     _check_solved(moments, results, kept)
-    values = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
-    selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), values)
+    possible = knot_values(bins, moments[..., :4].sum(axis=(0, 1)))
+    selected = [[select_knots(BinSums.of(model[0], k), BinSums.of(model[1], k), possible)
                  for k in range(len(QUANTITIES))] for model in moments]
-    shown = [choose_knots(values[0], SHOWN_DISTANCES), *(each[:1] for each in values[1:])]
+    shown = [choose_knots(possible[0], SHOWN_DISTANCES), *(each[:1] for each in possible[1:])]
     # All errors are given at the knots of all: what is linear between some is so between all.
     knots = [np.unique(np.concatenate(each)) for each in zip(
         shown, *(own for model in selected for own in model), strict=True)]
@@ -720,15 +719,13 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         name: results[name].variable for name in kept if name in results.coords}
     coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
                     "condition": list(CONDITIONS)}
-    parts = [(name, name, at, "knots") for name, at in zip(PREDICTORS, knots, strict=True)]
-    for name, edges in zip(PREDICTORS, cells, strict=True):
-        parts += [(f"cell_{name}_low", name, edges[:-1], "low end of cells"),
-                  (f"cell_{name}_high", name, edges[1:], "high end of cells")]
-    for coordinate, name, at, words in parts:
-        condition = CONDITIONS[name]
-        coordinates[coordinate] = (
-            coordinate.removesuffix("_low").removesuffix("_high"), condition.unscaled(at),
-            {"units": condition.units, "long_name": f"{words} of {condition.words}"})
+    for name, at, edges in zip(PREDICTORS, knots, cells, strict=True):
+        condition, cell = CONDITIONS[name], f"cell_{name}"
+        for coordinate, dim, values, words in (
+                (name, name, at, "knots"), (f"{cell}_low", cell, edges[:-1], "low end of cells"),
+                (f"{cell}_high", cell, edges[1:], "high end of cells")):
+            coordinates[coordinate] = dim, condition.unscaled(values), {
+                "units": condition.units, "long_name": f"{words} of {condition.words}"}
     return dataset.with_sampling(xr.Dataset(variables, coordinates, attrs={
         "focal_size_px_m": float(focal_size.mean()),
         "focal_size_varies": int(most > least * (1 + 1e-9)),

@@ -25,6 +25,8 @@ from sweep.errors import (
     RunError,
     StoreError,
     SweepError,
+    check_positive,
+    path_of,
 )
 from sweep.isolation.child_process import Child
 from sweep.messages import notice
@@ -444,8 +446,7 @@ def size(
     >>> found.answers[found.best].value, found.answers[found.best].next
     (40.0, 4.0)
     """
-    if not 0.0 < limit_s < float("inf"):
-        raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
+    check_positive("limit_s", limit_s, "expected a finite number above 0")
     with (Child() as child, library.progress.progress_report(progress) as report,
           library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
@@ -505,9 +506,9 @@ def compare(
     >>> found.data.detection_rate.values.tolist()  # photographs, simulated
     [1.0, 1.0]
     """
-    figure = None if output is None else os.fspath(output)
+    figure = None if output is None else path_of("output", output)
     library.output_file.figure_file(figure)
-    one, other = os.fspath(first), os.fspath(second)
+    one, other = path_of("first", first), path_of("second", second)
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
         place = os.fspath(store or library.prepare.twin_store(one, other))

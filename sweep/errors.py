@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import numbers
+import os
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 
 class SweepError(Exception):
@@ -53,6 +57,37 @@ class ArgumentError(SweepError, ValueError):
     def __str__(self) -> str:
         given = f" = {self.value}" if str(self.value) else ""
         return f"{self.argument}{given}: {self.problem}"
+
+
+def check_positive(
+    argument: str, value: object, expected: str, *, whole: bool = False
+) -> None:
+    """Raise ArgumentError unless a value is a finite number above 0, or None."""
+    kind = numbers.Integral if whole else numbers.Real
+    if value is not None and not (isinstance(value, kind) and 0 < float(value) < math.inf):
+        raise ArgumentError(argument, value, expected)
+
+
+def path_of(argument: str, given: object) -> str:
+    """Return the path or URL that an argument is; ArgumentError if it is none."""
+    if not isinstance(given, (str, os.PathLike)):
+        raise ArgumentError(argument, " ".join(repr(given)[:60].split()), "expected a path or URL")
+    return str(os.fspath(given))
+
+
+def texts_of(argument: str, given: object, expected: str = "texts") -> list[str]:
+    """Return the texts that an argument lists; one that is no list counts as a list of one.
+
+    Raises
+    ------
+    ArgumentError
+        If it is neither.
+    """
+    texts: list[Any] = [given] if isinstance(given, str) or not isinstance(
+        given, Iterable) else [*given]
+    if not all(isinstance(each, str) for each in texts):
+        raise ArgumentError(argument, " ".join(repr(given)[:60].split()), f"expected {expected}")
+    return texts
 
 
 class MissingPackageError(SweepError):

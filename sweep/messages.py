@@ -110,7 +110,7 @@ def similar(word: str, known: Collection[str], cutoff: float = 0.6) -> str:
     Letters' cases, underscores and hyphens do not count. ``cutoff``: least share of equal letters.
     The word itself is never suggested: it is known, and wrong for another reason.
     """
-    if len(word) > MAX_WORD_LENGTH:
+    if not isinstance(word, str) or len(word) > MAX_WORD_LENGTH:
         return ""
     letters, simple = _letters(word), {_letters(name): name for name in known if name != word}
     longer = [each for each in simple if len(letters) > 1 and letters in each]

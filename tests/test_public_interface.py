@@ -98,6 +98,8 @@ def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
 
 @pytest.mark.parametrize(("options", "expected"), [
     ({"workers": 0}, "workers = 0: expected at least 1"),
+    ({"workers": 1.5}, "workers = 1.5: expected at least 1"),
+    ({"store": 3}, "store = 3: expected a path or URL"),
     ({"time_limit_s": float("nan")}, "time_limit_s = nan: expected seconds above 0"),
     ({"scheduler": "nowhere"}, "scheduler = nowhere: expected an address such as tcp://"),
     ({"client": 3}, "client = 3: expected a distributed.Client or a cluster object"),

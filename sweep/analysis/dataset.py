@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.errors import ArgumentError, DatasetError, SweepError, texts_of
 from sweep.experiment.document import SEARCH, read_document
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
@@ -125,11 +125,7 @@ def as_names(per: Sequence[str]) -> tuple[str, ...]:
     ArgumentError
         If ``per`` is not a list of names.
     """
-    if isinstance(per, str):
-        return (per,)
-    if not isinstance(per, Iterable) or not all(isinstance(name, str) for name in per):
-        raise ArgumentError("per", per, "expected names of dimensions")
-    return tuple(per)
+    return tuple(texts_of("per", per, "names of dimensions"))
 
 
 def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import yaml
 from jinja2 import Template
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, RunError, StoreError
+from sweep.errors import RunError, StoreError, check_positive
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
@@ -421,8 +421,7 @@ def export(
         If an image cannot be rendered.
     """
     started = time.perf_counter()
-    if workers is not None and workers < 1:
-        raise ArgumentError("workers", workers, "expected at least 1")
+    check_positive("workers", workers, "expected at least 1", whole=True)
     target = Path(folder)
     count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.errors import ArgumentError, MachineFaultError, StoreError
+from sweep.errors import MachineFaultError, StoreError, check_positive
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.executors import SMALL_RUN_S
@@ -313,8 +313,7 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     ArgumentError
         If there are no workers.
     """
-    if workers is not None and workers < 1:
-        raise ArgumentError("workers", workers, "expected at least 1")
+    check_positive("workers", workers, "expected at least 1", whole=True)
     with Child() as child:
         timing = measure(child, pipeline, PLAN_S)
     least = least_share(make_rule(pipeline)) * pipeline.size(Stage.scene) * timing.scene_s

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import math
 import os
 import time
 from collections import Counter
@@ -20,6 +19,8 @@ from sweep.errors import (
     RunError,
     StoreError,
     StoreReplacedError,
+    check_positive,
+    path_of,
 )
 from sweep.execution import TIME_LIMIT_S, forecast, status
 from sweep.execution.block_task import is_reusable, match
@@ -116,19 +117,19 @@ def execute(
     """
     started = time.perf_counter()
     rule = make_rule(pipeline)  # it refuses names that it does not know
-    if workers is not None and workers < 1:
-        raise ArgumentError("workers", workers, "expected at least 1")
+    check_positive("workers", workers, "expected at least 1", whole=True)
     if scheduler is not None and client is not None:
         raise ArgumentError("scheduler", scheduler, "expected no client beside it")
-    if scheduler is not None and ":" not in scheduler and scheduler != "local":
+    if scheduler is not None and ":" not in str(scheduler) and scheduler != "local":
         raise ArgumentError(
             "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
     for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
-        if seconds is not None and not 0 < seconds < math.inf:
-            raise ArgumentError(name, seconds, "expected seconds above 0")
+        check_positive(name, seconds, "expected seconds above 0")
+    reuse = [reuse] if isinstance(reuse, (str, os.PathLike)) else reuse
     if retry_failed and reuse:
-        raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
-    url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
+        raise ArgumentError(
+            "reuse", path_of("reuse", reuse[0]), "expected no retry_failed beside it")
+    url = path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
     again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
     stricter = begun is not None and begun.pipeline.stopping != pipeline.stopping
@@ -206,7 +207,7 @@ def _matching_sources(
     url: str, pipeline: Pipeline, reuse: Sequence[str | os.PathLike[str]]
 ) -> list[str]:
     """Return the addresses of the stores to reuse; StoreError if one has no cell in common."""
-    sources = [absolute_url(os.fspath(source)) for source in reuse]
+    sources = [absolute_url(path_of("reuse", source)) for source in reuse]
     for source in sources:
         if source == absolute_url(url):
             raise ArgumentError("reuse", source, "it is the store that is written; choose another")

@@ -71,6 +71,8 @@ def read_document(text: str) -> dict[str, Any]:
     ValueError
         Says what was expected, or why it is no TOML.
     """
+    if not isinstance(text, str):
+        raise ValueError("expected TOML as text")  # noqa: TRY004
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
@@ -122,6 +124,8 @@ def document_text(mapping: Mapping[str, Any]) -> str:
     >>> document_text({"seed": 1, "axes": {"trial": 3, "marker_id": range(5)}})
     'seed = 1\n\n[axes]\ntrial = 3\nmarker_id = {range = [0, 5, 1]}\n'
     """
+    if not isinstance(mapping, Mapping):
+        raise ValueError("expected a mapping of keys and sections")  # noqa: TRY004
     faults: list[str] = []
     document = tomlkit.document()
     tables = {key: value for key, value in mapping.items() if isinstance(value, Mapping)}

@@ -16,7 +16,7 @@ from typing import Any
 import tomlkit
 
 from sweep.declaration import Declared
-from sweep.errors import PluginError
+from sweep.errors import PluginError, path_of, texts_of
 from sweep.experiment import document as documents
 from sweep.experiment import parameters
 from sweep.experiment.document import HEADER, REQUIRE, SEARCH, Reading
@@ -725,7 +725,7 @@ class Pipeline(Grid):
         PipelineError
             One line for each fault of the file or of the settings.
         """
-        path = Path(path)
+        path = Path(path_of("path", path))
         source = plain(path, MAX_SHOWN_PATH_LENGTH)
         with documents.refusing(source):
             text = documents.file_text(path)
@@ -771,7 +771,7 @@ class Pipeline(Grid):
         with documents.refusing(source):
             document = documents.read_document(text)
         chosen = {}
-        if settings:
+        if settings := texts_of("settings", settings or ()):
             # Other settings may be of plug-ins that settings name.
             named = copy.deepcopy(document)
             apply_settings(named, parse_settings([

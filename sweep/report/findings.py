@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import itertools
 import math
-import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from os import PathLike
@@ -22,7 +21,7 @@ from sweep.analysis import comparisons, dataset, simulation_gap
 from sweep.analysis import requirements as judged
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, check_positive, path_of, texts_of
 from sweep.execution.progress import progress_display, stage_display
 from sweep.execution.runner import execute
 from sweep.experiment.draws import REPLICATES
@@ -106,7 +105,7 @@ def require(
     results, stored = selected_store(store, at)
     if pipeline is not None:
         stored = read_pipeline(pipeline)
-    texts = list(requirements) or list(stored.requirements)
+    texts = texts_of("requirements", requirements) or list(stored.requirements)
     axes = list(judged.conditions(results, per, stored.require_per))
     if not texts and against is None:
         raise ArgumentError(
@@ -140,14 +139,14 @@ def require(
             "requirements": [
                 {**dataclasses.asdict(each), "failing": [] if table is None else
                  conditions_of(each, table)[:MAX_ROWS]} for each in found]},
-        table, STATUS[decision], (more_draws(found, results, os.fspath(store)), ""))
+        table, STATUS[decision], (more_draws(found, results, path_of("store", store)), ""))
 
 
 def selected_store(
     url: str | PathLike[str], at: Sequence[str] = ()
 ) -> tuple[xr.Dataset, Pipeline]:
     """Return a finished store's results at some values of axes, and its pipeline."""
-    store = open_finished(os.fspath(url))
+    store = open_finished(path_of("store", url))
     return selected(open_dataset(url), at, store.pipeline), store.pipeline
 
 
@@ -160,7 +159,8 @@ def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.D
         For an axis or a value that the store does not have.
     """
     kept: dict[str, list[int]] = {}
-    for name, value in parse_selection(",".join(at), pipeline).items() if at else ():
+    chosen = ",".join(texts_of("at", at))
+    for name, value in parse_selection(chosen, pipeline).items() if chosen else ():
         axis, axes = pipeline.axis_of(name), dataset.axes_of(results)
         if axis is None or axis.name not in axes:
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
@@ -735,10 +735,9 @@ def measure_tradeoff(
         raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
                             + nearest(criterion, CRITERIA))
     for name, value in (("budget_ms", budget_ms), ("limit_s", limit_s)):
-        if value is not None and not 0 < value < math.inf:
-            raise ArgumentError(name, value, "expected a finite number above 0")
+        check_positive(name, value, "expected a finite number above 0")
     figure = figure_file(output)
-    store = os.fspath(store)
+    store = path_of("store", store)
     if store.lower().endswith(".toml"):
         pipeline = read_pipeline(store)
         with progress_display() if progress else contextlib.nullcontext() as display:

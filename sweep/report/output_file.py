@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from sweep.errors import StoreError
+from sweep.errors import StoreError, path_of
 from sweep.messages import plain
 from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store, reason_of
@@ -30,7 +30,7 @@ def figure_file(name: str | os.PathLike[str] | None) -> Path | None:
     """
     if name is None:
         return None
-    path = Path(name)
+    path = Path(path_of("output", name))
     if path.suffix.lower() not in FIGURE_SUFFIXES:
         raise StoreError(f"{path}: expected a file that ends in .png or .svg")
     check_output_file(path)

@@ -19,7 +19,7 @@ from sweep.analysis.comparisons import paired_tables
 from sweep.analysis.dataset import QUANTITIES, SIZE_AXES, is_grid_axis, of_photographs
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.requirements import ANGLE_AXES, SIZES_BESIDE, conditions, parse_requirements
-from sweep.errors import StoreError, SweepError
+from sweep.errors import StoreError, SweepError, texts_of
 from sweep.execution.status import Totals, account_of
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL
@@ -240,7 +240,7 @@ def read_report_data(
                 store.storage, group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url, MAX_READ_BYTES)
-    required = tuple(require) or store.pipeline.requirements
+    required = texts_of("require", require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
         tuple(account_of(store, Totals.of_finished(store))["warnings"]),

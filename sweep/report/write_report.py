@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import math
-import os
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +24,7 @@ from sweep.analysis.dataset import of_photographs, sampling_text
 from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import BOARDS, Decision, Reached, Verdict, requirement_limits
 from sweep.analysis.summaries import ThresholdChoice
-from sweep.errors import ArgumentError, DatasetError, StoreError
+from sweep.errors import ArgumentError, DatasetError, StoreError, path_of
 from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.messages import byte_count, quoted
@@ -598,7 +597,7 @@ def write_report(
     (3, True)
     """
     for name, value in (("output", output), ("figures", figures)):
-        if value is not None and not os.fspath(value).strip():
+        if value is not None and not path_of(name, value).strip():
             raise ArgumentError(name, repr(value), "expected a name")
     for path in error_model:
         check_error_model_file(path)
@@ -608,7 +607,7 @@ def write_report(
         raise ArgumentError("output", str(file), "expected a file that ends in .html or .md")
     beside = file.with_name(f"{file.stem}_figures") if form == "md" else None
     folders = [folder for folder in (beside, Path(figures) if figures else None) if folder]
-    data = report_data.read_report_data(os.fspath(store), require, per, command)
+    data = report_data.read_report_data(path_of("store", store), require, per, command)
     if error_model:
         model_findings(data, error_model)
     output_file.check_output_file(file)

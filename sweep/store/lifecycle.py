@@ -25,7 +25,7 @@ from zarr.abc.store import Store
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
-from sweep.errors import ArgumentError, StoreError, SweepError
+from sweep.errors import ArgumentError, StoreError, SweepError, path_of
 from sweep.experiment.document import file_text, read_document
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
@@ -485,7 +485,7 @@ def open_dataset(url: str | os.PathLike[str], read_bytes: int = 0) -> xr.Dataset
     StoreError
         If there is no store, or something else, or it is damaged.
     """
-    store = open_store(os.fspath(url))
+    store = open_store(path_of("store", url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
     finished = store.finished

@@ -15,7 +15,7 @@ from sweep.analysis import covariance_trust, efficiency, renderer_bias
 from sweep.analysis.dataset import computed_scenes
 from sweep.analysis.estimator import INTERVAL
 from sweep.analysis.summaries import guarded_error_statistics
-from sweep.errors import ArgumentError, StoreError
+from sweep.errors import ArgumentError, StoreError, texts_of
 from sweep.execution.progress import StageReport
 from sweep.experiment.experiment import distinct, used_settings, wrong_configurations
 from sweep.experiment.grid import TRIAL, Axis
@@ -102,7 +102,8 @@ def measure_trade(
                 f"{url}: the detections of {plugin.name} were recorded: there is no search whose "
                 "time could be measured"
             )
-    per = list(dict.fromkeys((*per, *(axis.name for axis in stored.experiment.target_axes))))
+    targets = (axis.name for axis in stored.experiment.target_axes)
+    per = list(dict.fromkeys((*texts_of("per", per), *targets)))
     _check(url, stored, results, per)
     # The same versions and files must be measured as were run.
     pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)

@@ -342,18 +342,14 @@ def as_json(choice: Choice) -> dict[str, Any]:
         {**dataclasses.asdict(answer), "cost": None if cost is None else dataclasses.asdict(cost),
          "on_front": k in choice.front, "within_budget": choice.within_budget(k)}
         for k, (answer, cost) in enumerate(zip(choice.answers, choice.costs, strict=True))]
-    best = None if choice.best is None else choice.answers[choice.best]
-    known = None if best is None else _chosen(choice, best)
+    known = None if choice.best is None else _chosen(choice, choice.answers[choice.best])
+    names = ("decision", "best", "conditions", "budget_ms", "poses", "grid_poses", "most_trials",
+             "store")
     return {
         "answer": known if choice.decision is Decision.met else None, "known": known,
-        "decision": choice.decision, "sentences": [headline(choice)],
-        "best": choice.best, "along": choice.rule.along,
-        "confidence": CONFIDENCE, "conditions": choice.conditions,
-        "budget_ms": choice.budget_ms, "alternatives": listed,
-        "poses": choice.poses, "grid_poses": choice.grid_poses,
-        "most_trials": choice.most_trials, "store": choice.store,
-        "warnings": list(choice.notes),
-    }
+        "sentences": [headline(choice)], "along": choice.rule.along, "confidence": CONFIDENCE,
+        **{name: getattr(choice, name) for name in names},
+        "alternatives": listed, "warnings": list(choice.notes)}
 
 
 # --------------------------------------------------------------------------------------------------

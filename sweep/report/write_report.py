@@ -26,7 +26,7 @@ from sweep.analysis.requirements import BOARDS, Decision, Reached, Verdict, requ
 from sweep.analysis.summaries import ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError, StoreError, path_of
 from sweep.experiment.parameters import Stage
-from sweep.measure.flags import BoundStatus, outcomes, present_values
+from sweep.measure.flags import BoundStatus, Flag, outcomes, present_values
 from sweep.messages import byte_count, quoted
 from sweep.report import findings, output_file, report_data
 from sweep.report.error_model_file import check_error_model_file, model_findings
@@ -309,8 +309,7 @@ def threshold_tables(data: ReportData) -> list[Table]:
     table = grouped(data, analysis.ambiguity, groups)
     if not ((table["without_alternative"] < table["solved"]) & (table["flipped"] > 0)).any():
         return []
-    words = [ThresholdChoice(flag).name.replace("_", " ") for flag in np.ravel(table["choice"])]
-    choice = table["choice"].copy(data=np.reshape(np.array(words, object), table["choice"].shape))
+    choice = in_words(table["choice"], ThresholdChoice)
     wanted = 100 * float(table.attrs["flip_rate"])
     return [table_of(
         table.sel(threshold=USUAL, drop=True).assign(choice=choice),
@@ -319,19 +318,20 @@ def threshold_tables(data: ReportData) -> list[Table]:
 
 
 def precision_table(table: xr.Dataset) -> Table:
-    """Return a row for each quantity and configuration of `sweep.analysis.precision_reached`."""
-    kept = ["quantity", *table.attrs["configuration_dims"]]
-    reached, run = table["reached"], table["run"].isel(dict.fromkeys(kept[1:], 0)).values
-    pooled = [dim for dim in reached.dims if dim not in kept]
-    known = reached.isin((Reached.reached, Reached.not_reached))
-    counts = {each.name: (reached == each).sum(pooled) for each in Reached}
+    """Return a row for each quantity, configuration and condition of `precision_reached`."""
+    columns = [Column(name.replace("_", " "), name) for name in (
+        "reached", "value", "half_width", "wanted", "run")]
+    dims = ["quantity", *(str(dim) for dim in table["reached"].dims if dim != "quantity")]
     return table_of(
-        table[["wanted"]].assign(
-            counts | {"widest": table["half_width"].where(known).max(pooled)}),
-        f"Precision of {run.size:,} conditions, which took {int(run.min()):,} to "
-        f"{int(run.max()):,} poses each: conditions by what was reached; of rates the "
-        "half-width of the interval, of others relative to the value (bias: to the RMSE)",
-        kept, [Column(name.replace("_", " "), name) for name in ("wanted", "widest", *counts)])
+        table.assign(reached=in_words(table["reached"], Reached)),
+        "Precision: of rates the half-width of the interval, of others relative to the value "
+        "(bias: to the RMSE); poses that were run", dims, columns)
+
+
+def in_words(flags: xr.DataArray, kind: type[Flag]) -> xr.DataArray:
+    """Return flags as words."""
+    words = {int(flag): flag.name.replace("_", " ") for flag in kind}
+    return flags.copy(data=np.vectorize(words.__getitem__, otypes=[object])(flags.values))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -160,13 +160,14 @@ class Executor(ABC):
     def submit(self, arguments: tuple[Any, ...], failures: list[Failed]) -> Any:
         """Call :func:`attempt`, rather not where the block failed; return a future."""
 
-    @abstractmethod
     def result(self, future: Any) -> Receipt | Failed:
         """Return the receipt of a future that is done, or why there is none."""
+        found: Receipt | Failed = future.result()
+        return found
 
-    @abstractmethod
     def elsewhere(self, failures: list[Failed]) -> bool:
-        """Return whether a block that machines failed may be tried again."""
+        """Return whether a block that machines failed may be tried again: here once."""
+        return len(failures) == 1
 
     @abstractmethod
     def workers(self) -> str:
@@ -262,15 +263,6 @@ class Children(Executor):
         finally:
             self._idle.put(child)
         return result
-
-    def result(self, future: Any) -> Receipt | Failed:
-        """Return the receipt, or why there is none."""
-        found: Receipt | Failed = future.result()
-        return found
-
-    def elsewhere(self, failures: list[Failed]) -> bool:
-        """Return whether this machine failed for the first time."""
-        return len(failures) == 1
 
     def cancel(self, out: Collection[Any]) -> None:
         """End the processes if they still compute."""

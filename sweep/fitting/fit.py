@@ -245,10 +245,10 @@ def edge_sums(fit: PhotographFit) -> tuple[Floats, Floats]:
     return sums, counts
 
 
-def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]:
-    """Return the edges on lines of constant column (``axis`` 0) or row of a marker.
+def _edges_along(state: MarkerState, axis: int) -> Floats:
+    """Return the edges (3, lines, modules) on lines of constant column (``axis`` 0) or row.
 
-    (lines, modules) each, NaN where there is no edge: shifts towards white in px, the sign of that
+    NaN where there is no edge: shifts towards white in px, the sign of that
     direction along the axis, and the information of the shifts.
     """
     marker = state.marker
@@ -261,10 +261,7 @@ def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]
     shape = marker.modules + 1, marker.modules
     number = (line * marker.modules + module)[near].astype(np.int64)
     slope, residuals = state.slope[:, near], state.residuals[near]
-
-    def total(values: Floats) -> Floats:
-        return np.asarray(np.bincount(number, values, shape[0] * shape[1]), dtype=np.float64)
-
+    total = partial(np.bincount, number, minlength=shape[0] * shape[1])
     steps = np.stack([total(each) for each in slope])
     length = np.hypot(*steps)
     normal = steps / np.maximum(length, 1e-12)
@@ -276,10 +273,8 @@ def _edges_along(state: MarkerState, axis: int) -> tuple[Floats, Floats, Floats]
         shifts = np.where(edge, total(by_shift * residuals) / information, np.nan)
     corners = marker.corners_px
     positive = corners[1] - corners[0] if axis == 0 else corners[3] - corners[0]
-    return tuple(  # type: ignore[return-value]
-        np.where(edge, each, np.nan).reshape(shape)
-        for each in (shifts, np.sign(positive @ normal), information)
-    )
+    found = np.stack([shifts, np.sign(positive @ normal), information])
+    return np.where(edge, found, np.nan).reshape(3, *shape)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -400,10 +395,7 @@ def _corners(state: MarkerState, noise: Floats) -> tuple[Floats, Floats, Floats,
     variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
     cells = np.clip(marker.at * CELLS, 0, CELLS - 1).astype(np.int64)
     number = cells[1] * CELLS + cells[0]
-
-    def in_cells(values: Floats) -> Floats:
-        return np.asarray(np.bincount(number, values, minlength=CELLS**2), dtype=np.float64)
-
+    in_cells = partial(np.bincount, number, minlength=CELLS**2)
     # A cell's point is where its edges are, most of them at a side of the marker.
     edge = (state.slope**2).sum(axis=0) + 1e-12
     rows, columns = np.nonzero(marker.used)

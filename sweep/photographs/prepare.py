@@ -211,9 +211,9 @@ def prepare(
         partner_poses(one, others[0], rig.rotation, rig.translation)
         partner_poses(others[0], one, back, -back @ rig.translation)
     sides = sides[:1] if one_camera else sides
-    lines += _summary([each.record for each in sides], first, dictionary)
+    lines += _summary(sides, dictionary)
     name = name or name_of(Path(folders[0]))
-    _write_records([each.record for each in sides], place, name, overwrite=overwrite)
+    _write_records(sides, place, name, overwrite=overwrite)
     pipeline = _experiment(sides, dictionary, settings, place, name)
     markers = sum(int(each.record.shown.sum()) for each in sides)
     return Prepared(pipeline, tuple(lines), len(first.photographs), markers)
@@ -309,14 +309,13 @@ def _detected(
     return dictionary, dict.fromkeys(ids, float(fixed["size_m"])), seen
 
 
-def _summary(
-    records: Sequence[PhotographRecord], shots: folder.Folder, dictionary: str
-) -> list[str]:
+def _summary(sides: Sequence[Side], dictionary: str) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
+    records = [each.record for each in sides]
     shown = np.array([each.shown for each in records])
     if not shown.any():
         raise folder.fault_of(
-            shots.photographs[0].path.parent,
+            sides[0].shots.photographs[0].path.parent,
             f"no photograph shows a whole marker of {dictionary} whose pose is known",
         )
     with_pose = shown.any(axis=2)
@@ -618,20 +617,18 @@ def _without_truth(
     )
 
 
-def _record_names(records: Sequence[PhotographRecord], name: str) -> list[str]:
+def _record_names(sides: Sequence[Side], name: str) -> list[str]:
     """Return the names of the records' files."""
-    ends = [""] if len(records) == 1 else ["-left", "-right"]
+    ends = [""] if len(sides) == 1 else ["-left", "-right"]
     return [f"{name}{end}{SUFFIX}" for end in ends]
 
 
-def _write_records(
-    records: Sequence[PhotographRecord], home: Path, name: str, *, overwrite: bool
-) -> None:
+def _write_records(sides: Sequence[Side], home: Path, name: str, *, overwrite: bool) -> None:
     """Write the records of a store of that name; another record of a store is kept."""
     with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
-        for each, record in zip(_record_names(records, name), records, strict=True):
-            path, content = home / each, record.content()
+        for each, side in zip(_record_names(sides, name), sides, strict=True):
+            path, content = home / each, side.record.content()
             used = (home / f"{name}.zarr").exists() and path.exists()
             if used and path.read_bytes() != content and not overwrite:
                 raise StoreError(
@@ -646,7 +643,7 @@ def _experiment(
 ) -> Pipeline:
     """Return the experiment on records."""
     columns = {
-        "photographs": _record_names([each.record for each in sides], name),
+        "photographs": _record_names(sides, name),
         **{key: [getattr(each.camera, key) for each in sides] for key in VIEW},
         "distortion": [list(each.camera.distortion) for each in sides],
     }

@@ -164,7 +164,11 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
         declaration = field.metadata["declaration"]
         unit = declaration.unit or next(
             (unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
-        kinds, default = plain_types(hints[field.name]), field.default
+        hint, default = hints[field.name], field.default
+        joined = typing.get_origin(hint) in (types.UnionType, typing.Union)
+        kinds = tuple(typing.get_origin(each) or each  # tuple[float, ...] is a tuple
+                      for each in (typing.get_args(hint) if joined else (hint,))
+                      if each is not type(None))
         if kinds == (float,) and type(default) is int:
             default = float(default)
         declared[field.name] = dataclasses.replace(
@@ -217,14 +221,3 @@ def check_table(
         if each.default is dataclasses.MISSING and name not in table
     ]
     return values, lines
-
-
-def plain_types(hint: Any) -> tuple[type, ...]:
-    """Return the plain types of an annotation, without None.
-
-    >>> plain_types(float | None), plain_types(tuple[float, ...])
-    ((<class 'float'>,), (<class 'tuple'>,))
-    """
-    joined = typing.get_origin(hint) in (types.UnionType, typing.Union)
-    parts = typing.get_args(hint) if joined else (hint,)
-    return tuple(typing.get_origin(each) or each for each in parts if each is not type(None))

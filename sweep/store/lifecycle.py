@@ -620,7 +620,8 @@ def write_root(
     """Write the root's document, with a copy of the others' if the store is finished."""
     members = None
     if metadata["finished"]:
-        keys = [key for key in metadata["files"] if key.endswith("/zarr.json")]
+        # Sorted: of a folder whose members are not together Zarr finds the last ones alone.
+        keys = sorted(key for key in metadata["files"] if key.endswith("/zarr.json"))
         members = {
             key.removesuffix("/zarr.json"): json.loads(content)
             for key, content in zip(keys, files.read_files(store.storage, keys), strict=True)

@@ -645,16 +645,16 @@ def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataA
     Raises
     ------
     DatasetError
-        If the dataset lacks one.
+        If the dataset lacks some.
     """
-    for name in names:
-        if name not in results:
-            if AXIS in results.dims:
-                raise DatasetError(
-                    f"no variable {name}: a board's markers have detections alone; estimates "
-                    "are the board's: give the dataset that per_marker was given")
-            raise DatasetError(f"no variable {name}; "
-                               f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
+    lacking = ", ".join(name for name in names if name not in results)
+    if lacking and AXIS in results.dims:
+        raise DatasetError(
+            f"no variable {lacking}: a board's markers have detections alone; estimates "
+            "are the board's: give the dataset that per_marker was given")
+    if lacking:
+        raise DatasetError(f"no variable {lacking}; "
+                           f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
     return {name: results[name] for name in names}
 
 

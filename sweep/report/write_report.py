@@ -275,7 +275,7 @@ def tables_of(data: ReportData) -> list[Table]:
             data, grouped(data, signed_error_statistics), (),
             "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
         *threshold_tables(data),
-        *([precision_table(analysis.precision_reached(data.results))]
+        *([precision_table(data)]
           if rule is not None and rule.precision else [])]
 
 
@@ -317,15 +317,16 @@ def threshold_tables(data: ReportData) -> list[Table]:
         [CONFIGURATION, *groups], KEPT_AT_USUAL, data.results)]
 
 
-def precision_table(table: xr.Dataset) -> Table:
-    """Return a row for each quantity, configuration and condition of `precision_reached`."""
+def precision_table(data: ReportData) -> Table:
+    """Return a row for each quantity, configuration and condition of a wanted precision."""
+    table = analysis.precision_reached(data.results)
     columns = [Column(name.replace("_", " "), name) for name in (
         "reached", "value", "half_width", "wanted", "run")]
     dims = ["quantity", *(str(dim) for dim in table["reached"].dims if dim != "quantity")]
     return table_of(
         table.assign(reached=in_words(table["reached"], Reached)),
         "Precision: of rates the half-width of the interval, of others relative to the value "
-        "(bias: to the RMSE); poses that were run", dims, columns)
+        "(bias: to the RMSE); poses that were run", dims, columns, data.results)
 
 
 def in_words(flags: xr.DataArray, kind: type[Flag]) -> xr.DataArray:

@@ -195,6 +195,8 @@ def stores_of_regions():
            [(1, 60, None, 0), (4, 0, None, 0), (1, 30, None, 0), (2, 0, None, 0),
             (2.5, 60, None, 0)])
 
+    yield ("corner", seen_in(on_axis, (on_axis["distance_m"] == 1) | (on_axis["tilt_deg"] == 0)),
+           [(1, 60, None, 0), (4, 0, None, 0)], [(4, 60, None, 0), (2, 45, None, 0)])
     bearings = poses_with_law(12, grid, power_law, bearing_deg=15.0)
     yield ("bearings", bearings, [(2, 30, None, 0), (2, 30, None, 14), (1, 0, None, 10)],
            [(2, 30, None, 30), (2, 30, None, 63), (2, 30, None, 120), (1, 30, 50, 5)])
@@ -216,7 +218,7 @@ def regions():
     return {name: rest for name, *rest in stores_of_regions()}
 
 
-@pytest.mark.parametrize("name", ["grid", "zipped", "bearings", "drawn"])
+@pytest.mark.parametrize("name", ["grid", "zipped", "corner", "bearings", "drawn"])
 def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
     results, seen, unseen = regions[name]
     models = error_models(results)

@@ -21,24 +21,18 @@ from sweep.measure.solver import (
     poses_of_each_marker,
     reprojection_px,
 )
-from sweep.model.board import Board, box_corners, extent_of, own_sheets, sheets_m, unit_m
+from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.coverage import LEVELS, POSE
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.typing import Floats, Grey, Integers
+from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # First poses of one target, marker or board, and the part of the image that is fitted.
 
 def marker_poses(detections: Detections, *, refined: bool) -> list[list[Pose]]:
     """Return both planar solutions of each marker's corners, then of its refined corners."""
-    found = [detections.corners]
-    if refined:
-        found.append(np.stack([
-            refined_corners(
-                corners, detections.images[i], detections.origins[i], detections.targets[i])
-            for i, corners in enumerate(detections.corners)
-        ]))
+    found = [detections.corners, *([refined_corners(detections)] if refined else [])]
     solved = [
         both_planar_solutions(corners, detections.cameras, detections.size_m) for corners in found
     ] if len(detections) else []
@@ -55,13 +49,8 @@ def board_poses(one: Detections, *, refined: bool) -> list[Pose]:
     agree: one marker that is wrong spoils the former.
     """
     poses: list[Pose] = []
-    points, found = one.objects_m.reshape(-1, 3), [one.corners]
-    if refined:
-        found.append(np.stack([
-            refined_corners(corners, one.images[0], one.origins[0], one.targets[0])
-            for corners in one.corners
-        ]))
-    for corners in found:
+    points = one.objects_m.reshape(-1, 3)
+    for corners in (one.corners, refined_corners(one)) if refined else (one.corners,):
         pixels = corners.reshape(-1, 2)
         guard = GuardedPoints.of(points, pixels, one.cameras)
         poses += guard.poses(cv2.SOLVEPNP_IPPE) + guard.poses(cv2.SOLVEPNP_ITERATIVE)
@@ -81,21 +70,22 @@ def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
     return float(np.median(np.nan_to_num(errors, nan=math.inf)))
 
 
-def refined_corners(corners: Floats, image: Grey, origin: Integers, target: Board) -> Floats:
-    """Return a square's corners (4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers.
-
-    ``origin`` (2,) is the image's first pixel; a square that leaves the image keeps its corners.
-    """
-    inside = corners - origin
-    if not ((inside >= 0) & (inside <= np.array(image.shape[::-1]) - 1)).all():
-        return corners
-    side = float(np.linalg.norm(np.roll(inside, -1, axis=0) - inside, axis=1).mean())
-    half = min(5, max(1, round(0.3 * (side / module_count(target.dictionary)))))
-    moved = cv2.cornerSubPix(
-        image, np.ascontiguousarray(inside[:, None], dtype=np.float32), (half, half), (-1, -1),
-        (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
-    )
-    return np.asarray(moved[:, 0].astype(np.float64) + origin)
+def refined_corners(detections: Detections) -> Floats:
+    """Return the corners (K, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
+    refined = detections.corners.copy()
+    for k, i in enumerate(detections.owner.tolist()):
+        image, origin = detections.images[i], detections.origins[i]
+        corners = refined[k] - origin
+        if ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
+            modules = module_count(detections.targets[i].dictionary)
+            side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+            half = min(5, max(1, round(0.3 * (side / modules))))
+            moved = cv2.cornerSubPix(
+                image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+                (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+            )
+            refined[k] = np.asarray(moved[:, 0], dtype=np.float64) + origin
+    return refined
 
 
 def start_states(poses: list[Pose], middle: Floats, spread_px: float) -> Floats:

@@ -156,9 +156,9 @@ class Chaos:
 
 @pytest.mark.evidence
 @pytest.mark.parametrize(("text", "kills"), [
-    pytest.param(GRID.replace("trial = 8", "trial = 250"), 60, id="grid"),
+    pytest.param(GRID.replace("trial = 8", "trial = 250"), 160, id="grid"),
     pytest.param(GRID.replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]").replace(
-        "trial = 8", "trial = 2000") + PRECISION, 15, id="waves"),
+        "trial = 8", "trial = 2000") + PRECISION, 40, id="waves"),
 ])
 def test_kills_at_random_instants_change_no_bit_and_lose_no_block(text, kills, claim, tmp_path):
     chaos = Chaos(tmp_path, *prepared(tmp_path, text, "undisturbed"))

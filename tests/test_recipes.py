@@ -59,30 +59,25 @@ EFFECTS = """
 """
 
 SOLVER = """
-from dataclasses import dataclass
 import numpy as np
 from sweep.measure.estimation import Estimates
 from sweep.measure.flags import EstimateStatus
 
-@dataclass(frozen=True, slots=True)
-class FrontalSolver:
-    needs_images = True
-
-    def __call__(self, detections):
-        estimates = Estimates.none(len(detections.corners), EstimateStatus.solved)
-        sides = np.roll(detections.corners, -1, axis=1) - detections.corners
-        view = detections.cameras.view
-        depth = view[:, 0] * detections.size_m / np.linalg.norm(sides, axis=2).mean(axis=1)
-        centre = (detections.corners.mean(axis=1) - view[:, 2:]) / view[:, :2]
-        estimates.rotation[:] = np.diag([1.0, -1.0, -1.0])
-        estimates.translation[:] = np.column_stack([centre * depth[:, None], depth])
-        estimates.reprojection_px[:] = [image.mean() for image in detections.images]
-        return estimates
+def frontal(detections):
+    estimates = Estimates.none(len(detections.corners), EstimateStatus.solved)
+    sides = np.roll(detections.corners, -1, axis=1) - detections.corners
+    view = detections.cameras.view
+    depth = view[:, 0] * detections.size_m / np.linalg.norm(sides, axis=2).mean(axis=1)
+    centre = (detections.corners.mean(axis=1) - view[:, 2:]) / view[:, :2]
+    estimates.rotation[:] = np.diag([1.0, -1.0, -1.0])
+    estimates.translation[:] = np.column_stack([centre * depth[:, None], depth])
+    estimates.reprojection_px[:] = [image.mean() for image in detections.images]
+    return estimates
 """
 """A frontal pose at the depth of the corners' mean side; it reports the image's mean, too."""
 
 SOLVER_RECORD = """
-    "frontal": Solver("a frontal pose", lambda setting: FrontalSolver(), needs_images=True),
+    "frontal": Solver(meaning="a frontal pose", make=lambda _: frontal, needs_images=True),
 """
 
 FLAG, SENTENCE = len(EstimateStatus), "The pose is unlikely beforehand; it is stored."
@@ -225,7 +220,7 @@ def results(tmp_path_factory):
         ("model/effects.py", "EFFECTS: tuple[Effect, ...] = (", EFFECTS),
         ("measure/frontal.py", None, SOLVER),
         ("measure/estimators.py", ", PoseEstimator, credible_estimates\n",
-         "from sweep.measure.frontal import FrontalSolver\n"),
+         "from sweep.measure.frontal import frontal\n"),
         ("measure/estimators.py", "SOLVERS: dict[str, Solver] = {", SOLVER_RECORD),
         ("measure/detectors.py", DECLARED, None),
         ("measure/detectors.py", "OpenCV's own name and default.\"\"\"\n", SETTING),

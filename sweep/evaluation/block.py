@@ -213,7 +213,7 @@ def run_cells(
         searched |= search_too
     builds = [build(setting) for setting in experiment.estimators]
     size = max(count, 1)
-    if any(each.needs_images for each in builds):
+    if experiment.solvers_on_pixels:
         # Fewer scenes at a time, since their images must be kept.
         frame = max(grid.values_of("width_px")) * max(grid.values_of("height_px"))
         size = max(KEPT_PX // frame, 1)
@@ -245,7 +245,7 @@ def _run_batch(
     batch = scenes_at(experiment, indices)
     found, result.row_seconds[part] = detections_of(
         batch, searched & batch.visible[:, None], failures,
-        keep=any(each.needs_images for each in builds),
+        keep=bool(experiment.solvers_on_pixels),
     )
     asked = batch.values["bound"].broadcast(len(need), np.str_)
     of_scenes = SceneResults(batch, bounds(batch.scenes, batch.boxes, asked, batch.visible))

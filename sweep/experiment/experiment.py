@@ -129,6 +129,12 @@ class Experiment:
                 else _made(EstimatorSetting, values)
                 for values, own in self._settings("estimator")]
 
+    @cached_property
+    def solvers_on_pixels(self) -> list[str]:
+        """The solvers for which the detections' images are kept."""
+        needing = [each.solver for each in self.estimators if each.record.needs_images]
+        return [*dict.fromkeys(needing)]
+
     def _settings(self, section: str) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
         """Yield the values of a section at all combinations of its axes, in their order.
 
@@ -641,8 +647,6 @@ class Facts:
                    and "full" not in grid.values_of("window")}
         assumptions = [name for name in PARAMETERS if name.startswith("believed_")
                        and grid.fixed.get(name, "varies") is not None]
-        with_pixels = [name for name, each in SOLVERS.items() if each.needs_images] + [
-            each.name for each in grid.plugins if each.needs_images]
         # Why each is active, and what is said if nothing is a reason.
         reasons: dict[str, tuple[Iterable[str], str]] = {
             "lens distortion": (["distortion is given"] * lens, "distortion is empty"),
@@ -658,8 +662,9 @@ class Facts:
                              "guarded = false: plain cv2.solvePnP"),
             "accuracy bound": ([f"bound is {each}" for each in sorted(set(
                 grid.values_of("bound"))) if each != "none"], "bound is none"),
-            "pixels kept": ([f"solver {each} needs them" for each in grid.values_of("solver")
-                             if each in with_pixels], "no solver needs them"),
+            "pixels kept": (
+                [f"solver {each} needs them" for each in self.experiment.solvers_on_pixels],
+                "no solver needs them"),
             "wrong assumptions": ([*assumptions, *["believed: calibration"] * calibrated],
                                   "the estimator knows the true camera and size"),
         }

@@ -19,7 +19,6 @@ from sweep.errors import PluginError
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary
 from sweep.model.polygon import side_lengths
-from sweep.plugins import DetectorPlugin
 from sweep.plugins.loading import PluginSetting, call, made, real_numbers
 from sweep.typing import Floats, Integers
 
@@ -371,74 +370,53 @@ def opencv_board(board: Board) -> cv2.aruco.Board:
 MAX_MARKERS = 1000
 
 
-class PluggedDetector:
-    """One setting of a plug-in's detector in this process.
+def plugged(setting: PluginSetting) -> FindFunction:
+    """Return the search of a plug-in's detector in this process; the frame's side does not matter.
 
-    Parameters
-    ----------
-    name
-        The plug-in's, for messages.
-    record
-        Its declaration.
-    settings
-        An instance of its settings; None without.
+    It raises PluginError, in one line, if the plug-in lacks the dictionary, cannot be made, raises,
+    or returns what cannot be a detection.
     """
+    name, record, settings = setting.plugin.name, setting.record(), setting.instance()
 
-    def __init__(self, name: str, record: DetectorPlugin, settings: Any) -> None:
-        self._name = name
-        self._record = record
-        self._settings = settings
-        self._search = lru_cache(maxsize=64)(self._new_search)
+    @lru_cache(maxsize=64)
+    def search_for(dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
+        families = record.families
+        if families is not None and dictionary not in families:
+            raise PluginError(f"{name}: no dictionary {dictionary}; it has {', '.join(families)}")
+        family = dictionary if families is None else families[dictionary]
+        return made(name, record.make, settings, family)
+
+    def quadrilaterals(what: str, returned: Any) -> Floats:
+        """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""
+        quads = real_numbers(name, what, returned, (-1, 4, 2), finite=True)
+        if len(quads) > MAX_MARKERS:
+            raise PluginError(
+                f"{name}: returned {len(quads):,} {what} for one image; expected at most "
+                f"{MAX_MARKERS:,}"
+            )
+        return np.asarray(quads[:, record.corner_order] - record.pixel_center)
 
     def find(
-        self, image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG002
+        image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG001
     ) -> DetectorOutput:
-        """Search an image (h, w) for markers of a dictionary; the frame's side does not matter.
-
-        Raises
-        ------
-        PluginError
-            If the plug-in lacks the dictionary, cannot be made, raises, or returns what cannot be a
-            detection; in one line.
-        """
-        search = self._search(dictionary)
         own = np.array(image, order="C")  # what it does to its image reaches nobody else
-        returned = call(self._name, search, own)
+        returned = call(name, search_for(dictionary), own)
         if not np.array_equal(own, image):
-            raise PluginError(f"{self._name}: changed the image that it was given; copy it first")
+            raise PluginError(f"{name}: changed the image that it was given; copy it first")
         if not isinstance(returned, tuple) or len(returned) not in (2, 3):
             raise PluginError(
-                f"{self._name}: returned a {type(returned).__name__}; expected a tuple "
+                f"{name}: returned a {type(returned).__name__}; expected a tuple "
                 "(corners, ids), or with rejected quadrilaterals as the third"
             )
         corners, ids, *rest = returned
-        quads = self._quadrilaterals("corners", corners)
-        rejected = list(self._quadrilaterals("rejected", rest[0] if rest else ())[:, None])
-        numbers = real_numbers(self._name, "ids", ids, (len(quads),), whole=True)
+        quads = quadrilaterals("corners", corners)
+        rejected = list(quadrilaterals("rejected", rest[0] if rest else ())[:, None])
+        numbers = real_numbers(name, "ids", ids, (len(quads),), whole=True)
         if (numbers < 0).any():
-            raise PluginError(
-                f"{self._name}: returned the ID {numbers.min()}; expected at least 0")
+            raise PluginError(f"{name}: returned the ID {numbers.min()}; expected at least 0")
         return list(quads[:, None]), numbers if len(quads) else None, rejected
 
-    def _new_search(self, dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
-        """Return the plug-in's search for markers of a dictionary."""
-        families = self._record.families
-        if families is not None and dictionary not in families:
-            raise PluginError(
-                f"{self._name}: no dictionary {dictionary}; it has {', '.join(families)}"
-            )
-        family = dictionary if families is None else families[dictionary]
-        return made(self._name, self._record.make, self._settings, family)
-
-    def _quadrilaterals(self, what: str, returned: Any) -> Floats:
-        """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""
-        quads = real_numbers(self._name, what, returned, (-1, 4, 2), finite=True)
-        if len(quads) > MAX_MARKERS:
-            raise PluginError(
-                f"{self._name}: returned {len(quads):,} {what} for one image; expected at most "
-                f"{MAX_MARKERS:,}"
-            )
-        return np.asarray(quads[:, self._record.corner_order] - self._record.pixel_center)
+    return find
 
 
 # --------------------------------------------------------------------------------------------------
@@ -479,7 +457,7 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     """
     if isinstance(setting, DetectorSetting):
         return Detector(setting).find
-    return PluggedDetector(setting.plugin.name, setting.record(), setting.instance()).find
+    return plugged(setting)
 
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,17 +196,9 @@ class Estimates:
         )
 
 
-class PoseEstimator(Protocol):
-    """A function from detections to poses, by their corners or by their pixels as well."""
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images."""
-        ...
-
-    def __call__(self, detections: Detections, /) -> Estimates:
-        """Return one estimate for each target; its status says why a pose is missing."""
-        ...
+#: From detections to poses, by their corners or by their pixels as well: one estimate for each
+#: target, whose status says why a pose is missing.
+PoseEstimator = Callable[[Detections], Estimates]
 
 
 def credible_estimates(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from sweep.measure.flags import EstimateStatus
 from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.solver import OPENCV_SOLVERS, Solver
 from sweep.model.lens import COUNTS
-from sweep.plugins import EstimatorPlugin, Poses
-from sweep.plugins.loading import PluginSetting, call, made, real_numbers
+from sweep.plugins import Poses
+from sweep.plugins.loading import DeclaredPlugin, PluginSetting, call, made, real_numbers
 
 # --------------------------------------------------------------------------------------------------
 # A plug-in's solver: what it returns is checked as our own solvers' poses are.
@@ -26,110 +26,84 @@ from sweep.plugins.loading import PluginSetting, call, made, real_numbers
 ROTATION_ATOL = 1e-6
 
 
-class PluggedEstimator:
-    """One setting of a plug-in's solver in this process.
+def plugged(setting: PluggedEstimatorSetting) -> PoseEstimator:
+    """Return the estimator of a plug-in's solver in this process.
 
     Errors and covariances are those of the corners of all squares that were found, whichever of
-    them the plug-in uses.
-
-    Parameters
-    ----------
-    name
-        The plug-in's, for messages.
-    record
-        Its declaration.
-    settings
-        An instance of its settings; None without.
-    reprojection_limit, corner_noise_px
-        As :class:`sweep.measure.solver.PointSolver` has them.
+    them the plug-in uses. It raises PluginError, in one line, if the plug-in raises, or returns
+    what cannot be poses.
     """
+    name = setting.solver
+    solve = made(name, setting.own.record().make, setting.own.instance())
 
-    def __init__(
-        self, name: str, record: EstimatorPlugin, settings: Any, reprojection_limit: float,
-        corner_noise_px: float | None,
-    ) -> None:
-        self._name = name
-        self._limit = reprojection_limit
-        self._noise_px = corner_noise_px
-        self.needs_images = record.needs_images
-        self._solve = made(name, record.make, settings)
-
-    def __call__(self, detections: Detections) -> Estimates:
-        """Return the poses that the plug-in finds, those that are credible.
-
-        Raises
-        ------
-        PluginError
-            If the plug-in raises, or returns what cannot be poses; in one line.
-        """
+    def estimates(detections: Detections) -> Estimates:
         count = len(detections)
         if count == 0:
             return Estimates.none(0, EstimateStatus.solver_failed)
         # Of a copy: what a plug-in does to it reaches nobody else.
         copied = detections.take(np.arange(count))
         copied = dataclasses.replace(copied, images=[np.array(image) for image in copied.images])
-        poses = self._checked(call(self._name, self._solve, copied), count)
+        poses = checked_poses(name, call(name, solve, copied), count)
         alternative = None
         if poses.alternative_rotation is not None:
             alternative = poses.alternative_rotation, poses.alternative_translation
         return credible_estimates(
-            detections, poses.rotation, poses.translation, self._limit, alternative=alternative,
-            covariance=poses.covariance, corner_noise_px=self._noise_px,
+            detections, poses.rotation, poses.translation, setting.reprojection_limit,
+            alternative=alternative, covariance=poses.covariance,
+            corner_noise_px=setting.corner_noise_px,
         )
 
-    def _checked(self, returned: Any, count: int) -> Poses:
-        """Return poses whose arrays have the right shapes, and rotations that are rotations."""
-        if not isinstance(returned, tuple) or not 2 <= len(returned) <= 5:
+    return estimates
+
+
+def checked_poses(plugin: str, returned: Any, count: int) -> Poses:
+    """Return a plug-in's poses: arrays of the right shapes, and rotations that are rotations.
+
+    Raises
+    ------
+    PluginError
+        If they are none.
+    """
+    if not isinstance(returned, tuple) or not 2 <= len(returned) <= 5:
+        raise PluginError(
+            f"{plugin}: returned a {type(returned).__name__}; expected a tuple "
+            "(rotation, translation)"
+        )
+    given = Poses(*returned)
+    if (given.alternative_rotation is None) != (given.alternative_translation is None):
+        raise PluginError(
+            f"{plugin}: returned half an alternative; expected its rotation and translation"
+        )
+    shapes, arrays = ((3, 3), (3,), (6, 6), (3, 3), (3,)), {}
+    for (name, value), shape in zip(given._asdict().items(), shapes, strict=True):
+        if value is not None:
+            array = real_numbers(plugin, f"a {name}", value, (count, *shape))
+            array[~np.isfinite(array).reshape(count, -1).all(axis=1)] = np.nan
+            arrays[name] = array
+    for name in arrays.keys() & {"rotation", "alternative_rotation"}:
+        known = arrays[name][~np.isnan(arrays[name][:, 0, 0])]
+        gram = np.swapaxes(known, 1, 2) @ known
+        off = np.abs(gram - np.eye(3)).max(initial=0.0)
+        if off > ROTATION_ATOL or (np.linalg.det(known) < 0).any():
             raise PluginError(
-                f"{self._name}: returned a {type(returned).__name__}; expected a tuple "
-                "(rotation, translation)"
+                f"{plugin}: returned a {name} that is no rotation matrix ({off:.2g} off)"
             )
-        given = Poses(*returned)
-        if (given.alternative_rotation is None) != (given.alternative_translation is None):
-            raise PluginError(
-                f"{self._name}: returned half an alternative; expected its rotation and translation"
-            )
-        shapes, arrays = ((3, 3), (3,), (6, 6), (3, 3), (3,)), {}
-        for (name, value), shape in zip(given._asdict().items(), shapes, strict=True):
-            if value is not None:
-                array = real_numbers(self._name, f"a {name}", value, (count, *shape))
-                array[~np.isfinite(array).reshape(count, -1).all(axis=1)] = np.nan
-                arrays[name] = array
-        for name in arrays.keys() & {"rotation", "alternative_rotation"}:
-            known = arrays[name][~np.isnan(arrays[name][:, 0, 0])]
-            gram = np.swapaxes(known, 1, 2) @ known
-            off = np.abs(gram - np.eye(3)).max(initial=0.0)
-            if off > ROTATION_ATOL or (np.linalg.det(known) < 0).any():
-                raise PluginError(
-                    f"{self._name}: returned a {name} that is no rotation matrix ({off:.2g} off)"
-                )
-        return Poses(**arrays)
+    return Poses(**arrays)
 
 
 # --------------------------------------------------------------------------------------------------
 # Poses that another program estimated, as an estimator.
 
-@dataclass(frozen=True, slots=True)
-class RecordedPose:
-    """Takes the poses that came with recorded detections; there are none for other detections.
+def given_poses(limit: float, detections: Detections) -> Estimates:
+    """Return the poses that came with recorded detections.
 
-    Attributes
-    ----------
-    reprojection_limit
-        Largest RMS reprojection error of a pose, as a share of the mean side of the detected
-        quadrilateral, as for solvers.
+    solver_failed where there is none, none in front of the camera, or the RMS reprojection error
+    exceeds ``limit``, a share of the mean side of the detected quadrilateral, as for solvers.
     """
-
-    reprojection_limit: float
-
-    needs_images = False
-
-    def __call__(self, detections: Detections) -> Estimates:
-        """Return the poses; solver_failed where there is none, or none in front of the camera."""
-        rotation, translation = detections.recorded_rotation, detections.recorded_translation
-        if rotation is None or translation is None:
-            return Estimates.none(len(detections), EstimateStatus.solver_failed)
-        return credible_estimates(detections, rotation, translation, self.reprojection_limit)
+    rotation, translation = detections.recorded_rotation, detections.recorded_translation
+    if rotation is None or translation is None:
+        return Estimates.none(len(detections), EstimateStatus.solver_failed)
+    return credible_estimates(detections, rotation, translation, limit)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -139,21 +113,22 @@ class RecordedPose:
 SOLVERS: dict[str, Solver] = {
     **OPENCV_SOLVERS,
     "photometric": Solver(
-        "maximum likelihood on the pixels, started from ippe",
-        lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
+        meaning="maximum likelihood on the pixels, started from ippe",
+        make=lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
         needs_images=True, of_boards=True,
     ),
     "photometric_real": Solver(
-        "least squares on the pixels of photographs: what else is on the board, point spread "
-        "and tone are in the model, noise is estimated",
-        lambda setting: PhotometricReal(
+        meaning="least squares on the pixels of photographs: what else is on the board, point "
+        "spread and tone are in the model, noise is estimated",
+        make=lambda setting: PhotometricReal(
             setting.refined_starts, spread_free=True, tone=setting.estimate_tone
         ),
         needs_images=True, planar_only=True,
     ),
     "recorded": Solver(
-        "the poses that came with the detections which `sweep score` recorded",
-        lambda setting: RecordedPose(setting.reprojection_limit), recorded=True, of_boards=True,
+        meaning="the poses that came with the detections which `sweep score` recorded",
+        make=lambda setting: partial(given_poses, setting.reprojection_limit),
+        recorded=True, of_boards=True,
     ),
 }
 
@@ -239,12 +214,22 @@ class EstimatorSetting:
         None, f"noise of a pixel {_ASSUMED}", 0, 1e6, unit="grey level"
     )
 
+    @property
+    def record(self) -> Solver | DeclaredPlugin:
+        """What is declared of its solver; a plug-in is not imported for it."""
+        return SOLVERS[self.solver]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PluggedEstimatorSetting(EstimatorSetting):
     """The setting of a plug-in's solver: ours, and ``own``."""
 
     own: PluginSetting
+
+    @property
+    def record(self) -> DeclaredPlugin:
+        """The plug-in."""
+        return self.own.plugin
 
 
 @lru_cache(maxsize=1024)
@@ -257,8 +242,5 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
         If a plug-in cannot be used.
     """
     if isinstance(setting, PluggedEstimatorSetting):
-        return PluggedEstimator(
-            setting.solver, setting.own.record(), setting.own.instance(),
-            setting.reprojection_limit, setting.corner_noise_px,
-        )
-    return SOLVERS[setting.solver].build(setting)
+        return plugged(setting)
+    return SOLVERS[setting.solver].make(setting)

@@ -174,8 +174,6 @@ class Photometric:
     refined: bool
     spread_free: bool
 
-    needs_images = True
-
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with their covariances."""
         out = Estimates.none(len(detections), EstimateStatus.solver_failed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,26 +19,23 @@ from sweep.model.camera import Cameras
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import side_lengths, signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
+from sweep.plugins import EstimatorPlugin
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # OpenCV's solvers, and poses of N markers at once, from four corners each.
 
-@dataclass(frozen=True, slots=True)
-class Solver:
-    """One choice of ``solver`` in pipeline files.
+@dataclass(frozen=True, kw_only=True)
+class Solver(EstimatorPlugin):
+    """A built-in choice of ``solver`` in pipeline files: a plug-in's record, and what OpenCV needs.
+
+    Its ``make`` takes a :class:`sweep.measure.estimators.EstimatorSetting`, and returns an
+    estimator.
 
     Attributes
     ----------
-    meaning
-        One line for the reference.
-    build
-        Makes its estimator from a :class:`sweep.measure.estimators.EstimatorSetting`; called once
-        for each configuration and process.
     method
         OpenCV's constant of a solver that takes corners alone; None of others.
-    needs_images
-        Whether it uses the pixels: the detections' images are kept for it.
     guarded
         Whether the setting ``guarded`` applies to it: it is stable for four coplanar points.
     planar_only
@@ -51,26 +48,21 @@ class Solver:
         Whether it estimates the pose of a board from all its points, too.
     """
 
-    meaning: str
-    build: Callable[[Any], estimation.PoseEstimator]
     method: Any = None
-    needs_images: bool = False
     guarded: bool = False
     planar_only: bool = False
     two_solutions: bool = False
     recorded: bool = False
-    of_boards: bool = False
 
 
-def _of_opencv(method: int, meaning: str, *, guarded: bool = True, **properties: bool) -> Solver:
+def _of_opencv(method: int, meaning: str, *, guarded: bool = True, **properties: Any) -> Solver:
     """Return the record of one method of ``cv2.solvePnP``."""
     return Solver(
-        meaning,
-        lambda setting: PointSolver(
+        make=lambda setting: PointSolver(
             setting.solver, setting.guarded, setting.reprojection_limit, setting.corner_noise_px,
             setting.points, setting.refine,
         ),
-        method, guarded=guarded, **properties,
+        meaning=meaning, method=method, guarded=guarded, **properties,
     )
 
 
@@ -542,8 +534,6 @@ class PointSolver:
     corner_noise_px: float | None = None
     points: str = "markers"
     refine: str = "none"
-
-    needs_images = False
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with covariances if the corners' noise is given."""

@@ -238,8 +238,6 @@ def test_scenes_do_not_depend_on_which_others_are_needed_or_kept(monkeypatch):
 class Recorder:
     """An estimator that keeps the detections it gets."""
 
-    needs_images = True
-
     def __call__(self, detections):
         self.seen = detections
         return Estimates.none(len(detections.corners), EstimateStatus.solver_failed)

@@ -361,7 +361,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     url
         The store.
     sample
-        Scenes that are drawn at random and recomputed.
+        Scenes that are drawn at random and recomputed; none with a sample of 0.
 
     Raises
     ------
@@ -370,11 +370,7 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     """
     if sample < 0:
         raise ArgumentError("sample", sample, "expected at least 0")
-    return report_on(lifecycle.open_unchecked(url), sample)
-
-
-def report_on(store: RunStore, sample: int) -> IntegrityReport:
-    """Check a store, and recompute up to ``sample`` scenes; none with a sample of 0."""
+    store = lifecycle.open_unchecked(url)
     done = blocks.committed(store)
     report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
     report.files = 1 + len(store.run_metadata["files"])
@@ -424,19 +420,19 @@ def repair(
     RunError
         If blocks failed.
     """
-    store = lifecycle.open_unchecked(url, "r+")
-    before = report_on(store, sample)
+    before = verify(url, sample)
     lasting = [each for each in before.damage if before.unstable and each.where == before.unstable]
     if before.damage == lasting:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
+    store = lifecycle.open_unchecked(url, "r+")
     pipeline = computable(store) if numbers else store.pipeline
     store = lifecycle.reopen(store, drop=numbers)
     if before.finished and numbers:
         execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
     elif before.finished:
         close(store)
-    after = report_on(lifecycle.open_unchecked(url), 0)
+    after = verify(url, 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.unstable, after.damage = before.unstable, after.damage + lasting
     remaining = {damage.where for damage in after.damage}

@@ -321,7 +321,7 @@ def begin_block(store: RunStore, block: Block) -> bool:
     with translate_errors(store.url, "written"):
         check_not_replaced(store)
         key = f"{BEGUN}/{store.blocks.number(block)}"
-        if files.sync(store.storage.exists(key)):
+        if files.read_files(store.storage, [key]) != [None]:
             return True
         files.write_document(store.storage, key, {})
     return False

@@ -9,20 +9,17 @@ import os
 import stat
 import tempfile
 import uuid
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import google_crc32c
 import numcodecs.zstd
 from zarr.abc.store import Store
 from zarr.buffer import cpu, default_buffer_prototype
 from zarr.codecs import Crc32cCodec, ZstdCodec
-from zarr.core.sync import sync
+from zarr.core.sync import collect_aiterator, sync
 from zarr.storage import FsspecStore, LocalStore
-
-__all__ = ["sync"]
-
 
 # --------------------------------------------------------------------------------------------------
 # Files that are read and written whole: a store's by key, and results for a user.
@@ -111,23 +108,16 @@ def absent_files(storage: Store, keys: Iterable[str], folder: str) -> Iterator[s
             yield key
 
 
-def _listed(keys: AsyncIterator[str]) -> list[str]:
-    async def names() -> list[str]:
-        return [key async for key in keys]
-
-    return sync(names())
-
-
 def list_folder(storage: Store, folder: str) -> list[str]:
     """Return the names in a folder of a storage; none if there is no such folder."""
     with contextlib.suppress(FileNotFoundError):
-        return _listed(storage.list_dir(folder))
+        return [*collect_aiterator(storage.list_dir(folder))]
     return []
 
 
 def list_files(storage: Store, prefix: str = "") -> list[str]:
     """Return the keys of all files below a prefix."""
-    return _listed(storage.list_prefix(prefix))
+    return [*collect_aiterator(storage.list_prefix(prefix))]
 
 
 def files_in(storage: Store) -> dict[str, bytes]:
@@ -156,18 +146,17 @@ def write_document(storage: Store, key: str, content: Mapping[str, Any]) -> None
     write_files(storage, {key: encoded(content)})
 
 
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file beside a path, which takes the path's name once everything is written.
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a new file beside a path, which takes the path's name once everything is written.
 
     Its own name cannot be foreseen, and it is refused if it exists: nothing is written through a
     link that waits there. A link at the path is replaced; a file there passes on its permissions.
     """
     temporary = path.with_name(f".sweep-{uuid.uuid4().hex}")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    file = temporary.open("xb")
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            yield file
+        with file:
+            file.write(content)
         if path.is_file() and not path.is_symlink():
             temporary.chmod(stat.S_IMODE(path.stat().st_mode))
         temporary.replace(path)
@@ -179,12 +168,6 @@ def check_folder_writable(folder: Path) -> None:
     """Raise OSError if no file can be made in a folder."""
     with tempfile.TemporaryFile(dir=folder):
         pass
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file as :func:`whole_file` does."""
-    with whole_file(path) as file:
-        file.write(content)
 
 
 # --------------------------------------------------------------------------------------------------

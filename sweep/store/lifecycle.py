@@ -12,7 +12,6 @@ import uuid
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -22,7 +21,6 @@ import zarr
 import zarr.errors
 from numpy.typing import NDArray
 from zarr.abc.store import Store
-from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
 from sweep.errors import ArgumentError, StoreError, SweepError, path_of
@@ -55,7 +53,6 @@ if TYPE_CHECKING:
 #: Version of the layout of stores; another one is refused.
 FORMAT = 8
 
-COORDINATE_CHUNK = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class PlannedArray:
@@ -85,12 +82,11 @@ class PlannedArray:
 
     def create(self, group: zarr.Group) -> None:
         """Create the array and write its values."""
-        options = {} if self.fill is None else {"fill_value": self.fill}
         array = group.create_array(
-            self.path, shape=self.shape, chunks=self.chunks, dtype=_dtype(self.dtype),
+            self.path, shape=self.shape, chunks=self.chunks, dtype=self.dtype,
             dimension_names=self.dimensions, compressors=files.codecs(), attributes=self.attributes,
             # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
-            config={"write_empty_chunks": True}, **options,
+            config={"write_empty_chunks": True}, fill_value=self.fill,
         )
         if self.values is not None:
             array[...] = self.values
@@ -105,12 +101,6 @@ def planned_files(planned: Iterable[PlannedArray]) -> dict[str, bytes]:
     return {key: content for key, content in files.files_in(memory).items() if key != "zarr.json"}
 
 
-@cache
-def _dtype(name: str) -> Any:
-    """Return Zarr's data type of a name; it looks through all that it knows, each time."""
-    return parse_dtype(name, zarr_format=3)
-
-
 def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
     axes = pipeline.experiment.scene_axes
@@ -121,7 +111,7 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
         if array.dtype.kind in "TU":
             array = array.astype(object)
         planned.append(PlannedArray(
-            name, array.shape, tuple(min(length, COORDINATE_CHUNK) for length in array.shape),
+            name, array.shape, array.shape,
             "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
             with_description(name, attributes), array, coordinate=dimensions != (name,),
         ))

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import re
-import tempfile
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from zarr.storage import FsspecStore, LocalStore
 
 from sweep.errors import StoreError
 from sweep.messages import nearest_file, plain
-from sweep.store.files import read_files
+from sweep.store.files import check_folder_writable, read_files
 
 # --------------------------------------------------------------------------------------------------
 # Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
@@ -122,11 +121,8 @@ def storage_at(url: str, *, read_only: bool) -> Store:
 
 def remote_run_id(url: str) -> str | None:
     """Return the id of the run that a remote store's URL points to; None if there is no store."""
-    storage = storage_at(url, read_only=True)
-    try:
-        content = read_files(storage, ["zarr.json"])[0]
-    except Exception as error:
-        raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
+    with translate_errors(url, "reached"):
+        content = read_files(storage_at(url, read_only=True), ["zarr.json"])[0]
     if content is None:
         return None
     with contextlib.suppress(ValueError, KeyError, TypeError):
@@ -223,5 +219,4 @@ def check_writable(url: str) -> None:
             raise StoreError(f"{url}: cannot be written: it is inside the store {around}")
         with contextlib.suppress(FileExistsError):  # a file, which cannot hold a folder
             Path(url).parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
-            pass
+        check_folder_writable(Path(url).parent)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import platform
-import runpy
 from collections.abc import Iterator, Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+
+import cv2
+import llvmlite
+import numba
+import numpy as np
 
 from sweep.experiment.draws import SAMPLINGS
 from sweep.experiment.grid import Axis
@@ -25,10 +28,6 @@ NUMBERS_VERSION = 5
 @cache
 def builds() -> dict[str, str]:
     """Return which builds of libraries are loaded in this process, whatever their metadata say."""
-    import cv2  # noqa: PLC0415  (slow to import)
-    import llvmlite  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
-
     config: dict[str, Any] = {**np.show_config(mode="dicts")}
     # Paths are other ones for each Python that NumPy was built for.
     for dependency in config["Build Dependencies"].values():
@@ -39,22 +38,13 @@ def builds() -> dict[str, str]:
     return {
         "opencv": f"{cv2.__version__} {_digest(cv2.getBuildInformation())}",
         "numpy": f"{np.__version__} {_digest(json.dumps(config, sort_keys=True))}",
-        "numba": _numba_version(),
+        "numba": numba.__version__,
         "llvmlite": llvmlite.__version__,
     }
 
 
 def _digest(text: str) -> str:
     return sha256(text.encode()).hexdigest()[:12]
-
-
-def _numba_version() -> str:
-    """Return ``numba.__version__`` from the file that it comes from: Numba is slow to import."""
-    spec = importlib.util.find_spec("numba")
-    if spec is None or spec.origin is None:
-        raise ModuleNotFoundError("numba", name="numba")
-    content = runpy.run_path(str(Path(spec.origin).parent / "_version.py"))
-    return str(content["get_versions"]()["version"])
 
 
 def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
@@ -108,12 +98,9 @@ def environment() -> dict[str, str]:
 
 def _cpu() -> str:
     """Return the CPU's model name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.machine())
 
 
 def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> list[str]:
@@ -140,12 +127,10 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     lines = [
         f"{name}: the store has {_shown(other)}, this run {_shown(own)}"
         for name, other, own in pairs
-        if other != own and _values(other) != _values(own)
+        if _values(other) != _values(own)
     ]
     if problem := not_continued(ours.stopping, theirs.stopping):
         lines.append(problem)
-    if any(line.startswith("sensor_") for line in lines):
-        lines.append("pixels are square unless both sides of the sensor are given")
     return lines
 
 

@@ -192,6 +192,7 @@ def paired_tables(
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
         first, second = xr.align(
             first, second, join="inner", exclude={*first.dims, *second.dims} - {DRAWS})
+        dataset.require_poses(first)
     require_pairs(first, second)
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]

@@ -112,7 +112,7 @@ def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
     It is JSON as `sweep.open` returns it, a mapping as Zarr has it; empty if there is none.
     """
     metadata = results.attrs.get("sweep")
-    if isinstance(metadata, str):
+    if isinstance(metadata, str) and metadata.startswith("{"):  # else it is somebody else's
         metadata = json.loads(metadata)
     return metadata if isinstance(metadata, Mapping) else {}
 
@@ -647,7 +647,7 @@ def pose_arrays(results: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataA
     DatasetError
         If the dataset lacks some.
     """
-    lacking = ", ".join(name for name in names if name not in results)
+    lacking = ", ".join(name for name in dict.fromkeys(names) if name not in results)
     if lacking and AXIS in results.dims:
         raise DatasetError(
             f"no variable {lacking}: a board's markers have detections alone; estimates "

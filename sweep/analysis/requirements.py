@@ -1090,12 +1090,13 @@ def requirement_limits(
 
 
 def require_order(results: xr.Dataset, along: str) -> None:
-    """Raise ArgumentError unless an axis of the scene has numbers."""
+    """Raise ArgumentError unless an axis of the scene has numbers, each once."""
     axes = [name for name in axes_of(results, Stage.scene)
-            if name != DRAWS and name in results.coords and results[name].dtype.kind in "fiu"]
+            if name != DRAWS and name in results.coords and results[name].dtype.kind in "fiu"
+            and 0 < results.sizes[name] == results.get_index(name).nunique()]
     if along not in axes:
-        raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
-                            f"are {', '.join(axes) or 'none'}")
+        raise ArgumentError("along", along, "expected an axis of the scene with numbers, each "
+                            f"once; there are {', '.join(axes) or 'none'}")
 
 
 #: Whether markers are smaller in the image at large values of an axis that changes their size.

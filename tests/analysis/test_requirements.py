@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 
 from support.small_datasets import perfect, with_detected
@@ -108,6 +109,14 @@ def test_a_limit_beyond_the_grid_has_an_infinite_end(axis, met, ends):
     one = requirement_limits(results, ["detection >= 0.9"], axis)
     assert (float(one["low"]), float(one["high"])) == ends
     assert Reach(int(one["reach"])) is (Reach.always if met else Reach.never)
+
+
+@pytest.mark.parametrize("parts", [2, 0])
+def test_an_axis_with_repeated_values_or_without_any_has_no_limit(parts):
+    results = detected_by_distance([1.0, 1.0])
+    results = xr.concat([results] * 2, "distance_m") if parts else results.isel(distance_m=[])
+    with pytest.raises(ArgumentError, match=r"distance_m: expected an axis .* each once"):
+        requirement_limits(results, ["detection >= 0.9"], "distance_m")
 
 
 def test_verdicts_are_of_the_worst_condition():

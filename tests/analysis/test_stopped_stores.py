@@ -15,7 +15,9 @@ from sweep.analysis import (
     marker_ranking,
     precision_reached,
 )
+from sweep.analysis.comparisons import regressions
 from sweep.analysis.requirements import Reached
+from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 TRIALS = 200
@@ -120,3 +122,15 @@ def test_what_was_reached_is_told_by_condition(stopped):
     np.testing.assert_allclose(
         table.half_width.isel(solver=0, quantity=0),
         (half.detection_rate_high - half.detection_rate_low) / 2)
+
+
+def test_stores_without_a_common_trial_are_not_paired(stopped):
+    with pytest.raises(DatasetError, match="there are no poses: trial has no values"):
+        compare(stopped.isel(trial=slice(9)), stopped.isel(trial=slice(9, None)))
+
+
+def test_an_attribute_of_another_program_and_a_missing_variable_are_told_apart(full):
+    assert detection_rate(full.assign_attrs(sweep="of another program")).equals(
+        detection_rate(full))
+    with pytest.raises(DatasetError, match="no variable rotation_error_rad; there are"):
+        regressions(full.drop_vars("rotation_error_rad"), full)

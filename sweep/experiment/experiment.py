@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, c
 from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
-from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.loading import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats, Masks
 
@@ -72,9 +71,9 @@ def _made(declaring: type[T], values: Mapping[str, Any]) -> T:
 
 def effect_of(plugin: DeclaredPlugin) -> Effect:
     """Return the effect of a plug-in, which is not imported for it: it lacks its function."""
-    parameters = {setting.name: setting for setting in plugin.settings}
-    return Effect(plugin.name, cast("Any", plugin.step), parameters, random=plugin.random,
-                  widens=cast("Any", plugin.widens))
+    return Effect(
+        plugin.name, plugin.step, {each.name: each for each in plugin.settings},
+        random=plugin.random, widens=plugin.widens)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -132,8 +131,7 @@ class Experiment:
     @cached_property
     def solvers_on_pixels(self) -> list[str]:
         """The solvers for which the detections' images are kept."""
-        needing = [each.solver for each in self.estimators if each.record.needs_images]
-        return [*dict.fromkeys(needing)]
+        return [*dict.fromkeys(each.solver for each in self.estimators if each.record.needs_images)]
 
     def _settings(self, section: str) -> Iterator[tuple[dict[str, Any], PluginSetting | None]]:
         """Yield the values of a section at all combinations of its axes, in their order.
@@ -164,15 +162,14 @@ class Experiment:
         PluginError
             If one is not the plug-in that was declared; in one line.
         """
-        effects, renderers, settings = [], {}, []
+        effects, renderers, settings = [*EFFECTS], {}, []
         for plugin in self.grid.plugins:
             if plugin.kind == "effect":
-                effect = cast("EffectPlugin", plugin.record(self.grid.folder))
-                applied = checked_effect(plugin.name, effect.apply)
-                effects.append(dataclasses.replace(effect_of(plugin), apply=applied))
+                apply = checked_effect(plugin.name, plugin.record(self.grid.folder).apply)
+                effects.append(dataclasses.replace(effect_of(plugin), apply=apply))
             elif plugin.kind == "renderer":
-                renderer = cast("RendererPlugin", plugin.record(self.grid.folder))
-                renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)
+                render = plugin.record(self.grid.folder).render
+                renderers[plugin.name] = checked_renderer(plugin.name, render)
                 settings += [setting.name for setting in plugin.settings]
         return ScenePlugins(tuple(effects), renderers, tuple(settings))
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
 from sweep.model import sensor
+from sweep.plugins import Widens
 from sweep.plugins.loading import call, real_numbers
 from sweep.typing import Floats
 
@@ -122,7 +123,7 @@ class Effect:
     needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     random: bool = False
     in_bound: bool = False
-    widens: Literal["nothing", "noise", "uneven light"] = "nothing"
+    widens: Widens = "nothing"
     worsens: tuple[Literal["noise", "uneven light"], ...] = ()
     outline: Literal["kept", "curved", "moving", "covered"] = "kept"
     spread_px: Callable[[Mapping[str, float], float, Floats], Floats] | None = None
@@ -488,9 +489,6 @@ NEUTRAL: dict[str, Any] = {name: each.default for name, each in _DECLARED.items(
 #: Parameters that are text or lists: scenes hold the numbers of their values.
 CODED = tuple(name for name, default in NEUTRAL.items() if is_coded(default))
 
-#: Parameters that are numbers.
-PLAIN = tuple(name for name in NEUTRAL if name not in CODED)
-
 #: Switches of the effects that only the ``exact`` renderer has.
 GEOMETRIC = tuple(effect.switch for effect in EFFECTS if effect.step == "edges")
 
@@ -553,26 +551,21 @@ Render = Callable[[MarkerView], tuple[Floats, Floats]]
 
 @dataclass(frozen=True, slots=True)
 class ScenePlugins:
-    """The plug-ins of scenes.
+    """What scenes may have: the built-in effects, and what plug-ins add.
 
     Attributes
     ----------
     effects
-        In the order in which they act, after the built-in ones of their step.
+        In the order in which they act in their step: the built-in ones, then those of plug-ins.
     renderers
         By the name that pipelines have.
     settings
         Names of the renderers' settings.
     """
 
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[Effect, ...] = EFFECTS
     renderers: Mapping[str, Render] = field(default_factory=dict)
     settings: tuple[str, ...] = ()
-
-    @property
-    def all_effects(self) -> tuple[Effect, ...]:
-        """The built-in effects, and those of plug-ins."""
-        return (*EFFECTS, *self.effects)
 
 
 NO_PLUGINS = ScenePlugins()

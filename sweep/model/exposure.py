@@ -377,7 +377,7 @@ def _in_frame(scenes: Scenes, row: int, low: Floats, high: Floats) -> tuple[Floa
     reach = 0.0
     if scenes.effects.active[row]:
         reach = REACH * largest_spread_px(scenes, row) + max(
-            each.reach_px for each in scenes.effects.plugins.all_effects
+            each.reach_px for each in scenes.effects.plugins.effects
         )
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
     sides = along_sides(board.sheets_m(target) * scenes.effects["marker_scale"][row], per_side)

@@ -293,7 +293,7 @@ def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
         np.array(modules(key.dictionary, key.marker_ids[0])),
         (key.margin or 0.0) - beyond, black, white, scenes.plane[row] @ from_whole,
         scenes.cameras.matrix(row), scenes.cameras.lenses[row, :14].copy() if distorted else None,
-        box, {name: float(column[row]) for name, column in scenes.effects.settings.items()},
+        box, {name: float(scenes.effects[name][row]) for name in scenes.effects.plugins.settings},
     )
 
 

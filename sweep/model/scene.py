@@ -17,7 +17,7 @@ from sweep.model import board, effects
 from sweep.model import lens as lens_model
 from sweep.model.board import Board, extent_of
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
-from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, Effect, Patch, ScenePlugins
+from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, Effect, Patch, ScenePlugins
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
@@ -150,8 +150,8 @@ class SceneEffects:
         The effects that a scene may have, and (N,) whether one is active.
     noise_key
         (N,) keys of the noise.
-    plugins, settings
-        The plug-ins' effects and renderers, and (N,) each setting of the renderers.
+    plugins
+        All effects, and the plug-ins' renderers, whose settings are among the values.
     memo
         What :func:`kept_for_row` keeps.
     """
@@ -162,7 +162,6 @@ class SceneEffects:
     active: NDArray[np.bool_]
     noise_key: NDArray[np.uint64]
     plugins: ScenePlugins
-    settings: Mapping[str, Floats]
     memo: dict[Any, tuple[int, Any]] = field(default_factory=dict, init=False)
 
     def __getitem__(self, name: str) -> Floats:
@@ -463,13 +462,13 @@ def build_scenes(
         ],
         axis=1,
     )
-    own = [name for each in plugins.effects for name in each.parameters]
-    strengths = {name: numbers(name) for name in (*PLAIN, *own)}
+    own = [name for each in plugins.effects for name in each.parameters if name not in CODED]
+    strengths = {name: numbers(name) for name in (*own, *plugins.settings)}
     coded: dict[str, Sequence[Any]] = {}
     for name in CODED:
         coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
         strengths[name] = number[1:].astype(np.float64)
-    present = [each for each in plugins.all_effects if column(each.switch).differs_from(each.off)]
+    present = [each for each in plugins.effects if column(each.switch).differs_from(each.off)]
     active = np.zeros(count, dtype=bool)
     for each in present:
         active |= each.is_active(strengths[each.switch])
@@ -488,7 +487,7 @@ def build_scenes(
         background=column("background").listed(count),
         effects=SceneEffects(
             strengths, coded, present, active, column("noise_key").broadcast(count, np.uint64),
-            plugins, {name: numbers(name) for name in plugins.settings},
+            plugins,
         ),
     )
 

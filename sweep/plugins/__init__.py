@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 from sweep.declaration import parameter
 
@@ -161,6 +161,10 @@ class EstimatorPlugin(Plugin):
     of_boards: bool = False
 
 
+#: Why an effect makes more than the usual window be searched.
+Widens = Literal["nothing", "noise", "uneven light"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class EffectPlugin(Plugin):
     """A pointwise effect of the camera or its surroundings on the image.
@@ -185,16 +189,16 @@ class EffectPlugin(Plugin):
     kind: ClassVar[str] = "effect"
     function: ClassVar[str] = "apply"
     apply: Callable[[Any, Any], Any]
-    step: str = "light"
+    step: Literal["light", "signal"] = "light"
     random: bool = False
-    widens: str = "nothing"
+    widens: Widens = "nothing"
 
     def __post_init__(self) -> None:
         """Refuse what no effect has."""
         super().__post_init__()
         if self.step not in ("light", "signal"):
             raise ValueError(f"step = {self.step!r}: expected light or signal")
-        if self.widens not in ("nothing", "noise", "uneven light"):
+        if self.widens not in get_args(Widens):
             raise ValueError(f"widens = {self.widens!r}: expected nothing, noise or uneven light")
         if self.settings is None:
             raise TypeError("expected settings, of which the first is the switch")

@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sweep.declaration import Declared, declared_fields
 from sweep.errors import ArgumentError, PluginError
 from sweep.messages import exception_line, nearest, nearest_file, plain
-from sweep.plugins import RECORDS, Plugin
+from sweep.plugins import RECORDS, Plugin, Widens
 from sweep.plugins.recording import is_recording, recorded_detector
 
 # --------------------------------------------------------------------------------------------------
@@ -307,10 +307,10 @@ class DeclaredPlugin:
     needs_images: bool = False
     of_boards: bool = False
     random: bool = False
-    widens: str = "nothing"
-    step: str = "light"
+    widens: Widens = "nothing"
+    step: Literal["light", "signal"] = "light"
 
-    def record(self, folder: str) -> Plugin:
+    def record(self, folder: str) -> Any:
         """Return the plug-in's record, imported; ``folder`` is the pipeline's folder.
 
         Raises

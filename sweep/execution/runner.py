@@ -252,6 +252,7 @@ def compute(
                     totals.needed, int(waves.settled_share * conditions), conditions))))
 
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
+        lifecycle.check_same_rule(store)
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = blocks.committed(store)

@@ -42,8 +42,8 @@ class Totals:
 
     Attributes
     ----------
-    blocks, scenes, needed
-        Blocks, scenes of these, and how many of the scenes were needed.
+    scenes, needed
+        Scenes, and how many of them were needed.
     detection, estimate
         Counts of cells; the flag is the index.
     processors
@@ -52,7 +52,6 @@ class Totals:
         The cells that "crashed" and that "failed", at most :data:`MAX_ROWS` of each.
     """
 
-    blocks: int = 0
     scenes: int = 0
     needed: int = 0
     detection: Integers = field(default_factory=lambda: np.zeros(len(DetectionStatus), np.int64))
@@ -70,7 +69,6 @@ class Totals:
 
     def add(self, receipt: Receipt) -> None:
         """Add the receipt of another block."""
-        self.blocks += 1
         self.scenes += receipt.scenes
         self.needed += receipt.scenes_needed
         self.processors.update(receipt.processors)
@@ -436,7 +434,7 @@ def status(url: str) -> SimpleNamespace:
         title=store.pipeline.heading,
         finished=store.finished,
         being_written=writing,
-        blocks_done=totals.blocks,
+        blocks_done=len(written),
         poses_done=totals.scenes,
         detection=dict(_by_name(DetectionStatus, totals.detection)),
         estimate=dict(_by_name(EstimateStatus, totals.estimate)),

@@ -554,6 +554,7 @@ def reopen(
     """
     contents = planned_files(planned_arrays(store.pipeline, store.blocks.extents))
     with changing(store.url, store.storage), locations.translate_errors(store.url, "written"):
+        check_same_rule(store)
         metadata = store.run_metadata | ({} if pipeline is None else _recorded(pipeline)) | {
             "finished": False, "files": checksums(contents)}
         for ended in ("finished_at", "counts"):
@@ -565,6 +566,16 @@ def reopen(
         for number in drop:
             blocks.drop_block(store, store.blocks[number])
     return open_store(store.url, "r+")
+
+
+def check_same_rule(store: RunStore) -> None:
+    """Raise StoreError if another run has reopened a store with its own rule of stopping.
+
+    Nobody does while this process holds the store's lock.
+    """
+    attributes, _ = read_root(store.url, store.storage)
+    if attributes["pipeline"] != store.pipeline.text:
+        raise StoreError(f"{store.url}: another run has changed when its sampling stops")
 
 
 def write_groups(

@@ -10,7 +10,7 @@ import pytest
 from zarr.storage import MemoryStore
 
 from sweep.errors import StoreError
-from sweep.execution.runner import execute
+from sweep.execution.runner import compute, execute
 from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
@@ -47,6 +47,18 @@ def test_writers_exclude_nobody_who_writes_and_refuse_all_changes(store, pipelin
     assert not status(store.url).being_written
     remove_store(store.url)
     assert list(Path(store.url).parent.iterdir()) == []
+
+
+def test_a_run_that_another_rule_of_stopping_has_overtaken_changes_nothing(tmp_path):
+    rules = (f"[search]\nmax_trials = 100\nprecision.detection_rate = {w}" for w in (0.2, 0.1))
+    loose, strict = (Pipeline.from_text(
+        TEXT.partition("\n")[2] + "\n" + rule, name="held") for rule in rules)
+    begun = create_store(str(tmp_path / "held.zarr"), loose, (50,))
+    reopen(open_store(begun.url, "r+"), strict)
+    for late in lambda: reopen(begun), lambda: compute(begun, None, (), 1.0, None):
+        with pytest.raises(StoreError, match="another run has changed when its sampling stops"):
+            late()
+    assert open_store(begun.url).pipeline.stopping == strict.stopping
 
 
 @pytest.fixture

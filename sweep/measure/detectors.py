@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -240,31 +240,23 @@ def opencv_parameters(setting: DetectorSetting) -> cv2.aruco.DetectorParameters:
     return parameters
 
 
-class Detector:
-    """One setting of OpenCV's detector in this process; OpenCV's objects cannot be pickled."""
+def opencv_search(
+    setting: DetectorSetting, dictionary: str, side: int, frame_side: int
+) -> SearchFunction:
+    """Return OpenCV's search for images of larger side ``side``, windows of a frame.
 
-    def __init__(self, setting: DetectorSetting) -> None:
-        self._setting = setting
-        self._search = lru_cache(maxsize=4096)(self._new_search)
-
-    def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> DetectorOutput:
-        """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
-        return self._search(dictionary, max(image.shape), frame_side)(image)
-
-    def _new_search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
-        """Return OpenCV's search for images of larger side ``side``, windows of a frame.
-
-        OpenCV takes the limits of the perimeter relative to the image that it is given and turns
-        them into whole pixels: they are passed so that they give the same numbers as on the frame.
-        """
-        parameters = opencv_parameters(self._setting)
-        if side != frame_side:
-            for name in ("minMarkerPerimeterRate", "maxMarkerPerimeterRate"):
-                pixels = int(getattr(self._setting, name) * frame_side)
-                setattr(parameters, name, (pixels + 0.5) / side)
-        detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
-        # OpenCV's stubs have neither the element types nor that the IDs may be None.
-        return cast("SearchFunction", detector.detectMarkers)
+    OpenCV takes the limits of the perimeter relative to the image that it is given and turns them
+    into whole pixels: they are passed so that they give the same numbers as on the frame. OpenCV's
+    objects cannot be pickled.
+    """
+    parameters = opencv_parameters(setting)
+    if side != frame_side:
+        for name in ("minMarkerPerimeterRate", "maxMarkerPerimeterRate"):
+            pixels = int(getattr(setting, name) * frame_side)
+            setattr(parameters, name, (pixels + 0.5) / side)
+    detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
+    # OpenCV's stubs have neither the element types nor that the IDs may be None.
+    return cast("SearchFunction", detector.detectMarkers)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -455,9 +447,11 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     PluginError
         If a plug-in cannot be used.
     """
-    if isinstance(setting, DetectorSetting):
-        return Detector(setting).find
-    return plugged(setting)
+    if isinstance(setting, PluginSetting):
+        return plugged(setting)
+    search_for = lru_cache(maxsize=4096)(partial(opencv_search, setting))
+    return lambda image, dictionary, frame_side: (
+        search_for(dictionary, max(image.shape), frame_side)(image))
 
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:

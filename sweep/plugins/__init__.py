@@ -78,8 +78,8 @@ class Plugin:
         How to install it (default: ``pip install`` and the distribution).
     """
 
-    kind: ClassVar[str]
-    function: ClassVar[str]  # the field that a class or function may stand for, without a record
+    #: The field that a class or function may stand for, without a record.
+    function: ClassVar[str] = "make"
     settings: type[Any] | None = None
     meaning: str = ""
     distribution: str | Sequence[str] = ()
@@ -117,8 +117,6 @@ class DetectorPlugin(Plugin):
         Threads that a search uses; runs have a process a processor, so that 1 suits them.
     """
 
-    kind: ClassVar[str] = "detector"
-    function: ClassVar[str] = "make"
     make: Callable[[Any, str], Callable[[Any], Any]]
     pixel_center: float = 0.0
     corner_order: tuple[int, int, int, int] = (0, 1, 2, 3)
@@ -154,8 +152,6 @@ class EstimatorPlugin(Plugin):
         markers, all of one.
     """
 
-    kind: ClassVar[str] = "estimator"
-    function: ClassVar[str] = "make"
     make: Callable[[Any], Callable[[Any], Any]]
     needs_images: bool = False
     of_boards: bool = False
@@ -186,7 +182,6 @@ class EffectPlugin(Plugin):
         Whether more than the usual window must be searched: "noise" or "uneven light".
     """
 
-    kind: ClassVar[str] = "effect"
     function: ClassVar[str] = "apply"
     apply: Callable[[Any, Any], Any]
     step: Literal["light", "signal"] = "light"
@@ -216,11 +211,11 @@ class RendererPlugin(Plugin):
         that the marker does not cover counts as 0, and the marker's share of each pixel.
     """
 
-    kind: ClassVar[str] = "renderer"
     function: ClassVar[str] = "render"
     render: Callable[[Any], Any]
 
 
 #: Kind of plug-in -> its record.
 RECORDS: dict[str, type[Plugin]] = {
-    each.kind: each for each in (DetectorPlugin, EstimatorPlugin, EffectPlugin, RendererPlugin)}
+    "detector": DetectorPlugin, "estimator": EstimatorPlugin, "effect": EffectPlugin,
+    "renderer": RendererPlugin}

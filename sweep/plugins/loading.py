@@ -409,31 +409,31 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
     record, digest, versions = load(kind, name, folder)
     traits = ("threads", "needs_images", "of_boards", "random", "widens", "step")
     return DeclaredPlugin(
-        kind, name, record.meaning, versions, file_of(name), digest, _settings(record),
+        kind, name, record.meaning, versions, file_of(name), digest, _settings(kind, record),
         tuple(getattr(record, "families", None) or ()),
         **{trait: getattr(record, trait) for trait in traits if hasattr(record, trait)},
     )
 
 
-def _settings(record: Plugin) -> tuple[Declared, ...]:
+def _settings(kind: str, record: Plugin) -> tuple[Declared, ...]:
     """Return the settings that a plug-in's dataclass declares."""
     if record.settings is None:
         return ()
-    types = [name for name in TYPES if name != "str" or record.kind not in ("effect", "renderer")]
+    types = [name for name in TYPES if name != "str" or kind not in ("effect", "renderer")]
     declared: list[Declared] = []
     try:
         wrong = [each.name for each in dataclasses.fields(record.settings)
                  if "declaration" not in each.metadata]
         declared += () if wrong else declared_fields(record.settings).values()
         wrong += [each.name for each in declared
-                  if each.reads or not {kind.__name__ for kind in each.types} <= {*types}]
+                  if each.reads or not {one.__name__ for one in each.types} <= {*types}]
     except Exception as error:
         wrong = [exception_line(error)]
     if wrong:
         raise PluginError(
-            f"settings of the {record.kind} as a dataclass with `name: type = parameter(default, "
+            f"settings of the {kind} as a dataclass with `name: type = parameter(default, "
             f"meaning)`, of the types {', '.join(types)}; not so: {', '.join(wrong)}")
-    if record.kind == "effect" and not declared:
+    if kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")
     return tuple(declared)
 

@@ -18,7 +18,7 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import scenes_at, searched_windows
 from sweep.experiment.pipeline import Pipeline
-from sweep.measure.detectors import Detector, opencv_board
+from sweep.measure.detectors import make_detector, opencv_board
 from sweep.model.renderers import render_all
 
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
@@ -98,7 +98,7 @@ class Block:
 
     def bare_calls(self, charuco=None):
         """The coverage and detection calls of the kernel, and their loop; markers decoded."""
-        find, side = Detector(self.setting).find, int(self.scenes.frame.max())
+        find, side = make_detector(self.setting), int(self.scenes.frame.max())
         decoded = 0
         for image in self.images(self.cut):
             corners, ids, _ = find(image, "DICT_5X5_50", side)

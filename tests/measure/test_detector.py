@@ -16,9 +16,10 @@ from sweep.measure.detectors import (
     ALIGNMENT_PX,
     MIN_WINDOW_PX,
     REFINEMENTS,
-    Detector,
     DetectorSetting,
     SearchOutput,
+    make_detector,
+    opencv_search,
     windows,
 )
 from sweep.measure.flags import DetectionStatus
@@ -62,7 +63,7 @@ OTHER = {
 
 def held_by(setting, side=64, frame_side=64):
     """OpenCV's parameters in a search of an image with ``side`` of a frame with ``frame_side``."""
-    search = Detector(setting)._search("DICT_4X4_50", side, frame_side)
+    search = opencv_search(setting, "DICT_4X4_50", side, frame_side)
     return search.__self__.getDetectorParameters()
 
 
@@ -107,7 +108,7 @@ def test_corners_of_an_upright_square_follow_opencvs_known_conventions(refinemen
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     image[100:202, 100:202] = cv2.aruco.generateImageMarker(dictionary, 1, 102)
     setting = DetectorSetting(cornerRefinementMethod=refinement)
-    corners, ids, _ = Detector(setting).find(image, "DICT_4X4_50", 320)
+    corners, ids, _ = make_detector(setting)(image, "DICT_4X4_50", 320)
     assert ids == [1]
     a, b = CONVENTIONS[refinement]
     # 0.01 px: contour's float32 line fit, and the two digits of subpix' convention.

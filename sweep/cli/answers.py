@@ -559,7 +559,7 @@ def score(
         conventions=library.answers.Conventions(pixel_center, corner_order, frame),
         doubled=doubled, beside=beside, settings=settings, overwrite=overwrite)
     summary = executed(
-        scored.pipeline, store or f"runs/{scored.name}.zarr", scored.lines, workers,
+        scored.pipeline, store or f"runs/{scored.pipeline.name}.zarr", scored.lines, workers,
         overwrite=overwrite)
     return summarised(
         summary, f"{summary.poses:,} poses, {detected_line(summary)}", answers=scored.lines)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.document import file_text
 from sweep.messages import nearest, nearest_file, plain, refusal
 from sweep.model.pose import rotation_of_vector
@@ -111,29 +111,21 @@ NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 #: Largest number of pixels, metres or radians, and largest ID.
 MOST = 1e6
 
-MAX_TOLD_COLUMNS = 12
-
 #: The largest file of answers.
 MAX_BYTES = 10**9
 
-#: What an ID counts that an image has twice.
-DOUBLED = ("refuse", "nearest")
 
-#: Line of the file -> its first fault.
-Faults = dict[int, str]
-
-
-def _refused(source: str, faults: Faults) -> PipelineError:
-    """Return the error that lists faults in the order of the file."""
-    return refusal([
-        f"{source}: line {line}: {plain(faults[line], 300)}" for line in sorted(faults)])
-
-
-def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
+def _table(text: str, source: str, faults: dict[int, str]) -> pd.DataFrame:
     """Return the cells of a CSV text as text, by our names of columns and by line.
 
-    Empty lines and lines that begin with ``#`` are left out. The header must have image and id, and
-    all columns of the corners, of the pose, or of both; further columns are left out.
+    ``faults`` gets the lines whose number of values is wrong. Empty lines and lines that begin with
+    ``#`` are left out. The header must have image and id, and all columns of the corners, of the
+    pose, or of both; further columns are left out.
+
+    Raises
+    ------
+    PipelineError
+        If the header is at fault.
     """
     lines = {
         number: line for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
@@ -150,20 +142,22 @@ def _table(text: str, source: str, faults: Faults) -> pd.DataFrame:
     expected = ["image", "id", *itertools.chain.from_iterable(groups or [CORNER_COLUMNS])]
     missing = [name for name in expected if name not in header]
     if text.lstrip()[:1] in ("{", "["):
-        faults[first] = "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,..."
+        fault = "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,..."
     elif missing:
         unknown = [name for name, ours in zip(written, header, strict=True) if ours not in expected]
         hint = nearest(unknown[0], missing) if unknown else ""
         poses = "" if groups else ", or rx, ry, rz, tx, ty, tz of poses"
-        faults[first] = (
+        fault = (
             f"no column {', '.join(missing)}{poses}; the header has "
-            f"{', '.join(plain(name, 40) for name in written[:MAX_TOLD_COLUMNS])}{hint}")
+            f"{', '.join(plain(name, 40) for name in written)}{hint}")
     elif more := [name for name in written if re.fullmatch("[xy]_?[4-9]", name.lower())]:
-        faults[first] = f"the column {plain(more[0])}: expected four corners, x0, y0 to x3, y3"
+        fault = f"the column {plain(more[0])}: expected four corners, x0, y0 to x3, y3"
     elif repeated := [name for name in expected if header.count(name) > 1]:
-        faults[first] = f"the column {repeated[0]} is there twice"
-    if faults:
-        raise _refused(source, faults)
+        fault = f"the column {repeated[0]} is there twice"
+    else:
+        fault = ""
+    if fault:
+        raise refusal([f"{source}: line {first}: {plain(fault, 300)}"])
     faults |= {number: f"{len(row)} values; expected {len(header)}, as the header has"
                for number, row in rows.items() if len(row) != len(header)}
     table = pd.DataFrame.from_dict(
@@ -227,9 +221,9 @@ def read_answers(
     StoreError
         If the file cannot be read.
     """
-    if doubled not in DOUBLED:
-        raise ArgumentError("doubled", doubled, f"expected {' or '.join(DOUBLED)}")
-    source, faults = plain(path, 300), Faults()
+    if doubled not in ("refuse", "nearest"):
+        raise ArgumentError("doubled", doubled, "expected refuse or nearest")
+    source, faults = plain(path, 300), dict[int, str]()
     try:
         text = file_text(path, MAX_BYTES)
     except ValueError as error:
@@ -280,7 +274,8 @@ def read_answers(
               "here", first=first, what=("ID " + table["id"]).where(
                   ~of_target, "a pose without an ID"))
     if faults:
-        raise _refused(source, faults)
+        raise refusal([
+            f"{source}: line {line}: {plain(faults[line], 300)}" for line in sorted(faults)])
     rotation = np.full((len(table), 3, 3), np.nan)
     known = has_pose.to_numpy()
     given = turns.to_numpy()[known]

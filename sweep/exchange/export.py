@@ -7,8 +7,7 @@ import functools
 import hashlib
 import json
 import multiprocessing
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,41 +97,31 @@ def encoded_image(images: Images, row: int) -> bytes:
 # Both put pixel (0, 0) at the centre of the top left pixel and have OpenCV's lens model, as the
 # simulation does.
 
-#: Coefficients -> ROS's name of the lens model; longer ones are rational polynomials, too.
-MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
-
-
-class FileCamera(NamedTuple):
-    """A camera as files have it: frame in pixels, (fx, fy, cx, cy) in px, and coefficients."""
-
-    frame: tuple[int, ...]
-    view: tuple[float, ...]
-    distortion: tuple[float, ...]
+#: A camera as files have it: frame in pixels, (fx, fy, cx, cy) in px, and coefficients of its lens.
+FileCamera = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
 
 
 def camera_of(scenes: Scenes, row: int) -> FileCamera:
     """Return the camera of a scene, with 5, 8, 12 or 14 coefficients."""
     coefficients = scenes.cameras.lenses[row, :14].tolist()
-    used = int(np.max(np.flatnonzero(coefficients), initial=-1)) + 1
-    count = next(length for length in (5, 8, 12, 14) if length >= used)
-    return FileCamera(
-        tuple(scenes.frame[row].tolist()), tuple(scenes.cameras.view[row].tolist()),
-        tuple(coefficients[:count]))
+    count = next(length for length in (5, 8, 12, 14) if not any(coefficients[length:]))
+    return (tuple(scenes.frame[row].tolist()), tuple(scenes.cameras.view[row].tolist()),
+            tuple(coefficients[:count]))
 
 
 def camera_files(camera: FileCamera, name: str) -> dict[str, str]:
     """Return suffix -> text of the files that ``cv::FileStorage`` and ROS read."""
-    fx, fy, cx, cy = camera.view
+    frame, (fx, fy, cx, cy), distortion = camera
     opencv = cv2.FileStorage(
         ".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    ros: dict[str, Any] = dict(zip(("image_width", "image_height"), camera.frame, strict=True))
+    ros: dict[str, Any] = dict(zip(("image_width", "image_height"), frame, strict=True))
     for key, length in ros.items():
         opencv.write(key, length)
-    ros |= {"camera_name": name, "distortion_model": MODELS.get(
-        len(camera.distortion), "rational_polynomial")}
+    ros |= {"camera_name": name,
+            "distortion_model": "plumb_bob" if len(distortion) == 5 else "rational_polynomial"}
     for key, rows in {
         "camera_matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-        "distortion_coefficients": [camera.distortion],
+        "distortion_coefficients": [distortion],
         "rectification_matrix": np.eye(3),
         "projection_matrix": [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0]],
     }.items():
@@ -293,8 +282,8 @@ def _coco(squares: pd.DataFrame) -> dict[str, Any]:
             "categories": [*categories.values()]}
 
 
-def write_truth(pipeline: Pipeline, folder: Path, truths: Sequence[Truth]) -> int:
-    """Write the truth of an export's scenes and their cameras; return how many these are."""
+def write_truth(pipeline: Pipeline, folder: Path, truths: Sequence[Truth]) -> None:
+    """Write the truth of an export's scenes, and their cameras."""
     arrays, squares, chessboards = zip(*truths, strict=True)
     table = pd.concat(squares, ignore_index=True)
     cameras = {camera: f"camera-{k}" for k, camera in enumerate(dict.fromkeys(table["camera"]))}
@@ -312,7 +301,6 @@ def write_truth(pipeline: Pipeline, folder: Path, truths: Sequence[Truth]) -> in
     for camera, name in cameras.items():
         for suffix, text in camera_files(camera, name).items():
             write_whole(folder / "cameras" / f"{name}{suffix}", text.encode())
-    return len(cameras)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -329,8 +317,6 @@ GUIDE = Path(__file__).with_name("readme.md.jinja")
 
 #: Folder of the pipeline and of the files that it names.
 EXPERIMENT = "experiment"
-
-FORMAT = 1
 
 #: Larger exports have to be confirmed.
 MAX_BYTES = 10 * 10**9
@@ -354,10 +340,6 @@ class Export:
         finished export that were missing or had been changed.
     bytes
         Size of the images.
-    cameras
-        Distinct cameras.
-    seconds
-        How long it took.
     """
 
     folder: str
@@ -367,8 +349,6 @@ class Export:
     kept: int
     damaged: int
     bytes: int
-    cameras: int
-    seconds: float
 
 
 class ImageFile(NamedTuple):
@@ -420,12 +400,13 @@ def export(
     RunError
         If an image cannot be rendered.
     """
-    started = time.perf_counter()
     check_positive("workers", workers, "expected at least 1", whole=True)
     target = Path(folder)
     count = len(pipeline.experiment.all_scenes)
     parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
-    with contextlib.ExitStack() as stack, translate_errors(plain(folder, 300), "written"):
+    pool = contextlib.nullcontext() if (workers or 1) == 1 else ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"))
+    with translate_errors(plain(folder, 300), "written"), pool as processes:
         mark = _mark(pipeline, windowed)
         begun = _is_begun(target, mark)
         if not begun and not yes:
@@ -437,19 +418,15 @@ def export(
         finished = (target / CHECKSUMS).exists()
         files: list[ImageFile] = []
         truths: list[Truth] = []
-        mapped: Callable[..., Iterator[tuple[list[ImageFile], Truth]]] = map
-        if len(parts) > 1 and workers is not None and workers > 1:
-            mapped = stack.enter_context(ProcessPoolExecutor(
-                workers, mp_context=multiprocessing.get_context("spawn"))).map
         work = functools.partial(write_images, pipeline, target, windowed, finished)
-        for of_images, truth in mapped(work, parts):
+        for of_images, truth in (processes.map if processes else map)(work, parts):
             files += of_images
             truths.append(truth)
             if progress is not None:
                 progress(min(len(truths) * BATCH, count), count)
         write_whole(target / CHECKSUMS, "".join(
             f"{each.digest}  {each.name}\n" for each in files).encode())
-        cameras = write_truth(pipeline, target, truths)
+        write_truth(pipeline, target, truths)
         write_whole(target / "README.md", Template(GUIDE.read_text(encoding="utf-8")).render(
             title=pipeline.heading, images=len(files), invisible=count - len(files),
             windowed=windowed, target=pipeline.target_word,
@@ -457,9 +434,7 @@ def export(
     written = sum(each.written for each in files)
     return Export(
         str(folder), len(files), count - len(files), written, len(files) - written,
-        written * finished, sum(each.size for each in files), cameras,
-        time.perf_counter() - started,
-    )
+        written * finished, sum(each.size for each in files))
 
 
 def _is_begun(folder: Path, mark: dict[str, Any]) -> bool:
@@ -471,8 +446,6 @@ def _is_begun(folder: Path, mark: dict[str, Any]) -> bool:
         If it holds something else.
     """
     shown, begun = plain(folder, 300), read_mark(folder)
-    if folder.exists() and not folder.is_dir():
-        raise StoreError(f"{shown}: a file; choose a new folder")
     if begun is None:
         strange = sorted(path.name for path in folder.glob("*"))
         if strange:
@@ -498,7 +471,7 @@ def read_mark(folder: Path) -> dict[str, Any] | None:
 def _mark(pipeline: Pipeline, windowed: bool) -> dict[str, Any]:
     """Return the identity of an export: the experiment, the versions, the content of images."""
     return {
-        "sweep_export": FORMAT,
+        "sweep_export": 1,  # the layout of the folder
         "name": pipeline.name,
         "pipeline": hashlib.sha256(pipeline.text.encode()).hexdigest()[:16],
         "images": "windows" if windowed else "whole frames",

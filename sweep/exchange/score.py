@@ -21,7 +21,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import FITS, fitting_order
 from sweep.messages import plain
-from sweep.plugins.recording import OF_TARGET, REJECTED, SUFFIX, Recording
+from sweep.plugins.recording import REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
 from sweep.typing import Floats, Integers
@@ -71,8 +71,6 @@ def hints(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]
 # --------------------------------------------------------------------------------------------------
 # Scoring of others' answers: the experiment of an export with recorded detections as detector.
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,79}")
-
 
 @dataclass(frozen=True, slots=True)
 class Scored:
@@ -81,15 +79,12 @@ class Scored:
     Attributes
     ----------
     pipeline
-        The experiment, with the answers as its detectors.
-    name
-        The name that its store gets.
+        The experiment, with the answers as its detectors, by which it is named.
     lines
         Lines on the content of the answers, and on likely faults of their conventions.
     """
 
     pipeline: Pipeline
-    name: str
     lines: list[str]
 
 
@@ -128,8 +123,6 @@ class _Images:
             table = pd.read_csv(
                 folder / "truth.csv", usecols=["image", "id", *origin, *CORNER_COLUMNS],
                 dtype=dict.fromkeys(CORNER_COLUMNS, np.float64))
-            if table.empty:
-                raise StoreError(f"{shown}: no image was exported: no scene shows its target")
             image, names = pd.factorize(table["image"])
             indices = pipeline.experiment.all_scenes.indices(
                 np.array([name.partition("-")[0] for name in names], dtype=np.intp))
@@ -216,8 +209,7 @@ def prepare(
                 )
             write_whole(path, content)
     posed = all(np.isfinite(each.translation).any() for each in answers)
-    return Scored(
-        _pipeline(images.pipeline, home, labels, beside, posed, settings), "-".join(labels), lines)
+    return Scored(_pipeline(images.pipeline, home, labels, beside, posed, settings), lines)
 
 
 def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:
@@ -226,7 +218,8 @@ def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:
         re.sub(r"[^A-Za-z0-9._+-]", "-", Path(path).stem).lstrip("-._") or "answers"
         for path in files
     ]
-    if len({*labels}) != len(files) or not all(map(_NAME.fullmatch, labels)):
+    if len({*labels}) != len(files) or not all(
+            re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,79}", label) for label in labels):
         raise ArgumentError(
             "name", ", ".join(labels), f"expected another name for each file, {len(files)} in all, "
             "of letters, digits, and . _ + - between them")
@@ -235,16 +228,14 @@ def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:
 
 def _summary(answers: Answers, images: int) -> str:
     """Return a line on the content of answers."""
-    decoded = int((answers.marker_id >= 0).sum())
-    of_targets = int((answers.marker_id == OF_TARGET).sum())
-    if not decoded + of_targets:
-        return f"no marker: each of {images:,} images counts as searched in vain"
-    poses = f" and {of_targets:,} poses of targets" if of_targets else (
-        ", with poses" if np.isfinite(answers.translation).any() else "")
-    rejected = len(answers.marker_id) - decoded - of_targets
-    more = f", {rejected:,} candidates not decoded" if rejected else ""
+    kinds = {
+        "markers": answers.marker_id >= 0,
+        "poses": np.isfinite(answers.translation[:, 0]),
+        "candidates not decoded": answers.marker_id == REJECTED,
+    }
+    listed = ", ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
     found = len(np.unique(answers.image[answers.marker_id != REJECTED]))
-    return f"{decoded:,} markers{poses} in {found:,} of {images:,} images{more}"
+    return f"{listed or 'nothing'} in {found:,} of {images:,} images, the others searched in vain"
 
 
 def _pipeline(
@@ -269,5 +260,5 @@ def _pipeline(
                          for name, values in axis.columns.items() if beside and name not in ours})
     chosen = [f"{name}={json.dumps(value)}" for name, value in ours.items()]
     return Pipeline.from_text(
-        tomlkit.dumps(document), [*chosen, *settings], name=labels[0],
+        tomlkit.dumps(document), [*chosen, *settings], name="-".join(labels),
         source=str(home / "pipeline.toml"), folder=home)

@@ -140,7 +140,7 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
     other = Pipeline.from_text(pipeline.text, ["seed=6"], name="exported")
     for some, folder, options, line in (
         (pipeline, tmp_path, {}, r"holds notes\.txt, and no export"),
-        (pipeline, tmp_path / "notes.txt", {}, "a file; choose a new folder"),
+        (pipeline, tmp_path / "notes.txt", {}, "cannot be written: "),
         (other, exported[0], {}, "(?s)holds another export.*pipeline: the folder has"),
         (pipeline, exported[0], {"windowed": True}, "images: the folder has whole frames"),
     ):

@@ -209,7 +209,7 @@ def test_several_programs_and_our_own_detector_are_paired_on_one_axis(exported, 
         np.testing.assert_array_equal(
             ran["corner_error_px"], results["corner_error_px"].sel(detector=name))
     assert not (results.detection.sel(detector="nothing.npz") == DetectionStatus.detected).any()
-    assert any("no marker: each of 24 images counts as searched in vain" in line
+    assert any("nothing in 0 of 24 images, the others searched in vain" in line
                for line in ready.lines)
 
 

@@ -127,7 +127,10 @@ MAX_ROTATION_DEG, MAX_POSITION_PERCENT = 5.0, 5.0
 
 
 class DetectorTrial:
-    """A detector; its inputs are images, an answer has IDs (n,) and corners (n, 4, 2) px."""
+    """A detector; its inputs are images, an answer has IDs (n,) and corners (n, 4, 2) px.
+
+    The first ``asked`` are scenes; ``odd`` has what lines on the others begin with.
+    """
 
     checks = ("returns markers", "finds markers", "keeps conventions", "repeats itself",
               "has no memory", "survives odd images")
@@ -141,7 +144,9 @@ class DetectorTrial:
         self.images = trial_images(batch) + [
             rng.integers(low, high, (height, width)).astype(np.uint8)
             for height, width, low, high in ODD_IMAGES]
-        self.asked, self.inputs = SCENES, len(self.images)
+        self.asked = SCENES
+        self.odd = [f"an image of {each.shape[1]} x {each.shape[0]} px: "
+                    for each in self.images[SCENES:]]
 
     def answers(self, numbers: Sequence[int]) -> list[Answer]:
         """Search images in an order."""
@@ -216,8 +221,9 @@ def judged_corners(
     if declared is None:
         return Finding(NOTE, f"{line}: OpenCV's own, which stays in its results", numbers)
     step = round(2 * offset.mean()) / 2
-    if step and (np.abs(offset - step) < 0.1).all():
-        line += f": declare pixel_center = {declared.pixel_center + step:g}"
+    center = declared.pixel_center + step
+    if step and abs(center) <= 1 and (np.abs(offset - step) < 0.1).all():
+        line += f": declare pixel_center = {center:g}"
     return Finding(FAULT, line, numbers)
 
 
@@ -235,7 +241,8 @@ class SolverTrial:
         (result,), _ = detections_of(batch, batch.visible[:, None], [], keep=True)
         self.rows = np.flatnonzero(result.flags == DetectionStatus.detected)
         self.scenes, self.seen = batch.scenes, detections_for(setting, batch, result, self.rows)
-        self.asked, self.inputs = int((self.rows < SCENES).sum()), len(self.rows)
+        self.asked = int((self.rows < SCENES).sum())
+        self.odd = [""] * (len(self.rows) - self.asked)
 
     def answers(self, numbers: Sequence[int]) -> list[Answer]:
         """Solve detections together, in an order."""
@@ -301,11 +308,11 @@ def findings_of(trial: DetectorTrial | SolverTrial) -> Iterator[Finding]:
     yield same([every], "again")
 
     odd = dict[str, None]()
-    for number in range(asked, trial.inputs):
+    for number, name in enumerate(trial.odd, asked):
         try:
             trial.answers([number])
         except PluginError as error:
-            odd[str(error)] = None
+            odd[f"{name}{error}"] = None
     yield same([every[::-1], *([row] for row in every)], "in reverse order, alone, after odd input")
 
     yield Finding(NOTE if odd else OK, "; ".join(odd) or "no error")

@@ -86,9 +86,12 @@ class Plugin:
     install: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be called."""
+        """Refuse what cannot be called, and distributions without names."""
         if not callable(getattr(self, self.function)):
             raise TypeError(f"{self.function}: expected a class or function")
+        needed: Any = self.distribution
+        if not isinstance(needed, str | Sequence) or not all(isinstance(k, str) for k in needed):
+            raise TypeError(f"distribution = {needed!r}: expected a name, or several")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +130,9 @@ class DetectorPlugin(Plugin):
     def __post_init__(self) -> None:
         """Refuse conventions that cannot be."""
         super().__post_init__()
+        families: Any = self.families
+        if not isinstance(families, Mapping | None):
+            raise TypeError(f"families = {families!r}: expected names by dictionary, or None")
         if sorted(self.corner_order) != [0, 1, 2, 3]:
             raise ValueError(
                 f"corner_order = {self.corner_order!r}: expected the numbers 0 to 3, each once"

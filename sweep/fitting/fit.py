@@ -631,7 +631,7 @@ def _terms(
     white = of_photographs(lambda state: state.levels.sum())
     ground = of_photographs(lambda state: state.marker.ground, np.median)
     variances = [estimate(each) for each in np.transpose([fit.noise for fit in fits])]
-    deviations = [each.mapped(_root) for each in variances]
+    deviations = [each.mapped(lambda square: math.sqrt(max(square, 0.0))) for each in variances]
     noise = [
         judge(f"noise on {colour}", "noise_table", deviation, variance)
         for colour, deviation, variance in zip(("black", "white"), deviations, variances,
@@ -648,6 +648,7 @@ def _terms(
     # The mean profile of edges that are shifted is wider by the variance of their shifts.
     widened = edges.size_px.value**2 if ragged[0].kept else 0.0
     variance, amount, bloom = zip(optics, tested, strict=True)
+    blur = variance[0].mapped(lambda square: math.sqrt(max(square - widened, 0.0)))
     scale, geometry, unknown = UNKNOWN, Field(), "only beside a board or exact poses"
     source = fits[0].states[0].marker.shown.source
     if source in (TruthSource.board_without_this_marker, TruthSource.poses_file):
@@ -656,17 +657,12 @@ def _terms(
     return [
         Term("black", "black", black), Term("white", "white", white),
         Term("around the marker", "background", ground),
-        judge("blur", "blur_px", variance[0].mapped(lambda square: _root(square - widened)),
-              variance[1]),
+        judge("blur", "blur_px", blur, variance[1]),
         judge("sharpening", "sharpening", *amount), judge("bloom (tone)", "bloom", *bloom),
         *(replace(each, kept=noisy, setting=table) for each in noise), *ragged,
         judge("print's size", "marker_scale", scale, absent=1.0, unknown=unknown),
         *with_reach("geometry", "geometry_px", geometry, unknown),
     ]
-
-
-def _root(square: float) -> float:
-    return math.sqrt(square) if square > 0 else (math.nan if math.isnan(square) else 0.0)
 
 
 def _scale(state: MarkerState) -> float:

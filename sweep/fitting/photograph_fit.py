@@ -21,7 +21,7 @@ from sweep.model.coverage import MarkerEdges
 from sweep.model.image_file import photograph_image, reference
 from sweep.model.marker import OUTSIDE, module_count, overhang
 from sweep.model.polygon import Optics, Projection, side_lengths
-from sweep.photographs.cameras import cameras_of, project
+from sweep.photographs.cameras import cameras_of, derivatives
 from sweep.photographs.prepare import record_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
@@ -65,7 +65,7 @@ class Shown(NamedTuple):
         """Return the true images (n, 2) of columns and rows (n, 2), shares of the square's side."""
         flat = (points - 0.5) * self.size_m * [1.0, -1.0]
         in_plane = np.column_stack([flat, np.zeros(len(flat))])
-        return project(self.camera, in_plane, self.rotation, self.translation)
+        return derivatives(self.camera, in_plane, self.rotation, self.translation)[0]
 
 
 class FittedMarker(NamedTuple):
@@ -132,10 +132,8 @@ def photograph_views(pipeline: Pipeline, most: int = MARKERS) -> tuple[Views, li
         If nothing can be fitted, in a line.
     """
     record, fixed = record_of(pipeline), pipeline.fixed
-    fx, fy, cx, cy, distortion = (
-        pipeline.values_of(name)[0] for name in (*VIEW, "distortion")
-    )
-    camera = Calibration(None, None, fx, fy, cx, cy, tuple(distortion), (), ())
+    fx, fy, cx, cy = (fixed[name] for name in VIEW)
+    camera = Calibration(None, None, fx, fy, cx, cy, tuple(fixed["distortion"]), (), ())
     views, count = Views(), 0
     on_board = record.on_board(record.marker_id)
     sizes = np.broadcast_to(pipeline.values_of("size_m"), len(on_board)).tolist()

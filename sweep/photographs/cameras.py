@@ -30,19 +30,14 @@ from sweep.typing import Floats, Masks
 # --------------------------------------------------------------------------------------------------
 # A camera, which is a calibration, as OpenCV and as solvers take it.
 
-def project(camera: Calibration, points: Floats, rotation: Floats, translation: Floats) -> Floats:
-    """Return the images (n, 2) of points (n, 3) of a target."""
-    return derivatives(camera, points, rotation, translation)[0]
-
-
 def derivatives(
     camera: Calibration, points: Floats, rotation: Floats, translation: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return images (n, 2) with derivatives by the pose (2 n, 6) and by the camera (2 n, c).
+    """Return images (n, 2) of points, with derivatives by the pose (2 n, 6) and camera (2 n, c).
 
     The pose changes by a rotation vector in the camera's frame, about the target's origin, and by
     a translation. The derivative by a point in the camera's frame is OpenCV's by the translation.
-    The camera's numbers are fx, fy, cx, cy and the coefficients.
+    The camera's numbers are fx, fy, cx, cy and the coefficients. Points are (n, 3) of a target.
     """
     turned, none = points @ rotation.T, np.zeros(3)
     image, jacobian = cv2.projectPoints(
@@ -164,7 +159,7 @@ def fit_pose(
                 return None
             variance = float(residual @ residual) / max(len(residual) - 6, 1)
             covariance = np.asarray(variance * np.linalg.inv(normal), dtype=np.float64)
-            residuals = project(camera, points, rotation, translation) - pixels
+            residuals = derivatives(camera, points, rotation, translation)[0] - pixels
             return FittedPose(rotation, translation, covariance, residuals, used)
     return None
 
@@ -260,16 +255,14 @@ def _numbers(tree: Any, name: str, shape: tuple[int, ...]) -> Floats:
     """Return the numbers of a matrix in a file; raises ValueError if they are not there."""
     value = {str(key).upper(): each for key, each in tree.items()}.get(name)
     data = value.get("data") if isinstance(value, dict) else value
-    try:
+    with contextlib.suppress(TypeError, ValueError):
         numbers = np.array(data, dtype=np.float64).reshape(shape)
-    except (TypeError, ValueError):
-        numbers = np.full(shape, np.nan)
-    if not np.isfinite(numbers).all():
-        raise ValueError(
-            f"{name}: expected {numbers.size} numbers: R and T, in metres, take points of the left "
-            "camera's frame to the right one's"
-        )
-    return numbers
+        if np.isfinite(numbers).all():
+            return numbers
+    raise ValueError(
+        f"{name}: expected {math.prod(shape)} numbers: R and T, in metres, take points of the left "
+        "camera's frame to the right one's"
+    )
 
 
 def _check_size(

@@ -167,12 +167,10 @@ def detect_markers(
     ``find`` is a detector's search.
     """
     quads, ids, _ = find(image, dictionary, max(image.shape))
-    if ids is None:
-        return SeenMarkers(np.empty(0, dtype=np.int64), np.empty((0, 4, 2)))
-    numbers = np.asarray(ids).ravel().astype(np.int64)
+    numbers = np.array([] if ids is None else ids, dtype=np.int64).ravel()
     once = ~pd.Series(numbers).duplicated(keep=False).to_numpy()
     repeated = len(np.unique(numbers[~once]))
-    corners = np.concatenate(list(quads)).astype(np.float64).reshape(-1, 4, 2)
+    corners = np.reshape(quads, (-1, 4, 2)).astype(np.float64)
     return SeenMarkers(numbers[once], corners[once], repeated)
 
 
@@ -212,17 +210,15 @@ class FoundCorners(NamedTuple):
 def find_corners(image: NDArray[np.uint8], board: Board, seen: SeenMarkers) -> FoundCorners:
     """Return the corners of a board in an image in which markers were detected."""
     marker, quads = seen.among(board.marker_ids)
-    if not len(board.chessboard_m):
+    if board.chessboard is None:
         return FoundCorners(
             board.corners_m[marker].reshape(-1, 3), quads.reshape(-1, 2),
             (4 * marker[:, None] + np.arange(4)).ravel(),
         )
+    flat, square_m = board.corners_m[marker][..., :2], board.chessboard.square_m
     found = {
         number: pixel for number, point in enumerate(board.chessboard_m[:, :2])
-        if len(marker) > 1 and (
-            pixel := _chessboard_corner(image, point, board.corners_m[marker][..., :2], quads,
-                                        _pitch(board))
-        ) is not None
+        if (pixel := _chessboard_corner(image, point, flat, quads, square_m)) is not None
     }
     number = np.array(list(found), dtype=np.int64)
     return FoundCorners(
@@ -231,7 +227,7 @@ def find_corners(image: NDArray[np.uint8], board: Board, seen: SeenMarkers) -> F
 
 
 def _chessboard_corner(
-    image: NDArray[np.uint8], point: Floats, flat: Floats, quads: Floats, pitch: float
+    image: NDArray[np.uint8], point: Floats, flat: Floats, quads: Floats, square_m: float
 ) -> Floats | None:
     """Return the pixel (2,) of a chessboard's corner between markers; None if it is not found.
 
@@ -241,13 +237,13 @@ def _chessboard_corner(
         Grey levels.
     point, flat, quads
         The corner (2,) and the markers' corners (k, 4, 2) on the board, and the latter's pixels.
-    pitch
+    square_m
         Side of the chessboard's squares.
     """
     distance = np.abs(flat.mean(axis=1) - point).max(axis=1)
     near = np.argsort(distance, kind="stable")[:NEIGHBOURS]
-    near = near[distance[near] < 2.1 * pitch]
-    if len(near) < 2 or distance[near[0]] > 1.01 * pitch:
+    near = near[distance[near] < 2.1 * square_m]
+    if len(near) < 2 or distance[near[0]] > 1.01 * square_m:
         return None
     transform, _ = cv2.findHomography(flat[near].reshape(-1, 2), quads[near].reshape(-1, 2))
     if transform is None:
@@ -266,22 +262,14 @@ def _chessboard_corner(
     return found if np.abs(found - start).max() < half else None
 
 
-def _pitch(board: Board) -> float:
-    """Return the side of a chessboard's square in m."""
-    points = board.chessboard_m[:, :2]
-    if len(points) < 2:
-        return float(np.abs(board.corners_m[..., :2]).max())
-    return float(np.linalg.norm(points[1:] - points[0], axis=1).min())
-
-
 def own_corners(board: Board) -> list[Integers]:
     """Return the numbers of each marker's own corners: those that are left out of its truth.
 
     Of a chessboard they are the corners of the marker's square.
     """
-    if not len(board.chessboard_m):
+    if board.chessboard is None:
         return list(np.arange(4 * len(board)).reshape(-1, 4))
-    centres, reach = board.corners_m.mean(axis=1), 0.51 * _pitch(board) * 1.2
+    centres, reach = board.corners_m.mean(axis=1), 0.51 * board.chessboard.square_m * 1.2
     return [
         np.flatnonzero(np.abs(board.chessboard_m - centre).max(axis=1) < reach)
         for centre in centres
@@ -293,9 +281,6 @@ def own_corners(board: Board) -> list[Integers]:
 
 #: Share of the detected markers that lie where the board has them.
 MIN_FITTING = 0.8
-
-#: Share of fitting markers from which no other board is tried.
-DOUBTFUL = 0.98
 
 #: By how much more of the markers another board must fit.
 CLEARLY = 0.02
@@ -377,18 +362,16 @@ def _misfit(document: Mapping[str, Any], board: Board, seen: Sequence[SeenMarker
         side = float(np.linalg.norm(board.corners_m[0, 1] - board.corners_m[0, 0]))
         return (f"markers of {side:g} m do not fit its other lengths, beside which the photographs "
                 f"show about {side * ratio:.3g} m; correct marker_m, or the squares or gaps")
-    # Another board fits better. Of those that fit as well, the first.
+    # Another board fits better, if it can. Of those that fit as well, the first.
     share = fitting_share(board, seen)
-    best, words = share, ""
-    if share <= DOUBTFUL:
-        shares = [(fitting_share(other, seen), words) for words, other in _others(document)]
-        best, words = max(shares, key=lambda each: each[0], default=(0.0, ""))
-    if words and best >= max(MIN_FITTING, share + CLEARLY):
-        remedy = f"{words} fits"
-    elif share < MIN_FITTING:
+    least = max(MIN_FITTING, share + CLEARLY)
+    shares = {f"{words} fits": fitting_share(other, seen)
+              for words, other in _others(document if least <= 1 else {})}
+    remedy = max(shares, key=lambda words: shares[words], default="")
+    if shares.get(remedy, 0.0) < least:
+        if share >= MIN_FITTING:
+            return ""
         remedy = "correct its kind, its rows and columns, or its IDs"
-    else:
-        return ""
     return f"only {100 * share:.0f} % of the detected markers lie where it has them; {remedy}"
 
 

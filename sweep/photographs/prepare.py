@@ -91,9 +91,14 @@ class Side(NamedTuple):
     sizes_m: Floats
     record: PhotographRecord
 
-    def among(self, photograph: int) -> tuple[Integers, Floats]:
-        """Return the numbers (n,) of the markers that are seen, and their corners (n, 4, 2)."""
-        return self.seen[photograph].among(self.record.marker_id)
+    def solutions(self, photograph: int) -> tuple[Integers, Floats, Floats, Floats]:
+        """Return the numbers (n,) of the markers that are seen, their corners, and their poses.
+
+        The corners are (n, 4, 2) px, both planar solutions (n, 2, 3, 3) and (n, 2, 3) m.
+        """
+        marker, quads = self.seen[photograph].among(self.record.marker_id)
+        camera = cameras_of(self.camera, len(quads))
+        return marker, quads, *both_planar_solutions(quads, camera, self.sizes_m[marker])
 
     def put(
         self, place: tuple[Any, Any], rotation: Floats, translation: Floats, source: TruthSource,
@@ -163,7 +168,7 @@ def prepare(
     ArgumentError, PipelineError, StoreError
         Says in lines what to change.
     """
-    _check_arguments(folders, camera, poses, stereo)
+    _check_arguments(folders, camera, board, poses, stereo)
     document = {} if board is None else board_document(Path(board))
     target = None if board is None else board_of(document, plain(board))
     side_by_side = stereo is not None and len(folders) == 1
@@ -183,13 +188,9 @@ def prepare(
         known = [rig.left, rig.right]
     elif str(camera) != CALIBRATE:
         known = [cameras.camera_of_file(str(camera), first.size)]
-    elif target is not None:
+    else:
         calibrated, line = cameras.calibrate(first.size, corners)
         known, lines = [calibrated], [*lines, line]
-    else:
-        raise ArgumentError(
-            "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
-        )
     described = json.dumps(document, sort_keys=True) if document else ""
     sizes_m = np.array(list(sizes.values()))
     sides = [
@@ -213,8 +214,8 @@ def prepare(
     sides = sides[:1] if one_camera else sides
     lines += _summary(sides, dictionary)
     name = name or name_of(Path(folders[0]))
-    _write_records(sides, place, name, overwrite=overwrite)
-    pipeline = _experiment(sides, dictionary, settings, place, name)
+    records = _write_records(sides, place, name, overwrite=overwrite)
+    pipeline = _experiment(sides, records, dictionary, settings, place, name)
     markers = sum(int(each.record.shown.sum()) for each in sides)
     return Prepared(pipeline, tuple(lines), len(first.photographs), markers)
 
@@ -246,7 +247,8 @@ def name_of(folder: Path) -> str:
 # What is given, and what the photographs show.
 
 def _check_arguments(
-    folders: Sequence[PathName], camera: PathName | None, poses: object, stereo: object
+    folders: Sequence[PathName], camera: PathName | None, board: object, poses: object,
+    stereo: object,
 ) -> None:
     fault: tuple[str, object, str] | None = None
     if stereo is not None and poses is not None:
@@ -255,6 +257,8 @@ def _check_arguments(
         fault = "camera", camera, "expected none beside stereo, whose file has both cameras"
     elif stereo is None and camera is None:
         fault = "camera", "none", f"expected the file of a calibration, or {CALIBRATE}"
+    elif str(camera) == CALIBRATE and board is None:
+        fault = "camera", CALIBRATE, "expected a board beside it, whose corners calibrate it"
     elif not 1 <= len(folders) <= (1 if stereo is None else 2):
         fault = "folders", ", ".join(map(str, folders)), "expected one, or with stereo one or two"
     if fault:
@@ -353,10 +357,7 @@ MAD_TO_STD = 1.4826
 def own_poses(side: Side) -> None:
     """Write the poses of markers by their own corners."""
     for photograph in range(len(side.seen)):
-        marker, quads = side.among(photograph)
-        rotation, translation = both_planar_solutions(
-            quads, cameras_of(side.camera, len(quads)), side.sizes_m[marker]
-        )
+        marker, _, rotation, translation = side.solutions(photograph)
         good = np.isfinite(rotation[:, 0]).all(axis=(1, 2)) & (translation[:, 0, 2] > 0)
         side.put((photograph, marker[good]), rotation[good, 0], translation[good, 0],
                  TruthSource.none)
@@ -376,48 +377,46 @@ def partner_poses(left: Side, right: Side, turn: Floats, shift: Floats) -> None:
         (3, 3) and (3,) m: a point X in the left camera's frame is ``turn @ X + shift`` in the
         right one's.
     """
-    differences = []
+    differences = np.empty((0, 6))
     for photograph in range(len(left.seen)):
-        (own_marker, own_quads), (marker, quads) = (
-            each.among(photograph) for each in (left, right)
+        (own_marker, own_quads, own_rotation, own_translation), (marker, quads, *by_partner) = (
+            each.solutions(photograph) for each in (left, right)
         )
-        sides = left.sizes_m[marker]
-        by_partner = both_planar_solutions(quads, cameras_of(right.camera, len(quads)), sides)
         rotation, translation = turn.T @ by_partner[0], (by_partner[1] - shift) @ turn
-        error = _errors(right.camera, quads, sides, *by_partner)
+        error = _errors(right, marker, quads, *by_partner)
         _, at_own, at = np.intersect1d(own_marker, marker, return_indices=True)
-        error[at] += _errors(
-            left.camera, own_quads[at_own], sides[at], rotation[at], translation[at]
-        )
+        error[at] += _errors(left, marker[at], own_quads[at_own], rotation[at], translation[at])
         # The solution that fits both images better, of markers that have one in the frame.
-        row, best = np.arange(len(marker)), np.where(np.isnan(error), np.inf, error).argmin(axis=1)
-        rotation, translation = rotation[row, best], translation[row, best]
-        images = left.corners_px(marker_corners(sides), rotation, translation)
-        good = np.isfinite(error[row, best]) & left.are_within(images)
+        best = _least(error)
+        rotation, translation = rotation[best], translation[best]
+        images = left.corners_px(marker_corners(left.sizes_m[marker]), rotation, translation)
+        good = np.isfinite(error[best]) & left.are_within(images)
         left.put((photograph, marker[good]), rotation[good], translation[good],
                  TruthSource.stereo_partner)
         at_own, at = at_own[good[at]], at[good[at]]
-        own_rotation, own_translation = both_planar_solutions(
-            own_quads[at_own], cameras_of(left.camera, len(at)), sides[at]
-        )
-        for k, both, shifts in zip(at.tolist(), own_rotation, own_translation, strict=True):
-            turns = rotation_difference(both, np.repeat(rotation[k][None], 2, axis=0))
-            angle = np.linalg.norm(turns, axis=1)
-            if np.isfinite(angle).any():
-                j = int(np.nanargmin(angle))
-                differences.append([*turns[j], *(shifts[j] - translation[k])])
+        turns = rotation_difference(
+            own_rotation[at_own].reshape(-1, 3, 3), np.repeat(rotation[at], 2, axis=0)
+        ).reshape(-1, 2, 3)
+        shifts = own_translation[at_own] - translation[at, None]
+        nearest = np.concatenate([turns, shifts], axis=2)[_least(np.linalg.norm(turns, axis=2))]
+        differences = np.vstack([differences, nearest[np.isfinite(nearest).all(axis=1)]])
     if len(differences) >= MIN_PAIRS:
-        spread = MAD_TO_STD * np.median(np.abs(np.array(differences)), axis=0) / np.sqrt(2.0)
+        spread = MAD_TO_STD * np.median(np.abs(differences), axis=0) / np.sqrt(2.0)
         left.record.std[left.record.shown] = spread
 
 
+def _least(values: Floats) -> tuple[Integers, Integers]:
+    """Return the places of the least value of each row (k, 2); NaN is the largest."""
+    return np.arange(len(values)), np.where(np.isnan(values), np.inf, values).argmin(axis=1)
+
+
 def _errors(
-    camera: Calibration, quads: Floats, sides: Floats, rotation: Floats, translation: Floats
+    side: Side, marker: Integers, quads: Floats, rotation: Floats, translation: Floats
 ) -> Floats:
     """Return the RMS reprojection errors (k, 2) of both solutions of k markers."""
     return reprojection_errors_px(
-        rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), np.repeat(sides, 2),
-        np.repeat(quads, 2, axis=0), cameras_of(camera, 2 * len(quads)),
+        rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), np.repeat(side.sizes_m[marker], 2),
+        np.repeat(quads, 2, axis=0), cameras_of(side.camera, 2 * len(quads)),
     ).reshape(-1, 2)
 
 
@@ -617,17 +616,15 @@ def _without_truth(
     )
 
 
-def _record_names(sides: Sequence[Side], name: str) -> list[str]:
-    """Return the names of the records' files."""
-    ends = [""] if len(sides) == 1 else ["-left", "-right"]
-    return [f"{name}{end}{SUFFIX}" for end in ends]
+def _write_records(sides: Sequence[Side], home: Path, name: str, *, overwrite: bool) -> list[str]:
+    """Write the records of a store of that name, and return their names.
 
-
-def _write_records(sides: Sequence[Side], home: Path, name: str, *, overwrite: bool) -> None:
-    """Write the records of a store of that name; another record of a store is kept."""
+    Another record of a store is kept.
+    """
+    names = [f"{name}{end}{SUFFIX}" for end in (["-left", "-right"] if sides[1:] else [""])]
     with translate_errors(plain(home, 300), "written"):
         home.mkdir(parents=True, exist_ok=True)
-        for each, side in zip(_record_names(sides, name), sides, strict=True):
+        for each, side in zip(names, sides, strict=True):
             path, content = home / each, side.record.content()
             used = (home / f"{name}.zarr").exists() and path.exists()
             if used and path.read_bytes() != content and not overwrite:
@@ -636,14 +633,16 @@ def _write_records(sides: Sequence[Side], home: Path, name: str, *, overwrite: b
                     "refer to; choose another store, or overwrite it"
                 )
             write_whole(path, content)
+    return names
 
 
 def _experiment(
-    sides: Sequence[Side], dictionary: str, settings: Sequence[str], home: Path, name: str
+    sides: Sequence[Side], records: Sequence[str], dictionary: str, settings: Sequence[str],
+    home: Path, name: str,
 ) -> Pipeline:
-    """Return the experiment on records."""
+    """Return the experiment on records of those names."""
     columns = {
-        "photographs": _record_names(sides, name),
+        "photographs": records,
         **{key: [getattr(each.camera, key) for each in sides] for key in VIEW},
         "distortion": [list(each.camera.distortion) for each in sides],
     }
@@ -688,7 +687,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     scene
         Parameters of the section [scene] by name, as a document has them: values, or
         distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` is as ``black`` unless
-        it is given.
+        it is given; of a drawn one it is another draw.
     repeats
         How often each photograph is simulated.
 
@@ -706,7 +705,8 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
     trials = 1 if axis is None else len(axis)
     if repeats != 1 and (repeats < 1 or trials != photographs):
         raise ArgumentError(
-            "repeats", repeats, f"expected at least 1; 1 of the first of {photographs} photographs"
+            "repeats", repeats, f"expected at least 1, and 1 where {trials} of {photographs} "
+            "photographs are measured"
         )
     document = read_document(pipeline.to_toml())
     document["title"] = plain(f"Twins of {pipeline.heading}", 200)

@@ -29,8 +29,8 @@ from sweep.photographs.cameras import (
     calibrate,
     camera_of_file,
     covariance_of,
+    derivatives,
     fit_pose,
-    project,
 )
 from sweep.photographs.folder import FoundCorners
 from sweep.photographs.prepare import prepare, twin_pipeline, unshared_variance
@@ -250,7 +250,8 @@ def seen(number, rng, sd_px):
     """Return the chessboard's corners in a photograph, with an error."""
     turn, shift = POSES[number]
     points = board().chessboard_m
-    pixels = project(CAMERA, points, turn, np.array(shift)) + rng.normal(0, sd_px, (len(points), 2))
+    exact, *_ = derivatives(CAMERA, points, turn, np.array(shift))
+    pixels = exact + rng.normal(0, sd_px, exact.shape)
     return FoundCorners(points, pixels, np.arange(len(points)))
 
 
@@ -284,7 +285,7 @@ def test_what_truth_and_estimates_do_not_share_is_that_of_fitted_poses(number):
     centre = own.mean(axis=0)
     own, others = own - centre, board().chessboard_m - centre
     position = turn @ centre + shift
-    pixels = [project(CAMERA, points, turn, position) for points in (own, others)]
+    pixels = [derivatives(CAMERA, points, turn, position)[0] for points in (own, others)]
     pose = fit_pose(CAMERA, others, pixels[1], turn, position)
     predicted = np.sqrt(unshared_variance(CAMERA, covariance, pose, others, own))
     errors = []

@@ -288,13 +288,6 @@ class Experiment:
 # --------------------------------------------------------------------------------------------------
 # The settings that a configuration uses: an axis may hold others, which change nothing for it.
 
-#: Solver on pixels -> the settings that it has beside those of all solvers.
-PIXEL_SETTINGS = {
-    "photometric": frozenset({"refined_starts", "estimate_blur"}),
-    "photometric_real": frozenset({"refined_starts", "estimate_tone"}),
-}
-
-
 def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     r"""Return the axes' values that are settings of the detector and the solver among them.
 
@@ -311,7 +304,7 @@ def used_settings(pipeline: Grid, values: Mapping[str, Any]) -> dict[str, Any]:
     """
     # Each setting that some detectors or solvers have and others lack, with its owner.
     owned = [("detector", detectors.OPENCV, {*_names(DetectorSetting)})]
-    owned += [("solver", name, {*PIXEL_SETTINGS.get(name, ()), *["guarded"] * solver.guarded})
+    owned += [("solver", name, {*solver.own, *["guarded"] * solver.guarded})
               for name, solver in SOLVERS.items()]
     owned += [(NAMED_BY[plugin.kind].name, plugin.name, {each.name for each in plugin.settings})
               for plugin in pipeline.plugins if plugin.kind in NAMED_BY]

@@ -115,7 +115,7 @@ SOLVERS: dict[str, Solver] = {
     "photometric": Solver(
         meaning="maximum likelihood on the pixels, started from ippe",
         make=lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
-        needs_images=True, of_boards=True,
+        own=("refined_starts", "estimate_blur"), needs_images=True, of_boards=True,
     ),
     "photometric_real": Solver(
         meaning="least squares on the pixels of photographs: what else is on the board, point "
@@ -123,7 +123,7 @@ SOLVERS: dict[str, Solver] = {
         make=lambda setting: PhotometricReal(
             setting.refined_starts, spread_free=True, tone=setting.estimate_tone
         ),
-        needs_images=True, planar_only=True,
+        own=("refined_starts", "estimate_tone"), needs_images=True, planar_only=True,
     ),
     "recorded": Solver(
         meaning="the poses that came with the detections which `sweep score` recorded",

@@ -27,13 +27,15 @@ from sweep.typing import Floats, Masks
 
 @dataclass(frozen=True, kw_only=True)
 class Solver(EstimatorPlugin):
-    """A built-in choice of ``solver`` in pipeline files: a plug-in's record, and what OpenCV needs.
+    """A built-in choice of ``solver`` in pipeline files: a plug-in's record, and more about it.
 
     Its ``make`` takes a :class:`sweep.measure.estimators.EstimatorSetting`, and returns an
     estimator.
 
     Attributes
     ----------
+    own
+        The settings that it has beside those of all solvers, by name; ``guarded`` apart.
     method
         OpenCV's constant of a solver that takes corners alone; None of others.
     guarded
@@ -48,6 +50,7 @@ class Solver(EstimatorPlugin):
         Whether it estimates the pose of a board from all its points, too.
     """
 
+    own: tuple[str, ...] = ()
     method: Any = None
     guarded: bool = False
     planar_only: bool = False

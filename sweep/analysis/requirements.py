@@ -635,6 +635,7 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
     """Return the least power of about 1.1 at which the interval excludes the limit."""
     if rate == limit:
         return math.inf
+
     def is_decided(n: float) -> bool:
         # Whole hits, rounded towards the limit.
         hits = math.floor(rate * n) if rate > limit else math.ceil(rate * n)

@@ -19,7 +19,7 @@ from sweep.errors import ArgumentError
 from sweep.messages import to_json
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Column, Findings, Table, number, table_of
+from sweep.report.table import Column, Findings, Table, table_of
 from sweep.typing import Integers
 from sweep.version import __version__
 
@@ -235,5 +235,5 @@ def exponent_lines(models: xr.Dataset) -> list[str]:
                 z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all():
             first, last = (np.log(z["sigma"].isel({along: k}).values).mean() for k in (0, -1))
             power = (last - first) / np.log(models[along].values[-1] / models[along].values[0])
-            lines.append(f"{name}: sigma of z goes with {along} to the power {number(power)}")
+            lines.append(f"{name}: sigma of z goes with {along} to the power {power:.1f}")
     return lines

@@ -675,7 +675,6 @@ def _pairs(flags: Sequence[str], counts: Integers) -> str:
     return ", ".join(f"{flags[i]} \u2192 {flags[j]} {int(counts[i, j]):,}" for i, j in different)
 
 
-
 # --------------------------------------------------------------------------------------------------
 # What each configuration costs, beside its accuracy.
 

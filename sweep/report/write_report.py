@@ -555,6 +555,7 @@ def _tile(one: xr.Dataset, column: Column) -> dict[str, Any]:
 FORMS = {".html": "html", ".htm": "html", ".md": "md", "": "html"}
 PICTURES = (".svg", ".png")
 
+
 def write_report(
     store: str | PathLike[str], output: str | PathLike[str] | None = None, *,
     require: Sequence[str] = (), per: Sequence[str] | None = None, form: str | None = None,

@@ -497,10 +497,7 @@ def uneven_light_needs_frame(setting: AnyDetectorSetting, gain: Any) -> Any:
 def _margin_px(setting: PluginSetting) -> int | None:
     margin = setting.record().margin_px
     if callable(margin):
-        try:
-            margin = margin(setting.instance())
-        except Exception as error:
-            raise PluginError(f"{setting.plugin.name}: margin_px raises {error!r}") from error
+        margin = call(f"{setting.plugin.name}: margin_px", margin, setting.instance())
     if margin is None:
         return None
     if not isinstance(margin, int) or not 0 <= margin < 1 << 31:

@@ -27,6 +27,7 @@ from sweep.execution.runner import execute
 from sweep.experiment.parameters import lacking_plugins
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import check_plugins, use
+from sweep.measure.detectors import full_frame_reason
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plugins.loading import call
 from sweep.store.lifecycle import open_store
@@ -339,6 +340,13 @@ def test_a_detector_that_cannot_be_made_refuses_the_run(bad, made, told):
     with pytest.raises(PluginError) as refused:
         check_plugins(Here(), bad(made=made))
     assert str(refused.value) == f"bad:D: {told}"
+
+
+def test_what_a_function_margin_px_raises_is_the_plug_in_s_fault(bad):
+    made = "__import__('sweep').plugins.DetectorPlugin(make=print, margin_px=lambda _: exit(3))"
+    *_, setting = bad(made=made).experiment.detectors
+    with pytest.raises(PluginError, match="bad:D: margin_px: raises SystemExit: 3"):
+        full_frame_reason(setting)
 
 
 @pytest.mark.parametrize(("source", "told"), [

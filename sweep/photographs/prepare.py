@@ -29,7 +29,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, marker_frame, reprojection_errors_px
-from sweep.messages import notice, plain, refusal
+from sweep.messages import notice, plain, refusal, shown
 from sweep.model.board import Board
 from sweep.model.calibration import VIEW, Calibration
 from sweep.model.image_file import Part
@@ -449,9 +449,9 @@ def poses_of_file(side: Side, path: Path) -> list[str]:
         lines = [line.partition(", or pass --doubled")[0] for line in error.faults]
         raise PipelineError(lines) from None
     marker = pd.Index(record.marker_id).get_indexer(answers.marker_id)
-    if (marker < 0).any():
-        unknown = answers.marker_id[marker < 0].min()
-        faults.append(f"marker {unknown}: expected one of the board or the photographs")
+    if unknown := sorted({*answers.marker_id[marker < 0].tolist()}):
+        faults.append(f"markers {shown(unknown)}: expected those of the board, or of the "
+                      f"dictionary in the photographs: {shown(record.marker_id.tolist())}")
     if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
         faults.append("expected a pose in each row: rx, ry, rz, tx, ty, tz")
     if not faults:

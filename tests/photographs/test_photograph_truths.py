@@ -53,7 +53,7 @@ def record_of(prepared, name=None):
     return PhotographRecord.read(f"{prepared.pipeline.folder}/{name}.photographs.npz")[0]
 
 
-def write_poses(path, scale=1.0, suffix="", sign=1.0):
+def write_poses(path, scale=1.0, suffix="", sign=1.0, first=0):
     """Write the exact poses of all markers, also of those that are cut by the frame."""
     with path.open("w") as file:
         writer = csv.writer(file)
@@ -61,7 +61,7 @@ def write_poses(path, scale=1.0, suffix="", sign=1.0):
         for number, pose in enumerate(POSES[:2]):
             for marker, (turn, shift) in enumerate(zip(*marker_poses(pose), strict=True)):
                 x, y, z = np.asarray(shift) * scale
-                writer.writerow([f"shot{number}{suffix}", marker,
+                writer.writerow([f"shot{number}{suffix}", first + marker,
                                  *cv2.Rodrigues(turn)[0].ravel(), x, y, sign * z])
     return path
 
@@ -84,6 +84,7 @@ def test_a_file_of_poses_is_the_truth(faulty, tmp_path):
     ({"scale": 1000.0}, "positions are .* times those of the detected markers; expected metres"),
     ({"sign": -1.0}, "most markers are not where its poses have them"),
     ({"suffix": "_a"}, "image shot0_a is not among the images; expected a name such as shot0"),
+    ({"first": 40}, r"markers \[40, .*\]: expected those .* photographs: \[0, 1, .*\]"),
 ])
 def test_poses_of_another_unit_frame_or_image_are_refused(faulty, tmp_path, changes, expected):
     with pytest.raises(PipelineError, match=expected):

@@ -8,7 +8,7 @@ import hashlib
 import json
 import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -398,7 +398,7 @@ def export(
     StoreError
         If the folder holds something else, or cannot be written, or there is too much to write.
     RunError
-        If an image cannot be rendered.
+        If an image cannot be rendered, or a process that renders is ended.
     """
     check_positive("workers", workers, "expected at least 1", whole=True)
     target = Path(folder)
@@ -419,11 +419,14 @@ def export(
         files: list[ImageFile] = []
         truths: list[Truth] = []
         work = functools.partial(write_images, pipeline, target, windowed, finished)
-        for of_images, truth in (processes.map if processes else map)(work, parts):
-            files += of_images
-            truths.append(truth)
-            if progress is not None:
-                progress(min(len(truths) * BATCH, count), count)
+        try:
+            for of_images, truth in (processes.map if processes else map)(work, parts):
+                files += of_images
+                truths.append(truth)
+                if progress is not None:
+                    progress(min(len(truths) * BATCH, count), count)
+        except BrokenExecutor:
+            raise RunError(f"{plain(target, 300)}: a process ended; use fewer workers") from None
         write_whole(target / CHECKSUMS, "".join(
             f"{each.digest}  {each.name}\n" for each in files).encode())
         write_truth(pipeline, target, truths)
@@ -446,12 +449,10 @@ def _is_begun(folder: Path, mark: dict[str, Any]) -> bool:
         If it holds something else.
     """
     shown, begun = plain(folder, 300), read_mark(folder)
-    if begun is None:
-        strange = sorted(path.name for path in folder.glob("*"))
-        if strange:
-            raise StoreError(f"{shown}: holds {plain(strange[0])}, and no export; choose a new or "
-                             "an empty folder")
-    elif begun != mark:
+    if begun is None and (strange := sorted(path.name for path in folder.glob("*"))):
+        raise StoreError(f"{shown}: holds {plain(strange[0])}, and no export; choose a new or an "
+                         "empty folder")
+    if begun is not None and begun != mark:
         raise StoreError("\n".join([
             f"{shown}: holds another export; choose another folder",
             *(f"  {key}: the folder has {plain(begun.get(key))}, this export {plain(mark.get(key))}"

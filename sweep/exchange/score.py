@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -72,8 +72,7 @@ def hints(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]
 # Scoring of others' answers: the experiment of an export with recorded detections as detector.
 
 
-@dataclass(frozen=True, slots=True)
-class Scored:
+class Scored(NamedTuple):
     """Answers that are ready to be scored.
 
     Attributes

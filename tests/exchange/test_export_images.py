@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from concurrent.futures import BrokenExecutor
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -10,7 +12,7 @@ import xarray as xr
 
 from support.answers import TEXT, rows_of
 from sweep import cli
-from sweep.errors import ArgumentError, StoreError
+from sweep.errors import ArgumentError, RunError, StoreError
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.experiment.pipeline import Pipeline
@@ -156,6 +158,9 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
         with pytest.raises((ArgumentError, StoreError), match=line):
             export(some, tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(exporting.ProcessPoolExecutor, "map", mock.Mock(side_effect=BrokenExecutor))
+    with pytest.raises(RunError, match="a process ended; use fewer workers"):
+        export(pipeline, tmp_path / "new", workers=2, yes=True)
 
 
 def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):

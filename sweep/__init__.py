@@ -506,8 +506,7 @@ def compare(
     >>> found.data.detection_rate.values.tolist()  # photographs, simulated
     [1.0, 1.0]
     """
-    figure = None if output is None else path_of("output", output)
-    library.output_file.figure_file(figure)
+    library.output_file.figure_file(output)
     one, other = path_of("first", first), path_of("second", second)
     library.lifecycle.open_finished(one)
     if other.endswith(".toml"):
@@ -518,4 +517,4 @@ def compare(
         for name, value, unset in (("store", store, None), ("repeats", repeats, 1)):
             if value != unset:
                 raise ArgumentError(name, value, "expected photographs and a TOML file to simulate")
-    return library.findings.compare(one, other, bins=bins or None, output=figure)
+    return library.findings.compare(one, other, bins=bins or None, output=output)

@@ -13,12 +13,12 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from sweep.messages import nearest, plain, shown
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Declared:
     """The declaration of a value: name, types, default, meaning, unit, allowed values.
 
@@ -111,11 +111,10 @@ class Declared:
             if len(value) in self.lengths and all(
                     _is_number(item) and abs(item) < 1e300 for item in value):
                 found = tuple(map(float, value))
-        elif isinstance(value, str):
-            found = (self.choice(value) if self.choices else value or None) if (
-                str in self.types) else None
-        elif isinstance(value, bool):
-            found = value if bool in self.types else None
+        elif isinstance(value, str) and str in self.types:
+            found = self.choice(value) if self.choices else value or None
+        elif isinstance(value, bool) and bool in self.types:
+            found = value
         elif _is_number(value) and self.admits(value):
             if int in self.types and isinstance(value, int):
                 found = value
@@ -174,15 +173,6 @@ def declared_fields(declaring: type) -> dict[str, Declared]:
         declared[field.name] = dataclasses.replace(
             declaration, name=field.name, types=kinds, default=default, unit=unit)
     return declared
-
-
-Kind = TypeVar("Kind", bound=Declared)
-
-
-def converted(declared: Declared, kind: type[Kind], **more: Any) -> Kind:
-    """Return a declaration as one of another kind, which has ``more`` fields."""
-    fields = {field.name: getattr(declared, field.name) for field in dataclasses.fields(Declared)}
-    return kind(**fields | more)
 
 
 class TablesError(ValueError):

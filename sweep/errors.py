@@ -90,10 +90,6 @@ def texts_of(argument: str, given: object, expected: str = "texts") -> list[str]
     return texts
 
 
-class MissingPackageError(SweepError):
-    """An optional package that was asked for is not installed."""
-
-
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
 

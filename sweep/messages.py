@@ -149,22 +149,6 @@ def _letters(word: str) -> str:
     return word.casefold().replace("_", "").replace("-", "")
 
 
-def columns(rows: Sequence[Sequence[Any]], *, gap: str = "  ", right: Sequence[int] = ()) -> str:
-    r"""Return rows as lines with aligned columns; those numbered in ``right`` end together.
-
-    >>> print(columns([["solver", "poses"], ["ippe", 1200]], right=[1]))
-    solver  poses
-    ippe     1200
-    """
-    texts = [[str(cell) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    return "\n".join(
-        gap.join(cell.rjust(width) if k in right else cell.ljust(width)
-                 for k, (cell, width) in enumerate(zip(row, widths, strict=True))).rstrip()
-        for row in texts
-    )
-
-
 def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
     r"""Return the text of a JSON object: what every command prints with ``--json``.
 

@@ -10,7 +10,7 @@ from typing import Literal, NoReturn
 
 from sweep.cli import answers, experiments  # noqa: F401  (they declare the commands)
 from sweep.cli.command import DECLARED, Command, command, printing
-from sweep.errors import MissingPackageError
+from sweep.errors import SweepError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
 
@@ -33,7 +33,7 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
     try:
         import shtab  # noqa: PLC0415
     except ImportError:
-        raise MissingPackageError("sweep completion needs shtab: pip install shtab") from None
+        raise SweepError("sweep completion needs shtab: pip install shtab") from None
     parser, commands = build_parser()
     for added in commands:
         for action in added._actions:  # noqa: SLF001  (argparse offers no other list)

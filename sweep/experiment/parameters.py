@@ -9,7 +9,7 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any
 
-from sweep.declaration import Declared, converted, declared_fields
+from sweep.declaration import Declared, declared_fields
 from sweep.errors import PluginError
 from sweep.measure.detectors import BoardDetectorSetting, DetectorChoice, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
@@ -48,7 +48,7 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
 GEOMETRY_SECTIONS = ("camera", "marker", "pose")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Parameter(Declared):
     """A parameter of pipelines: a declared field with its section and stage."""
 
@@ -58,7 +58,7 @@ class Parameter(Declared):
 
 #: Every parameter by its name; names are unique over all sections.
 PARAMETERS: dict[str, Parameter] = {
-    name: converted(each, Parameter, section=section, stage=stage)
+    name: Parameter(**vars(each), section=section, stage=stage)
     for section, (declaring, stage) in SECTIONS.items() for group in declaring
     for name, each in declared_fields(group).items()
 }
@@ -223,7 +223,7 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
             by = gathered[NAMED_BY[plugin.kind].name]
             gathered[by.name] = dataclasses.replace(by, choices=(*by.choices, plugin.name))
         for setting in plugin.settings:
-            name, own = setting.name, converted(setting, Parameter, section=section, stage=stage)
+            name, own = setting.name, Parameter(**vars(setting), section=section, stage=stage)
             if name in PARAMETERS:
                 raise PluginError(f"another name for its setting {name}: the pipeline has this one")
             if gathered.setdefault(name, own) != own:

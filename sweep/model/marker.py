@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import parameter
-from sweep.errors import MissingPackageError
+from sweep.errors import SweepError
 from sweep.installation import check_installation
 from sweep.model.coverage import MarkerEdges, joined
 from sweep.typing import Floats
@@ -101,7 +101,7 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
     """
     path = library_path()
     if path is None:
-        raise MissingPackageError(f"{name} needs {missing_package(name)}")
+        raise SweepError(f"{name} needs {missing_package(name)}")
     create = getattr(ctypes.CDLL(str(path)), f"{name}_create")
     create.restype = ctypes.POINTER(_Family)
     family = create().contents  # the library keeps it; it is read once in a process
@@ -180,7 +180,7 @@ def _stag_codes(name: str) -> NDArray[np.uint64]:
     """
     path, library = library_file(), STAG_LIBRARIES[name]
     if path is None:
-        raise MissingPackageError(f"{name} needs {missing_package(name)}")
+        raise SweepError(f"{name} needs {missing_package(name)}")
     raw = path.read_bytes()
     words = np.frombuffer(raw[: len(raw) // 8 * 8], dtype="<u8").astype(np.uint64)
     n = library.count
@@ -193,7 +193,7 @@ def _stag_codes(name: str) -> NDArray[np.uint64]:
             digest = hashlib.sha256(codes.astype("<u8").tobytes()).hexdigest()
             if digest.startswith(library.digest):
                 return codes
-    raise MissingPackageError(f"{name}: its codes are not in {path}; install stag-python 1.1")
+    raise SweepError(f"{name}: its codes are not in {path}; install stag-python 1.1")
 
 
 def _circle(centre: Floats, radius: float, sides: int, areas: tuple[int, int]) -> MarkerEdges:
@@ -305,7 +305,7 @@ def modules(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
 
     Raises
     ------
-    MissingPackageError
+    SweepError
         No package with an AprilTag library is installed.
     """
     n, start = module_count(dictionary), overhang(dictionary)
@@ -409,7 +409,7 @@ def _stag_edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
 
     Raises
     ------
-    MissingPackageError
+    SweepError
         The package stag-python is not installed.
     """
     code = int(_stag_codes(dictionary)[marker_id])

@@ -474,7 +474,7 @@ def limit_figure(limits: xr.Dataset) -> Figure:
 
 def compare(
     first: str, second: str, *, bins: Mapping[str, Sequence[float]] | None = None,
-    output: str | None = None,
+    output: str | PathLike[str] | None = None,
 ) -> Findings:
     """Compare photographs with a simulation, or two stores of one pipeline; as `sweep.compare`."""
     figure = figure_file(output)

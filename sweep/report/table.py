@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sweep.messages import columns, plain, to_json
+from sweep.messages import plain, to_json
 
 #: Rows of a table that a page shows.
 MAX_ROWS = 300
@@ -282,10 +282,12 @@ class Table:
             if width > MAX_WIDTH and len(parts[-1]) > len(stub):
                 parts.append(stub[:])
             parts[-1].append(k)
-        left = [k for k in range(len(widths)) if k < self.stub or self.words]
+        aligned = [
+            [cell.ljust(width) if k < self.stub or self.words else cell.rjust(width)
+             for k, (cell, width) in enumerate(zip(row, widths, strict=True))] for row in lines]
         return "\n\n".join([plain(self.full_caption, len(self.full_caption)), *(
-            columns([[row[k] for k in part] for row in lines], gap=GAP,
-                    right=[j for j, k in enumerate(part) if k not in left]) for part in parts)])
+            "\n".join(GAP.join(row[k] for k in part).rstrip() for row in aligned)
+            for part in parts)])
 
     def markdown(self) -> str:
         """Return it as a Markdown table behind its caption."""

@@ -180,12 +180,10 @@ def run(
     # The child imports its packages while this process does.
     with Child() as child, library.progress.progress_report(progress) as report:
         read = library.lifecycle.read_pipeline(pipeline)
-        if store is None and not isinstance(pipeline, library.pipeline.Pipeline | Mapping):
-            store = pipeline if library.lifecycle.names_store(pipeline) else None
         summary = library.runner.execute(
-            read, store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-            overwrite=overwrite, retry_failed=retry_failed, yes=yes, time_limit_s=time_limit_s,
-            progress=report, child=child)
+            read, library.lifecycle.store_of(pipeline, store), workers=workers, client=client,
+            scheduler=scheduler, reuse=reuse, overwrite=overwrite, retry_failed=retry_failed,
+            yes=yes, time_limit_s=time_limit_s, progress=report, child=child)
     for line in summary.warnings:
         notice(line)
     if summary.advice:
@@ -251,11 +249,8 @@ def limit(
     """
     # The child imports its packages while this process does.
     with Child() as child, library.progress.progress_report(progress) as report:
-        source = (
-            library.pipeline.Pipeline.from_dict(pipeline) if isinstance(pipeline, Mapping)
-            else pipeline)
         limits, summary = library.runner.search_limits(
-            source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
+            pipeline, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
             store=store, progress=report, child=child, **options)
     for line in summary.warnings if summary is not None else ():
         notice(line)
@@ -450,8 +445,8 @@ def size(
     with (Child() as child, library.progress.progress_report(progress) as report,
           library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
-            library.lifecycle.read_pipeline(pipeline), store, limit_s=limit_s, progress=report,
-            stage=stage, child=child, **options)
+            library.lifecycle.read_pipeline(pipeline), library.lifecycle.store_of(pipeline, store),
+            limit_s=limit_s, progress=report, stage=stage, child=child, **options)
     for line in found.notes:
         notice(line)
     return found

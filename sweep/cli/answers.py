@@ -24,7 +24,6 @@ from sweep.cli.command import (
     findings,
     quiet_matplotlib,
     read_pipeline,
-    store_of,
     summarised,
 )
 from sweep.errors import ArgumentError
@@ -138,7 +137,7 @@ def size(
     SESSION.stopped = CONTINUES
     with library.progress.progress_display() as bar:
         choice = sweep.size(
-            read, store=store_of(pipeline, store), limit_s=limit_s, progress=bar,
+            read, store=library.lifecycle.store_of(pipeline, store), limit_s=limit_s, progress=bar,
             workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
     return library.findings.choice_findings(choice)
 

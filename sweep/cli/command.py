@@ -252,11 +252,6 @@ def read_pipeline(
     return pipeline
 
 
-def store_of(pipeline: str, store: str | None) -> str | None:
-    """Return the store that a command was told to write, or to continue; None for the default."""
-    return store or (pipeline if library.lifecycle.names_store(pipeline) else None)
-
-
 #: Seconds that the renderer takes to compile, which every run needs.
 COMPILATION_S = 8
 

@@ -22,7 +22,6 @@ from sweep.cli.command import (
     listed,
     precision_settings,
     read_pipeline,
-    store_of,
     summarised,
 )
 from sweep.errors import ArgumentError
@@ -93,9 +92,9 @@ def run(
         announce_compilation(read)
         SESSION.stopped = f"{CONTINUES}, without --overwrite" if overwrite else CONTINUES
         summary = library.runner.execute(
-            read, store_of(source, store), workers=workers, scheduler=scheduler, reuse=reuse,
-            overwrite=overwrite, retry_failed=retry_failed, yes=yes, time_limit_s=time_limit_s,
-            progress=display, child=child)
+            read, library.lifecycle.store_of(source, store), workers=workers, scheduler=scheduler,
+            reuse=reuse, overwrite=overwrite, retry_failed=retry_failed, yes=yes,
+            time_limit_s=time_limit_s, progress=display, child=child)
     poses = f"{summary.poses:,} poses"
     if summary.needed is not None:
         settled = (summary.conditions or 0) - (summary.unsettled or 0)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sweep.errors import (
     ArgumentError,
     OtherExperimentError,
+    PipelineError,
     RunError,
     StoreError,
     StoreReplacedError,
@@ -27,10 +28,9 @@ from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.waves import InWaves, condition_count
-from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.sampling import search_settings
+from sweep.experiment.sampling import NO_TRIALS, search_settings
 from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.measure.flags import DetectionStatus
@@ -321,7 +321,8 @@ MAX_TRIALS = 2400
 
 
 def search_limits(
-    source: Pipeline | str | os.PathLike[str], *, require: Sequence[str] = (), along: str = "",
+    source: Pipeline | Mapping[str, Any] | str | os.PathLike[str], *,
+    require: Sequence[str] = (), along: str = "",
     per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
     max_trials: int | None = None,
     settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
@@ -332,8 +333,8 @@ def search_limits(
     Parameters
     ----------
     source
-        A pipeline, its file, or a store: one of a search is continued, and one of equally many
-        trials everywhere is analysed as it is.
+        A pipeline, its content or file, or a store: one of a search is continued, and one of
+        equally many trials everywhere is analysed as it is.
     require, along, per, at_all, max_trials, store
         As `sweep.limit` has them.
     settings
@@ -351,7 +352,7 @@ def search_limits(
     from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
     chosen = search_settings(require, along, per, at_all, max_trials)
-    if not isinstance(source, Pipeline) and lifecycle.names_store(source):
+    if isinstance(source, (str, os.PathLike)) and lifecycle.names_store(source):
         stored = lifecycle.open_store(os.fspath(source))
         if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
             if not stored.finished:
@@ -361,10 +362,13 @@ def search_limits(
             return limits.assign_attrs(store=os.fspath(source)), None
         if store is None and not settings:
             store = source
-    own = (lifecycle.document_of(source) or {}).get(SEARCH, {})
-    default = [] if isinstance(own, dict) and "max_trials" in own else (
-        search_settings(max_trials=MAX_TRIALS))
-    pipeline = lifecycle.read_pipeline(source, [*default, *settings, *chosen])
+    try:
+        pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
+    except PipelineError as error:
+        if NO_TRIALS not in str(error):
+            raise
+        chosen += search_settings(max_trials=MAX_TRIALS)
+        pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
     begin(pipeline)
     if store is None:
         along = getattr(pipeline.stopping, "along", "")

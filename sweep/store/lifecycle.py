@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.storage import MemoryStore
 
-from sweep.errors import ArgumentError, StoreError, SweepError, path_of
-from sweep.experiment.document import file_text, read_document
+from sweep.errors import ArgumentError, StoreError, path_of
 from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.experiment.grid import TRIAL, Axis, Blocks
 from sweep.experiment.parameters import PHOTOGRAPHS
@@ -663,6 +662,16 @@ def names_store(path: str | os.PathLike[str]) -> bool:
     return "://" in os.fspath(path) or Path(path).is_dir()
 
 
+def store_of(source: object, store: str | os.PathLike[str] | None) -> str | os.PathLike[str] | None:
+    """Return the store that is to be written, or the one that a pipeline is read from; else None.
+
+    None stands for the default.
+    """
+    if store is None and isinstance(source, (str, os.PathLike)) and names_store(source):
+        return source
+    return store
+
+
 def read_pipeline(
     source: Pipeline | Mapping[str, Any] | str | os.PathLike[str], settings: Sequence[str] = ()
 ) -> Pipeline:
@@ -686,34 +695,17 @@ def read_pipeline(
     """
     if isinstance(source, Mapping):
         return Pipeline.from_dict(source, settings)
-    found = _pipeline_or_file(source)
-    if isinstance(found, str):
-        return Pipeline.from_toml(found, settings)
-    return Pipeline.from_text(
-        found.text, settings, name=found.name, source=found.source, folder=found.folder)
-
-
-def _pipeline_or_file(source: Pipeline | str | os.PathLike[str]) -> Pipeline | str:
-    """Return a pipeline itself, that of a store, or the path of a file."""
-    if isinstance(source, Pipeline):
-        return source
-    if not isinstance(source, (str, os.PathLike)):
+    if not isinstance(source, (Pipeline, str, os.PathLike)):
         raise ArgumentError(
             "pipeline", source,
             "expected a Pipeline, the path of a TOML file or of a store, or a mapping")
-    url = os.fspath(source)
-    if not names_store(url):
-        return url
-    if "://" not in url and not (Path(url) / "zarr.json").exists():
-        raise refusal([f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
-    return open_store(url).pipeline
-
-
-def document_of(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return the document of a pipeline, its file or its store; None if it cannot be read."""
-    try:
-        found = _pipeline_or_file(source)
-        text = file_text(found) if isinstance(found, str) else found.text
-        return read_document(text)
-    except (OSError, ValueError, SweepError):
-        return None
+    if not isinstance(source, Pipeline):
+        url = os.fspath(source)
+        if not names_store(url):
+            return Pipeline.from_toml(url, settings)
+        if "://" not in url and not (Path(url) / "zarr.json").exists():
+            raise refusal([
+                f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
+        source = open_store(url).pipeline
+    return Pipeline.from_text(
+        source.text, settings, name=source.name, source=source.source, folder=source.folder)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from concurrent.futures import BrokenExecutor
+from contextlib import nullcontext
 from unittest import mock
 
 import cv2
@@ -158,7 +159,8 @@ def test_folders_of_others_and_what_is_large_are_refused_in_a_line(
         with pytest.raises((ArgumentError, StoreError), match=line):
             export(some, tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
-    monkeypatch.setattr(exporting.ProcessPoolExecutor, "map", mock.Mock(side_effect=BrokenExecutor))
+    pool = nullcontext(mock.Mock(map=mock.Mock(side_effect=BrokenExecutor)))
+    monkeypatch.setattr(exporting, "ProcessPoolExecutor", lambda *_, **__: pool)
     with pytest.raises(RunError, match="a process ended; use fewer workers"):
         export(pipeline, tmp_path / "new", workers=2, yes=True)
 

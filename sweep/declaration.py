@@ -76,7 +76,7 @@ class Declared:
             return word
         wanted = self._letters(word.strip().replace("::", ".").rpartition(".")[2])
         spelled = {self._letters(choice): choice for choice in self.choices}
-        if wanted in spelled or not self.abbreviated or wanted.isdigit():
+        if wanted in spelled or not self.abbreviated or re.fullmatch("[a-z]*|[0-9]*", wanted):
             return spelled.get(wanted)
         # The one choice that ends so, with its number whole.
         found = [spelled[each] for each in spelled if re.fullmatch(f"[a-z]*{wanted}", each)]

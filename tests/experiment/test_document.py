@@ -259,6 +259,12 @@ def test_a_dictionary_is_understood_by_its_number_where_that_is_one(written, val
         assert pipeline.fixed["dictionary"] == value
 
 
+@pytest.mark.parametrize("written", ["", "?!", "l", "original", "36"])
+def test_a_dictionary_is_not_understood_without_a_number_and_letters(written):
+    with pytest.raises(ValueError, match="one of DICT_4X4_100"):
+        PARAMETERS["dictionary"].check(written)
+
+
 @given(st.sampled_from(sorted(PARAMETERS)), st.sampled_from(["camera", "pose", "estimator"]))
 def test_a_parameter_in_a_wrong_section_is_told_with_the_right_one(name, section):
     assert f"did you mean {name}?" not in nearest(name, list(PARAMETERS))

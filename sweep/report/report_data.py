@@ -645,7 +645,8 @@ def trade_lines(data: ReportData, trade: xr.Dataset, budget_ms: float | None = N
                          f"{number(cost[cheapest])} ms")
             line += f"; {found.line}" if found.line else ""
         else:
-            line += f"nothing fits {budget_ms or 0:g} ms a frame"
+            line += "nothing to recommend" if budget_ms is None else (
+                f"nothing fits {budget_ms:g} ms a frame")
             for near in sorted(usable, key=cost.__getitem__)[:1]:
                 line += f"; the nearest is {names[near]}, {number(cost[near])} ms"
         lines.append(line)

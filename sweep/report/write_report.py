@@ -239,12 +239,16 @@ FIGURES: tuple[Callable[[ReportData], Figure | None], ...] = (
 
 
 def figures_of(data: ReportData) -> list[Figure]:
-    """Return the figures of a store, such that one shows each axis and drawn parameter."""
+    """Return the figures of a store, such that one shows each axis and drawn parameter.
+
+    Where no pose was looked for there may be nothing to draw, and no figure.
+    """
     made = [figure for make in FIGURES if (figure := make(data)) is not None]
     covered = {name for figure in made for name in figure.covers}
     drawn = [name for name in data.pipeline.distributions if name in data.results.variables]
-    return made + [_along(data, name) for name in (*data.scene_axes, *data.setting_axes, *drawn)
-                   if name not in covered]
+    made += [_along(data, name) for name in (*data.scene_axes, *data.setting_axes, *drawn)
+             if name not in covered]
+    return [figure for figure in made if figure.panels]
 
 
 # --------------------------------------------------------------------------------------------------

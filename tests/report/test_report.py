@@ -102,6 +102,8 @@ def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"odd.zarr", "report.html"}
     assert "finished" in command("status", url)[1]
     assert command("plan", url)[0] == 0
+    if name == "nothing visible":
+        assert command("report", url, "-o", tmp_path / "report.md")[0] == 0
 
 
 def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):

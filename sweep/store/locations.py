@@ -121,8 +121,12 @@ def storage_at(url: str, *, read_only: bool) -> Store:
 
 def remote_run_id(url: str) -> str | None:
     """Return the id of the run that a remote store's URL points to; None if there is no store."""
-    with translate_errors(url, "reached"):
-        content = read_files(storage_at(url, read_only=True), ["zarr.json"])[0]
+    storage = storage_at(url, read_only=True)
+    try:
+        content = read_files(storage, ["zarr.json"])[0]
+    except Exception as error:
+        # Also a ValueError: of a port that is no port, say.
+        raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
     if content is None:
         return None
     with contextlib.suppress(ValueError, KeyError, TypeError):

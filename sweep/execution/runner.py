@@ -125,7 +125,7 @@ def execute(
             "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
     for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
         check_positive(name, seconds, "expected seconds above 0")
-    reuse = [reuse] if isinstance(reuse, (str, os.PathLike)) else reuse
+    reuse = reuse if isinstance(reuse, Sequence) and not isinstance(reuse, str) else [reuse]
     if retry_failed and reuse:
         raise ArgumentError(
             "reuse", path_of("reuse", reuse[0]), "expected no retry_failed beside it")

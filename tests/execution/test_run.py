@@ -212,7 +212,8 @@ def test_nothing_is_overwritten_by_a_run_that_cannot_be(pipeline, tmp_path):
     url = str(tmp_path / "kept.zarr")
     by_hand(url, pipeline, (2, 4, 2, 3))
     for options, error in (
-        ({"reuse": [url]}, ArgumentError), ({"reuse": [str(tmp_path / "none.zarr")]}, StoreError),
+        ({"reuse": [url]}, ArgumentError), ({"reuse": 3}, ArgumentError),
+        ({"reuse": [str(tmp_path / "none.zarr")]}, StoreError),
         ({"scheduler": "nowhere"}, ArgumentError), ({"client": "nowhere"}, ArgumentError),
     ):
         with pytest.raises(error):

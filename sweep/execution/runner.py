@@ -369,10 +369,13 @@ def search_limits(
             raise
         chosen += search_settings(max_trials=MAX_TRIALS)
         pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
+    searched = getattr(pipeline.stopping, "along", "")
+    if not searched:
+        names = [axis.name for axis in pipeline.experiment.scene_axes if axis.name != "trial"]
+        raise ArgumentError("along", along, f"expected one of {', '.join(names) or 'its axes'}")
     begin(pipeline)
     if store is None:
-        along = getattr(pipeline.stopping, "along", "")
-        store = Path("runs") / f"{pipeline.name}-limit-{along}.zarr"
+        store = Path("runs") / f"{pipeline.name}-limit-{searched}.zarr"
     summary = execute(pipeline, store, **options)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
     return limits.assign_attrs(store=summary.store), summary

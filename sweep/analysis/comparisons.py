@@ -34,8 +34,8 @@ from sweep.typing import Floats, Integers, Masks
 #: Variables that are the same for both poses of a pair.
 TRUTH = ("true_tvec_m", "true_rvec")
 
-#: Part of the name of the first configuration's mean absolute error.
-OLDER = "older"
+#: Name of the mask of the pairs whose truth differs.
+DIFFERING = "differing"
 
 
 class Pair:
@@ -49,6 +49,7 @@ class Pair:
 
     def __init__(self, arrays: estimator.Arrays) -> None:
         self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
+        self._arrays = arrays
 
     @property
     def draws(self) -> Masks:
@@ -63,8 +64,7 @@ class Pair:
     @property
     def differing(self) -> Masks:
         """Poses whose truth differs."""
-        return functools.reduce(operator.or_, (
-            (self.first[name] != self.second[name]).any(axis=-1) for name in TRUTH))
+        return self._arrays[DIFFERING]
 
     @property
     def both_solved(self) -> Masks:
@@ -175,18 +175,17 @@ def compare(
     kept = dataset.kept_dimensions(first, per)
     dataset.kept_dimensions(second, per)
     table, = paired_tables(first, second, kept, bins)
-    return table.drop_vars([
-        name for name in table if name == "drawn" or f"_{OLDER}_" in str(name)])
+    return table.drop_vars("drawn")
 
 
 def paired_tables(
     first: xr.Dataset, second: xr.Dataset, kept: Sequence[str], bins: Bins | None,
     quantities: Sequence[Quantity] = QUANTITIES, levels: Sequence[float] = (LEVEL,),
+    more: Sequence[PairStatistic] = (),
 ) -> list[xr.Dataset]:
     """Return the table of `compare` of some kinds of error, for each level of the intervals.
 
-    Beside it there are whether any cell has two draws, ``drawn``, and of each kind the mean
-    absolute error of the first configuration, such as ``rotation_older_deg``.
+    Beside it there is whether any cell has two draws, ``drawn``, and there are ``more`` statistics.
     """
     stopped = dataset.is_sampling_stopped(first) or dataset.is_sampling_stopped(second)
     if stopped and DRAWS in first.dims and DRAWS in second.dims:
@@ -197,8 +196,12 @@ def paired_tables(
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
-    inputs = paired_arrays(first, second, *ERROR_INPUTS, *TRUTH, *(
+    inputs = paired_arrays(first, second, *ERROR_INPUTS, *(
         name for quantity in quantities for name in quantity.inputs))
+    # Compared while they are read: the truth of 10^7 poses has 480 MB.
+    inputs[DIFFERING] = functools.reduce(operator.or_, (
+        (first[name] != second[name]).any("xyz").reset_coords(drop=True)
+        for name in TRUTH if name in first and name in second), xr.DataArray(False))
     statistics: list[PairStatistic] = [
         RateDifference("detection", "detected", lambda poses: poses.detected),
         RateDifference("solved", "solved", lambda poses: poses.solved),
@@ -212,7 +215,7 @@ def paired_tables(
               lambda pair: pair.first.run != pair.second.run),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
-        *(statistic for quantity in quantities for statistic in _differences(quantity)),
+        *(statistic for quantity in quantities for statistic in _differences(quantity)), *more,
     ]
     return estimator.aggregates(first, inputs, kept, [
         [replace(each, level=level) for each in statistics] for level in levels],
@@ -295,8 +298,6 @@ def _differences(quantity: Quantity) -> list[PairStatistic]:
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
              lambda pair: np.diff(np.sqrt(squares(pair))), lambda pair: pair.both_solved,
              units=quantity.units),
-        Mean(quantity.named(OLDER), "", lambda pair: quantity.norm(pair.first)[..., None],
-             lambda pair: pair.both_solved),
         ratio("", "", lambda pair: pair.both_solved),
         *([ratio("_unflipped", ", flipped in neither",
                  lambda pair: pair.first.unflipped & pair.second.unflipped)]
@@ -446,6 +447,10 @@ class Regression:
     worse: bool
 
 
+def _first_error(quantity: Quantity, pair: Pair) -> Floats:
+    return quantity.norm(pair.first)[..., None]
+
+
 def regressions(
     old: xr.Dataset, new: xr.Dataset, variables: Iterable[str] = (), per: Sequence[str] = (),
 ) -> list[Regression]:
@@ -480,7 +485,10 @@ def regressions(
     kept = dataset.kept_dimensions(new, (*configuration, *dataset.as_names(per)))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    table, = paired_tables(old, new, kept, None, quantities, [level])
+    means: list[PairStatistic] = [
+        Mean(each.named("first"), "", functools.partial(_first_error, each),
+             lambda pair: pair.both_solved) for each in quantities]
+    table, = paired_tables(old, new, kept, None, quantities, [level], means)
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")
@@ -490,7 +498,7 @@ def regressions(
     for each in quantities:
         name = each.named("difference")
         compared.append((f"mean absolute {each.words}", name, each.units, table[name],
-                         table[f"{name}_low"] > MARGIN * table[each.named(OLDER)]))
+                         table[f"{name}_low"] > MARGIN * table[each.named("first")]))
     conditions = [name for name in kept if name not in configuration]
     found = []
     for quantity, name, units, excess, worse in compared:

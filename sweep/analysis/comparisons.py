@@ -1114,8 +1114,8 @@ def simulation_gap(
     gaps: dict[str, xr.DataArray] = {}
     for each in GAP_STATISTICS:
         words = "simulated over photographs" if each.ratio else "simulated minus photographs"
-        outputs = estimator.with_interval(f"{each.name}_gap", f"{words}: {each.meaning}",
-                                "1" if each.ratio else each.units)
+        outputs = estimator.with_interval(
+            f"{each.name}_gap", f"{words}: {each.meaning}", "1" if each.ratio else each.units)
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps |= {output.name: array.assign_attrs(cf_attributes(output.meaning, output.units))
                      for output, array in zip(outputs, each.gap(*tables), strict=True)}

@@ -28,6 +28,7 @@ from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
 from sweep.execution.waves import InWaves, condition_count
+from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
@@ -371,7 +372,8 @@ def search_limits(
         pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
     searched = getattr(pipeline.stopping, "along", "")
     if not searched:
-        names = [axis.name for axis in pipeline.experiment.scene_axes if axis.name != "trial"]
+        names = [axis.name for axis in pipeline.axes_of(Stage.scene)
+                 if axis.is_numeric and axis.name != TRIAL]
         raise ArgumentError("along", along, f"expected one of {', '.join(names) or 'its axes'}")
     begin(pipeline)
     if store is None:

@@ -247,12 +247,14 @@ def axis_values(
     known = [*AXIS_FORMS, "values"]
     if form not in known or len(table) != 1:
         raise ValueError(f"a list, or a table with one of {', '.join(known)}{nearest(form, known)}")
-    if form not in AXIS_FORMS and not isinstance(ends, list):
+    if form in AXIS_FORMS:
+        values = _generated(parameter, form, ends, quota)
+    elif not isinstance(ends, list):
         raise ValueError(f"{form} = a list")
-    if form not in AXIS_FORMS and not 0 < len(ends) <= quota:
+    elif not 0 < len(ends) <= quota:
         raise ValueError(TOO_MANY if ends else "at least one value")
-    values = _generated(parameter, form, ends, quota) if form in AXIS_FORMS else tuple(
-        _checked(parameter, value) for value in ends)
+    else:
+        values = tuple(_checked(parameter, value) for value in ends)
     if not repeats and not isinstance(values, range):
         value, count = collections.Counter(values).most_common(1)[0]
         if count > 1:

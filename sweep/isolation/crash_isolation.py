@@ -248,7 +248,7 @@ def check_repeatable(
 ) -> None:
     """Repeat the scenes that raised, all together, in a child process that was started for it.
 
-    Scenes that ended their process are not repeated for that: they did so in two processes.
+    Scenes that ended their process are not repeated for that: :data:`DEATHS` processes were ended.
 
     Parameters
     ----------

@@ -485,10 +485,10 @@ def compare(
             if value:
                 raise ArgumentError(name, "", "expected a store of photographs and a simulation")
         table = comparisons.store_differences(one, other)
-        tables = store_difference_tables(table)
-        return Findings([*tables.values()], {
+        parts = store_difference_tables(table)
+        return Findings([*parts.values()], {
             "first": first, "second": second,
-            **{name: each.as_json()["rows"] for name, each in tables.items()}}, table, 0, then)
+            **{name: each.as_json()["rows"] for name, each in parts.items()}}, table, 0, then)
     gap = simulation_gap(one, other, bins).load()
     if figure is not None:
         write_figure(gap_figures(one, other, bins), figure)
@@ -653,7 +653,7 @@ def store_difference_tables(table: xr.Dataset) -> dict[str, Table]:
         input_core_dims=[[f"first_{stage}", f"second_{stage}"]], vectorize=True,
         output_dtypes=[object]) for stage in ("detection", "estimate")}
     shown = table.assign({"detection": pairs["detection"], "estimation": pairs["estimate"]})
-    tables = {}
+    parts = {}
     for name, (caption, counts, shifts) in DIFFERENCES.items():
         columns = [Column(heading, variable) for heading, variable in counts.items()]
         for unit, (variable, scale) in shifts.items():
@@ -662,10 +662,10 @@ def store_difference_tables(table: xr.Dataset) -> dict[str, Table]:
                 shown[heading] = table[variable].sel(statistic=statistic, drop=True)
                 columns.append(Column(heading, heading, scale))
         dims = [str(dim) for dim in table[columns[0].variable].dims]
-        tables[name] = table_of(
+        parts[name] = table_of(
             shown, caption, dims, [*columns, Column("first \u2192 second", name)])
     versions = table["fingerprint"].to_series().unstack().reset_index().astype(object)
-    return {**tables, "fingerprint": Table("Versions and files that differ", versions, words=True)}
+    return {**parts, "fingerprint": Table("Versions and files that differ", versions, words=True)}
 
 
 def _pairs(flags: Sequence[str], counts: Integers) -> str:

@@ -101,31 +101,6 @@ class DatasetError(StoreError):
     """
 
 
-class OtherExperimentError(StoreError):
-    """A store that holds another experiment than the one that is to be run into it.
-
-    Parameters
-    ----------
-    url
-        The store.
-    differences
-        One line for each difference.
-    reusable
-        Whether a run into another store could reuse its cells.
-    """
-
-    def __init__(self, url: str, differences: Sequence[str], reusable: bool) -> None:
-        self.url, self.differences, self.reusable = url, tuple(differences), reusable
-
-    def __str__(self) -> str:
-        advice = (
-            "its cells can be reused: give another store, and this one as reuse"
-            if self.reusable else "choose another store, or overwrite it"
-        )
-        return "\n".join([f"{self.url}: holds another experiment; {advice}",
-                          *(f"  {each}" for each in self.differences)])
-
-
 class StoreReplacedError(StoreError):
     """A store that was moved, deleted or replaced by another run's while a run wrote it."""
 

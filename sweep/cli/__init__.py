@@ -17,6 +17,7 @@ from sweep.cli.command import (
     print_error,
     print_system_error,
     printing,
+    quiet_matplotlib,
 )
 from sweep.cli.parser import build_parser
 from sweep.errors import SweepError
@@ -32,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The words after ``sweep`` on the command line; by default this process'.
     """
     accept_any_text()
+    quiet_matplotlib()
     parser, _ = build_parser()
     SESSION.given = list(sys.argv[1:] if arguments is None else arguments)
     SESSION.flags, SESSION.stopped = {}, "stopped"

@@ -7,7 +7,6 @@ import contextlib
 import errno
 import inspect
 import io
-import itertools
 import logging
 import os
 import re
@@ -15,14 +14,12 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from sweep import library
 from sweep.errors import (
     ArgumentError,
-    OtherExperimentError,
     PipelineError,
     PluginError,
     StoreError,
@@ -280,9 +277,6 @@ def announce_compilation(pipeline: Pipeline) -> None:
 # --------------------------------------------------------------------------------------------------
 # Output: lines without control characters, and a picture.
 
-#: How the program's path ends if Python was told to run the package.
-AS_MODULE = ("sweep", "__main__.py")
-
 #: Lines of each kind that `sweep status` and `sweep verify` print.
 MAX_LINES = 50
 
@@ -316,9 +310,8 @@ def findings(
 
 
 def command_line() -> str:
-    """Return the command line as it was given, quoted for a shell, with how sweep was called."""
-    called = "python -m sweep" if Path(sys.argv[0]).parts[-2:] == AS_MODULE else "sweep"
-    return f"{called} {quoted(*SESSION.given)}"
+    """Return the command line as it was given, quoted for a shell."""
+    return quoted("sweep", *SESSION.given)
 
 
 def accept_any_text() -> None:
@@ -349,21 +342,6 @@ def quiet_matplotlib() -> None:
     """
     os.environ.pop("MPLBACKEND", None)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-
-
-def check_png(output: str) -> None:
-    """Check that a picture can be written, before it is computed.
-
-    Raises
-    ------
-    ArgumentError
-        If its name ends as another format's.
-    StoreError
-        If it cannot be.
-    """
-    if Path(output).suffix.lower() not in {"", ".png"}:
-        raise ArgumentError("output", output, "expected a file that ends in .png")
-    library.output_file.check_output_file(Path(output))
 
 
 def listed(texts: Sequence[str], more: str) -> list[str]:
@@ -436,25 +414,9 @@ def print_error(error: SweepError) -> int:
         given = f" {error.value}" if str(error.value) else ""
         flag = SESSION.flags.get(error.argument, f"--{error.argument.replace('_', '-')}")
         text = f"{flag}{given}: {error.problem}"
-    if isinstance(error, OtherExperimentError) and error.reusable and "reuse" in SESSION.flags:
-        line = _reusing_command(SESSION.given, error.url)
-        text = "\n".join([
-            f"{error.url}: holds another experiment; reuse its cells in a new store: {line}",
-            *(f"  {line}" for line in error.differences)])
     for line in text.split("\n"):
         print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
     return 2 if isinstance(error, REFUSALS) else 1
-
-
-def _reusing_command(given: Sequence[str], url: str) -> str:
-    """Return the command that runs the same into a new store, and reuses the cells of another."""
-    stem = url.removesuffix(".zarr")
-    new = next(name for name in (f"{stem}-{number}.zarr" for number in itertools.count(2))
-               if not library.locations.exists(name))
-    at = [k for k, word in enumerate(given) if word.partition("=")[0] == "--store"]
-    left_out = {*at, *(k + 1 for k in at if "=" not in given[k])}
-    words = [word for k, word in enumerate(given) if k not in left_out]
-    return quoted("sweep", *words, "--store", new, "--reuse", url)
 
 
 def print_system_error(error: OSError | MemoryError | RuntimeError | ValueError) -> int:

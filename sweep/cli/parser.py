@@ -8,7 +8,7 @@ import re
 from functools import cache
 from typing import Literal, NoReturn
 
-from sweep.cli import answers, experiments  # noqa: F401  (they declare the commands)
+from sweep.cli import commands  # noqa: F401  (it declares them)
 from sweep.cli.command import DECLARED, Command, command, printing
 from sweep.errors import SweepError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
@@ -34,8 +34,8 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
         import shtab  # noqa: PLC0415
     except ImportError:
         raise SweepError("sweep completion needs shtab: pip install shtab") from None
-    parser, commands = build_parser()
-    for added in commands:
+    parser, every = build_parser()
+    for added in every:
         for action in added._actions:  # noqa: SLF001  (argparse offers no other list)
             if action.metavar in FILES:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
@@ -92,8 +92,6 @@ def _hint(message: str) -> str:
 
 
 def _meant(word: str) -> str:
-    if word in ("--dry-run", "--dryrun", "-n"):
-        return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
         flags = {name for added in build_parser()[1] for name in _flags(added).values()}
         name = word.partition("=")[0]
@@ -123,15 +121,15 @@ def build_parser() -> tuple[Parser, list[argparse.ArgumentParser]]:
     )
     parser.add_argument("--version", action="version", version=f"sweep {__version__}")
     parser.set_defaults(command=None)
-    commands = parser.add_subparsers(metavar="COMMAND", title=UNGROUPED)
+    every = parser.add_subparsers(metavar="COMMAND", title=UNGROUPED)
     for each in COMMANDS:
-        added = commands.add_parser(
+        added = every.add_parser(
             each.name, help=each.summary, description=each.description,
             epilog=_epilog(each), formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         each.add_arguments(added)
         added.set_defaults(command=each, flags=_flags(added))
-    return parser, list(commands.choices.values())
+    return parser, list(every.choices.values())
 
 
 def _epilog(declared: Command) -> str:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 from sweep.errors import (
     ArgumentError,
-    OtherExperimentError,
     PipelineError,
     RunError,
     StoreError,
@@ -200,7 +199,9 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     store = lifecycle.open_store(url, "r+")
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
-        raise OtherExperimentError(url, lines, is_reusable(pipeline, store))
+        advice = ("its cells can be reused: give another store, and this one as reuse"
+                  if is_reusable(pipeline, store) else "choose another store, or overwrite it")
+        raise StoreError("\n  ".join([f"{url}: holds another experiment; {advice}", *lines]))
     return store
 
 

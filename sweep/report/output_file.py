@@ -20,7 +20,9 @@ from sweep.store.locations import enclosing_store, reason_of
 FIGURE_SUFFIXES = (".png", ".svg")
 
 
-def figure_file(name: str | os.PathLike[str] | None) -> Path | None:
+def figure_file(
+    name: str | os.PathLike[str] | None, suffixes: tuple[str, ...] = FIGURE_SUFFIXES
+) -> Path | None:
     """Return the path of a figure, checked before there is one; None without a name.
 
     Raises
@@ -31,8 +33,9 @@ def figure_file(name: str | os.PathLike[str] | None) -> Path | None:
     if name is None:
         return None
     path = Path(path_of("output", name))
-    if path.suffix.lower() not in FIGURE_SUFFIXES:
-        raise StoreError(f"{path}: expected a file that ends in .png or .svg")
+    if path.suffix.lower() not in suffixes:
+        endings = " or ".join(filter(None, suffixes))
+        raise StoreError(f"{path}: expected a file that ends in {endings}")
     check_output_file(path)
     return path
 

@@ -20,7 +20,7 @@ from support.here import Here
 from support.stores import by_hand
 from sweep.analysis.dataset import parameter_value
 from sweep.cli import main
-from sweep.errors import OtherExperimentError, PipelineError, PluginError, StoreError
+from sweep.errors import PipelineError, PluginError, StoreError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.block_task import match, other_here
 from sweep.execution.runner import execute
@@ -201,7 +201,7 @@ def test_the_file_is_in_the_fingerprint_and_a_changed_one_is_not_continued(made)
     (made / "mine.py").write_text(MINE + "# another version\n")
     pipeline = Pipeline.from_toml(made / "grid.toml")
     try:
-        with pytest.raises(OtherExperimentError, match=r"files: the store has \{'mine.py': "):
+        with pytest.raises(StoreError, match=r"files: the store has \{'mine.py': "):
             execute(pipeline, made / "grid.zarr")
         with pytest.raises(StoreError, match="no cell of it can be reused"):
             execute(pipeline, made / "other.zarr", reuse=[made / "grid.zarr"])

@@ -6,7 +6,7 @@ import pytest
 
 from support.here import calls_here
 from support.stores import by_hand, in_waves, same
-from sweep.errors import OtherExperimentError
+from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
 from sweep.experiment.pipeline import Pipeline
@@ -95,7 +95,7 @@ def test_fixed_trials_and_waves_reuse_each_other(first, second, tmp_path):
     source, reference = (str(tmp_path / f"{name}.zarr") for name in ("source", "reference"))
     target = str(tmp_path / "target.zarr")
     execute(pipelines[first], source)
-    with pytest.raises(OtherExperimentError, match="trials: the store has"):
+    with pytest.raises(StoreError, match="trials: the store has"):
         execute(pipelines[second], source)
     whole = execute(pipelines[second], reference)
     summary = execute(pipelines[second], target, reuse=[source])

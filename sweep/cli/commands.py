@@ -152,8 +152,6 @@ def plan(
     facts, listed = read.facts, read.facts.parts
     expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
-    refused = library.forecast.objections(
-        read, expected, library.forecast.free_disk(f"runs/{read.name}.zarr"))
     sections = {
         "Camera": [facts.camera_line, *facts.camera_notes],
         "Poses": [facts.pose_line, *facts.pose_notes, *facts.detector_notes, *bound],
@@ -167,9 +165,9 @@ def plan(
     lines = [read.heading]
     for title, texts in sections.items():
         lines += ["", title, *(f"  {text}" for text in texts)] if texts else []
-    lines += [f"warning: the run {line}" for line in refused]
+    lines += [f"warning: the run {line}" for line in expected.objections]
     words = [*_set([*settings, *precision_settings(precision, max_trials)]),
-             *(["--yes"] if refused else [])]
+             *(["--yes"] if expected.objections else [])]
     return findings(lines, {
         "title": read.title, "camera": facts.camera, "notes": [*facts.notes, *bound],
         "views": facts.view_ranges,

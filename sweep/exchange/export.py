@@ -26,7 +26,7 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SceneBatch, common_windows, scenes_at, searched_windows
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.exchange.answers import CORNER_COLUMNS, POSITION, VECTOR
-from sweep.execution.forecast import free_disk
+from sweep.execution.forecast import free_bytes
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.schema import LABELS
 from sweep.measure.flags import DetectionStatus
@@ -529,10 +529,10 @@ def _check_size(pipeline: Pipeline, folder: Path, count: int, windowed: bool) ->
     sizes = [len(encoded_image(images, row))
              for row in np.flatnonzero(images.batch.visible).tolist()]
     total = int(count * np.mean(sizes)) if sizes else 0
-    free = free_disk(str(folder))
-    if total > min(MAX_BYTES, free.bytes) or count > free.files:
+    free = free_bytes(str(folder))
+    if total > min(MAX_BYTES, free):
         raise StoreError(
             f"{plain(folder, 300)}: the export takes about {byte_count(total)} in {count:,} files, "
-            f"and {byte_count(int(min(free.bytes, 1e18)))} are free; choose fewer scenes, windows, "
+            f"and {byte_count(int(min(free, 1e18)))} are free; choose fewer scenes, windows, "
             "or confirm it with --yes (in Python, yes=True)"
         )

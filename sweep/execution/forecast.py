@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import resource
+import shutil
 import statistics
 import time
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.errors import MachineFaultError, StoreError, check_positive
+from sweep.errors import MachineFaultError, check_positive
 from sweep.evaluation.block import run_cells
 from sweep.execution import TIME_LIMIT_S
 from sweep.execution.executors import SMALL_RUN_S
@@ -171,10 +171,6 @@ BLOCKS_PER_S = 75
 #: Blocks of a run, of about 25 files each: longer runs get larger blocks.
 MAX_BLOCKS = 100_000
 
-#: Work that a block takes at most: jobs of clusters end after hours, and lose a block each. A run
-#: of 11 years of one processor has 100,000 of these; longer ones have more.
-MAX_BLOCK_S = 3600.0
-
 #: Share of a block's time limit that its work is to take: scenes may cost more than was measured. A
 #: time limit that the user gives bounds the work; else the work raises the limit.
 MAX_BLOCK_SHARE = 1 / 10
@@ -201,10 +197,8 @@ def block_work_s(total_s: float, workers: int, time_limit_s: float | None = None
 
 
 def longest_block_s(time_limit_s: float | None) -> float:
-    """Return the seconds of work that a block may take, under the user's time limit if any."""
-    if time_limit_s is None:
-        return MAX_BLOCK_S
-    return min(max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s), MAX_BLOCK_S)
+    """Return the seconds of work that a block may take under the user's time limit, if any."""
+    return math.inf if time_limit_s is None else max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s)
 
 
 def block_time_limit_s(time_limit_s: float | None, work_s: float) -> float:
@@ -217,8 +211,7 @@ def block_time_limit_s(time_limit_s: float | None, work_s: float) -> float:
 
 
 def blocks_of(
-    pipeline: Pipeline, scene_s: float, workers: int, block_s: float | None = None,
-    time_limit_s: float | None = None,
+    pipeline: Pipeline, scene_s: float, workers: int, time_limit_s: float | None = None
 ) -> Blocks:
     """Return the blocks of a run.
 
@@ -233,8 +226,6 @@ def blocks_of(
         Seconds that a scene takes.
     workers
         Threads that share the work.
-    block_s
-        Seconds of work in a block (default: :func:`block_work_s`).
     time_limit_s
         Block timeout in seconds, if the user gave one.
     """
@@ -245,16 +236,15 @@ def blocks_of(
     if rule is not None:
         # Writing a block costs as much if few of its scenes are needed.
         total_s = max(total_s * least_share(rule), WAVE_BLOCK_S * BLOCKS_PER_WORKER)
-    work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
-    longest = 0 if block_s is not None else int(longest_block_s(time_limit_s) / scene_s)
     most = max(min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // pipeline.experiment.bytes_of(1)), 1)
-    target = min(max(int(work_s / scene_s), 1), most)
+    longest = min(max(longest_block_s(time_limit_s) / scene_s, 1), most)
+    target = min(max(int(block_work_s(total_s, workers, time_limit_s) / scene_s), 1), most)
     while True:
         blocks = Blocks(tuple(map(len, axes)), _cut(axes, target, rule))
         # Blocks that fit into the axes are smaller than wanted, so that there may be more.
-        if len(blocks) <= MAX_BLOCKS or target >= min(longest, most):
+        if len(blocks) <= MAX_BLOCKS or target >= int(longest):
             return blocks
-        target = min(math.ceil(LARGER * target), longest, most)
+        target = min(math.ceil(LARGER * target), int(longest))
 
 
 def _cut(axes: Sequence[Axis], target: int, rule: Stopping | None) -> tuple[int, ...]:
@@ -286,7 +276,7 @@ def least_share(rule: Stopping | None) -> float:
 
 
 # --------------------------------------------------------------------------------------------------
-# The forecast of a run: blocks, bytes, memory and time.
+# The forecast of a run: blocks, bytes, memory and time, and why it has to be confirmed.
 
 #: Block timeout by which a forecast, which is answered within 5 s, abandons the batch of scenes.
 PLAN_S = 12.0
@@ -294,12 +284,15 @@ PLAN_S = 12.0
 #: Seconds of a run apart from its blocks: processes start and end, packages are imported.
 START_S = 1.5
 
+#: Seconds from which on a run has to be confirmed.
+MAX_S = 86_400.0
+
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
-    """Return the expected cost of a run, as :func:`forecast_of` does; write nothing.
+    """Return the expected cost of a run into its own store, as :func:`forecast_of` does.
 
     A seeded sample of scenes is measured in a child process, for a few seconds at most,
-    compilation not counted.
+    compilation not counted; nothing is written.
 
     Parameters
     ----------
@@ -320,13 +313,15 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> SimpleNamespace:
     here = default_workers()
     count = workers or (1 if least < SMALL_RUN_S else here)
     blocks = blocks_of(pipeline, timing.scene_s, count)
-    expected = forecast_of(pipeline, timing, blocks, min(count, here))
+    expected = forecast_of(
+        f"runs/{pipeline.name}.zarr", pipeline, timing, blocks, min(count, here))
     expected.workers = count
     return expected
 
 
 def forecast_of(
-    pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int, left: int | None = None
+    url: str, pipeline: Pipeline, timing: Timing, blocks: Blocks, workers: int,
+    left: int | None = None,
 ) -> SimpleNamespace:
     """Return the expected cost of a run; of its time, files and bytes for ``left`` of its blocks.
 
@@ -338,10 +333,21 @@ def forecast_of(
     seconds a pose, all configurations included, of so many ``sampled`` ones, and whether the
     measurement was abandoned since a pose takes ``over`` that; ``workers``, and the ``seconds``
     that they take; ``least_share`` of the poses that is computed in any case: of a run in waves the
-    first wave. All else is that of all poses.
+    first wave. All else is that of all poses: how many a run in waves needs, nobody knows.
+    ``objections``: why the run has to be confirmed; none if it need not be.
     """
     poses, left = pipeline.size(Stage.scene), len(blocks) if left is None else left
     left_poses = math.ceil(poses * left / max(len(blocks), 1))
+    size = pipeline.experiment.bytes_of(left_poses)
+    seconds = START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1))
+    objections, free = [], free_bytes(url)
+    if seconds > MAX_S:
+        about = "about" if pipeline.stopping is None else "up to"
+        objections.append(f"takes {about} {duration(seconds)} with {workers} "
+                          f"worker{'s' if workers > 1 else ''}")
+    if size > free:
+        objections.append(f"writes {byte_count(size)} before compression, and "
+                          f"{byte_count(int(free))} are free")
     # Of a child that ended, the memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     return SimpleNamespace(
@@ -350,63 +356,23 @@ def forecast_of(
         block=blocks.extents,
         blocks=len(blocks),
         files=left * (len(pipeline.experiment.variables) + 1),  # and a receipt
-        bytes=pipeline.experiment.bytes_of(left_poses),
+        bytes=size,
         worker_bytes=process + 3 * pipeline.experiment.bytes_of(math.prod(blocks.extents)),
         pose_s=timing.scene_s,
         sampled=timing.sampled,
         over=timing.over,
         workers=workers,
-        seconds=START_S + left_poses * timing.scene_s / min(workers, max(len(blocks), 1)),
+        seconds=seconds,
         least_share=least_share(make_rule(pipeline)),
+        objections=objections,
     )
 
 
-# --------------------------------------------------------------------------------------------------
-# A run is refused if it takes longer than a day, or more than the disk has.
-
-#: Seconds from which on a run has to be confirmed.
-MAX_S = 86_400.0
-
-
-class FreeDisk(NamedTuple):
-    """Bytes and files for which a disk has room; infinite if that is not limited, or not known."""
-
-    bytes: float = math.inf
-    files: float = math.inf
-
-
-def free_disk(url: str) -> FreeDisk:
-    """Return the free space on the disk of a local store."""
+def free_bytes(url: str) -> float:
+    """Return the bytes that are free on the disk of a local store; infinite if not known."""
     with contextlib.suppress(OSError):
         if not is_remote(url):
             path = Path(url).absolute()
-            state = os.statvfs(next(each for each in (path, *path.parents) if each.exists()))
-            return FreeDisk(state.f_bavail * state.f_frsize,
-                            state.f_favail if state.f_files else math.inf)
-    return FreeDisk()
-
-
-def objections(pipeline: Pipeline, demand: SimpleNamespace, free: FreeDisk) -> list[str]:
-    """Return why a run has to be confirmed; nothing if it need not be.
-
-    A run whose sampling stops is judged by all its trials: how many it needs, nobody knows.
-    """
-    found, about = [], "about" if pipeline.stopping is None else "up to"
-    if demand.seconds > MAX_S:
-        workers = f"{demand.workers} worker{'s' if demand.workers > 1 else ''}"
-        found.append(f"takes {about} {duration(demand.seconds)} with {workers}")
-    if demand.bytes > free.bytes:
-        found.append(f"writes {byte_count(demand.bytes)} before compression, and "
-                     f"{byte_count(int(free.bytes))} are free")
-    if demand.files > free.files:
-        found.append(f"makes {demand.files:,} files, and the disk has room for {free.files:,}")
-    return found
-
-
-def check_affordable(url: str, pipeline: Pipeline, demand: SimpleNamespace) -> None:
-    """Raise StoreError if a run has to be confirmed."""
-    if found := objections(pipeline, demand, free_disk(url)):
-        raise StoreError(
-            f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
-            "`--yes` (in Python, yes=True)"
-        )
+            return shutil.disk_usage(
+                next(each for each in (path, *path.parents) if each.exists())).free
+    return math.inf

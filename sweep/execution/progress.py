@@ -44,18 +44,15 @@ class Progress:
     conditions: int | None = None
 
     @property
-    def line(self) -> str:
-        """In words; how many poses a run in waves will need is not known."""
-        if self.conditions is None:
-            return f"{self.done:,} of {self.total:,} poses"
-        return f"{self.settled:,} of {self.conditions:,} conditions done, {self.needed:,} poses"
+    def shown(self) -> tuple[str, float, float]:
+        """Progress in words, how much is done, and of how much.
 
-    @property
-    def share(self) -> tuple[float, float]:
-        """How much is done, and of how much."""
+        How many poses a run in waves will need is not known.
+        """
         if self.conditions is None:
-            return self.done, self.total
-        return self.settled or 0, self.conditions
+            return f"{self.done:,} of {self.total:,} poses", self.done, self.total
+        line = f"{self.settled:,} of {self.conditions:,} conditions done, {self.needed:,} poses"
+        return line, self.settled or 0, self.conditions
 
 
 ProgressReport = Callable[[Progress], None]
@@ -95,7 +92,7 @@ def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
     ``ends``: with a line for the beginning and one for the end, however short the run is.
     """
     with _display(LINE_INTERVAL_S, ends=ends) as show:
-        yield lambda progress: show(progress.line, *progress.share)
+        yield lambda progress: show(*progress.shown)
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ from sweep.execution import TIME_LIMIT_S, forecast, status
 from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
 from sweep.execution.progress import Progress, ProgressReport
-from sweep.execution.waves import InWaves, condition_count
+from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -64,7 +64,6 @@ def execute(
     overwrite: bool = False,
     retry_failed: bool = False,
     yes: bool = False,
-    block_s: float | None = None,
     time_limit_s: float | None = None,
     progress: ProgressReport | None = None,
     child: Child | None = None,
@@ -94,9 +93,6 @@ def execute(
         Compute the blocks again in which cells failed or crashed, also of a finished store.
     yes
         Run also what would take more than a day, or more than is free on the disk.
-    block_s
-        Seconds of work in a block (default: about 2; more on large clusters and in long runs,
-        less if there is little to do).
     time_limit_s
         Block timeout in seconds; the search for a scene that never returns keeps within it
         (default: 600, or ten times a block's work if that is more).
@@ -123,8 +119,7 @@ def execute(
     if scheduler is not None and ":" not in str(scheduler) and scheduler != "local":
         raise ArgumentError(
             "scheduler", scheduler, "expected an address such as tcp://host:8786, or local")
-    for name, seconds in (("block_s", block_s), ("time_limit_s", time_limit_s)):
-        check_positive(name, seconds, "expected seconds above 0")
+    check_positive("time_limit_s", time_limit_s, "expected seconds above 0")
     reuse = reuse if isinstance(reuse, Sequence) and not isinstance(reuse, str) else [reuse]
     if retry_failed and reuse:
         raise ArgumentError(
@@ -166,10 +161,13 @@ def execute(
             executor = stack.enter_context(Children(
                 child, workers or default_workers(), at_once=large or workers is not None))
         cut = begun.blocks if begun is not None else forecast.blocks_of(
-            pipeline, timing.scene_s, executor.threads, block_s, time_limit_s)
-        if not (yes or sources):
-            forecast.check_affordable(url, pipeline, forecast.forecast_of(
-                pipeline, timing, cut, executor.threads, len(cut) - len(done)))
+            pipeline, timing.scene_s, executor.threads, time_limit_s)
+        expected = forecast.forecast_of(
+            url, pipeline, timing, cut, executor.threads, len(cut) - len(done))
+        if expected.objections and not (yes or sources):
+            raise StoreError(
+                f"{url}: the run {' and '.join(expected.objections)}; make it smaller, or confirm "
+                "it with `--yes` (in Python, yes=True)")
         if begun is None:
             if overwrite and exists(url):
                 lifecycle.remove_store(url)
@@ -251,7 +249,7 @@ def compute(
             progress(Progress(
                 totals.scenes, pipeline.size(Stage.scene),
                 int(totals.detection[DetectionStatus.detected]), *(() if waves is None else (
-                    totals.needed, int(waves.settled_share * conditions), conditions))))
+                    totals.needed, waves.settled, waves.conditions))))
 
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         lifecycle.check_same_rule(store)
@@ -267,11 +265,15 @@ def compute(
             blocks.drop_block(store, store.blocks[number])
         done -= missing.keys()
         waves = None if pipeline.stopping is None else InWaves(store)
-        conditions = condition_count(pipeline)
-        totals = status.Totals.of(blocks.receipts(store, done if waves is None else waves.current))
-        report()
+        totals, counted = status.Totals(), set[int]()
         left = ((number, None) for number in range(len(store.blocks)) if number not in done)
         for wave in waves or [left]:
+            # Later blocks than one that was computed again hold if its results are as before.
+            for number, receipt in blocks.receipts(
+                    store, (done if waves is None else waves.current) - counted):
+                totals.add(receipt)
+                counted.add(number)
+            report()
             tasks = (
                 (number, (url, store.run_id, store.blocks[number], sources, time_limit_s, decision))
                 for number, decision in wave)
@@ -286,6 +288,7 @@ def compute(
                         continue
                     if waves is not None:
                         waves.committed(number, result)
+                        counted.add(number)
                     computed.update({"blocks": 1, **result.computed})
                     totals.add(result)
                     report()
@@ -295,8 +298,6 @@ def compute(
             if failed:
                 raise RunError("\n  ".join([f"{store.url}: {len(failed)} blocks failed",
                                             *(each.reason for each in failed)]))
-        if waves is not None:
-            report()
         if not store.finished:  # by another process that wrote it, too
             status.close(store)
     return computed

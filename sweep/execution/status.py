@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -59,14 +58,6 @@ class Totals:
     processors: Counter[str] = field(default_factory=Counter)
     lost: dict[str, list[FailedCell]] = field(default_factory=lambda: {"crashed": [], "failed": []})
 
-    @staticmethod
-    def of(receipts: Iterable[tuple[int, Receipt]]) -> Totals:
-        """Return the totals of the receipts of blocks."""
-        totals = Totals()
-        for _, receipt in receipts:
-            totals.add(receipt)
-        return totals
-
     def add(self, receipt: Receipt) -> None:
         """Add the receipt of another block."""
         self.scenes += receipt.scenes
@@ -89,10 +80,14 @@ class Totals:
         """
         counts = store.run_metadata["counts"]
         totals = Totals(
+            needed=counts.get("sampled", {}).get("needed", 0),
             detection=np.array(counts["detection"]), estimate=np.array(counts["estimate"]),
             processors=Counter(counts["processors"]))
-        if any(lost_counts(totals.detection, totals.estimate).values()):
-            totals.lost = Totals.of(blocks.receipts(store, blocks.committed(store))).lost
+        if any(lost_counts(totals).values()):
+            listing = Totals()
+            for _, receipt in blocks.receipts(store, blocks.committed(store)):
+                listing.add(receipt)
+            totals.lost = listing.lost
         return totals
 
     @property
@@ -101,16 +96,20 @@ class Totals:
         return self.lost["failed"] + self.lost["crashed"]
 
 
-def lost_counts(detection: Iterable[int], estimate: Iterable[int]) -> dict[str, int]:
-    """Return how many cells crashed and failed, from counts by flag."""
-    both = _by_name(DetectionStatus, detection) + _by_name(EstimateStatus, estimate)
-    return {kind: both[kind] for kind in ("crashed", "failed")}
+def flag_counts(counted: Totals | Receipt) -> tuple[Counter[str], Counter[str]]:
+    """Return the counts of the flags that occur, by name: of detections, and of estimates."""
+    detection, estimate = (
+        Counter({flag.name: int(count) for flag, count in zip(flags, counts, strict=False)
+                 if count})
+        for flags, counts in (
+            (DetectionStatus, counted.detection), (EstimateStatus, counted.estimate)))
+    return detection, estimate
 
 
-def _by_name(flags: Iterable[Flag], counts: Iterable[int]) -> Counter[str]:
-    """Return the counts of the flags that occur, by name."""
-    return Counter({
-        flag.name: int(count) for flag, count in zip(flags, counts, strict=False) if count})
+def lost_counts(counted: Totals | Receipt) -> dict[str, int]:
+    """Return how many cells crashed and failed."""
+    detection, estimate = flag_counts(counted)
+    return {kind: detection[kind] + estimate[kind] for kind in ("crashed", "failed")}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -171,50 +170,47 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
     first
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
-    groups, repro = failure_groups(totals.cells), f"sweep repro {quoted(url)}"
-    shares, warnings, advice = list[float](), list[str](), ""
-    counts = {"detections": _by_name(DetectionStatus, totals.detection),
-              "estimates": _by_name(EstimateStatus, totals.estimate)}
-    for cells, flags in counts.items():
-        kinds = [kind for kind in ("failed", "crashed") if flags[kind]]
-        lost = sum(flags[kind] for kind in kinds)
+    groups, advice = failure_groups(totals.cells), ""
+    counts = flag_counts(totals)
+    shares, warnings = [0.0], list[str]()
+    for cells, flags in zip(("detections", "estimates"), counts, strict=True):
+        lost = {kind: flags[kind] for kind in ("failed", "crashed") if flags[kind]}
         tried = flags.total() - sum(flags[name] for name in NOT_TRIED)
-        share = lost / tried if lost else 0.0
+        share = sum(lost.values()) / max(tried, 1)
         shares.append(share)
         if share == 1.0:
-            warnings.append(f"nothing computed: all {lost:,} {cells} {' or '.join(kinds)}")
+            warnings.append(f"nothing computed: all {tried:,} {cells} {' or '.join(lost)}")
         elif lost:
-            listed = " and ".join(f"{flags[kind]:,} {kind}" for kind in kinds)
-            percent = f"{100 * share:.{2 if share < 0.995 else 4}g} %"
+            listed = " and ".join(f"{count:,} {kind}" for kind, count in lost.items())
             warnings.append(f"{'warning: ' if share > LOUD_SHARE else ''}{listed} of "
-                            f"{tried:,} {cells} ({percent})")
+                            f"{tried:,} {cells} ({100 * share:.4g} %)")
+    shown, others = groups[:MAX_GROUPS], groups[MAX_GROUPS:]
     warnings += [f"  {group['count']:,} x {group['kind']} in {group['stage']}: {group['reason']}"
-                 for group in groups[:MAX_GROUPS]]
-    if others := groups[MAX_GROUPS:]:
+                 for group in shown]
+    if others:
         rest = sum(group["count"] for group in others)
         warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
-    if groups:
-        chosen = [f"--at {quoted(group['at'])}" for group in groups[:MAX_GROUPS] if group["at"]]
-        advice = " ".join([repro, *chosen])
-    if 1.0 not in shares and (nothing := _nothing_found(*counts.values())):
-        warnings.append(nothing)
-        advice = advice or f"{repro}{f' --at {quoted(first)}' if first else ''} -o scene.png"
-    warnings += differing_processors(totals.processors, "blocks")
+    nothing = "" if 1.0 in shares else _nothing_found(*counts)
+    if groups or nothing:
+        places = [group["at"] for group in shown] if groups else [first]
+        words = [word for at in places if at for word in ("--at", at)]
+        advice = quoted("sweep", "repro", url, *words, *([] if groups else ["-o", "scene.png"]))
+    warnings += [*([nothing] if nothing else []),
+                 *differing_processors(totals.processors, "blocks")]
     return {"nothing_computed": 1.0 in shares, "failed_share": round(max(shares), 6),
             "failures": groups, "warnings": warnings, "advice": advice}
 
 
-def _nothing_found(detection: Counter[str], estimate: Counter[str]) -> str:
+def _nothing_found(*counts: Counter[str]) -> str:
     """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
-    flags: type[Flag] = DetectionStatus
-    counts, what = detection, "nothing was detected"
-    if detection["detected"]:
-        flags, counts, what = EstimateStatus, estimate, "no pose was estimated"
-    needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
-    if not needed or any(flags[name].present for name in needed):
-        return ""
-    ((name, count),) = needed.most_common(1)
-    return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
+    stages: tuple[tuple[type[Flag], str], ...] = (
+        (DetectionStatus, "nothing was detected"), (EstimateStatus, "no pose was estimated"))
+    for (flags, what), counted in zip(stages, counts, strict=True):
+        needed = Counter({name: count for name, count in counted.items() if name != "not_needed"})
+        if needed and not any(flags[name].present for name in needed):
+            ((name, count),) = needed.most_common(1)
+            return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
+    return ""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -242,10 +238,7 @@ def close(store: RunStore) -> None:
         "processors": dict(totals.processors),
     }
     if (rule := store.pipeline.stopping) is not None:
-        counts["sampled"] = {
-            "needed": totals.needed, "conditions": condition_count(store.pipeline),
-            "unsettled": unsettled_count(store, rule),
-        }
+        counts["sampled"] = {"needed": totals.needed, "unsettled": unsettled_count(store, rule)}
     write_groups(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
 
 
@@ -259,8 +252,7 @@ def _failure_table(totals: Totals) -> xr.Dataset:
         attrs={
             "long_name": "scenes that raised or ended their process",
             "rows_kept": f"at most {MAX_ROWS} of each kind, and {blocks.MAX_PER_BLOCK} of a block",
-            **{f"{kind}_cells": count
-               for kind, count in lost_counts(totals.detection, totals.estimate).items()},
+            **{f"{kind}_cells": count for kind, count in lost_counts(totals).items()},
         },
     )
 
@@ -277,11 +269,9 @@ def _cost(store: RunStore, costs: Mapping[int, Mapping[str, Sequence[float]]]) -
         ).reshape(len(costs), *map(len, axes)))
         for stage, axes in (("scene", ()), ("detection", settings), ("estimation", both))
     }
-    coordinates: dict[str, Any] = {"block": list(costs)}
-    for axis in both:
-        values = axis.coordinates()
-        coordinates[axis.name] = values.astype(object) if values.dtype.kind == "T" else values
-    return xr.Dataset(seconds, coordinates,
+    # Lists: xarray supports NumPy's strings of variable length in parts.
+    coordinates = {axis.name: axis.coordinates().tolist() for axis in both}
+    return xr.Dataset(seconds, {"block": list(costs), **coordinates},
                       {"long_name": "seconds per stage and treatment for each block"})
 
 
@@ -301,15 +291,15 @@ def failed_blocks(store: RunStore, numbers: Iterable[int] | None = None) -> dict
     chosen = blocks.committed(store) if numbers is None else numbers
     return {
         number: count for number, receipt in blocks.receipts(store, chosen)
-        if (count := sum(lost_counts(receipt.detection, receipt.estimate).values()))
+        if (count := sum(lost_counts(receipt).values()))
     }
 
 
 # --------------------------------------------------------------------------------------------------
 # The totals of a store in one record: the summary of a run, and the status of a store.
 
-def account_of(store: RunStore, totals: Totals, needed: int = 0) -> dict[str, Any]:
-    """Return what a summary and a status have in common; ``needed`` is of a run in waves.
+def account_of(store: RunStore, totals: Totals) -> dict[str, Any]:
+    """Return what a summary and a status have in common.
 
     Returns
     -------
@@ -331,7 +321,7 @@ def account_of(store: RunStore, totals: Totals, needed: int = 0) -> dict[str, An
     return {
         "store": store.url, "poses": pipeline.size(Stage.scene), "blocks": len(store.blocks),
         "looked_for": looked_for(totals.detection.tolist()),
-        "needed": needed if in_waves else None,
+        "needed": totals.needed if in_waves else None,
         "conditions": condition_count(pipeline) if in_waves else None, **outcome,
     }
 
@@ -367,9 +357,8 @@ def summary_of(
         If blocks, chunks of them, or receipts that tell of failures are missing.
     """
     totals, rule = Totals.of_finished(store), store.pipeline.stopping
-    sampled = store.run_metadata["counts"].get("sampled", {})
-    account = account_of(store, totals, sampled.get("needed", 0))
-    unsettled = sampled.get("unsettled")
+    account = account_of(store, totals)
+    unsettled = store.run_metadata["counts"].get("sampled", {}).get("unsettled")
     # A search says itself what it does not know.
     if unsettled and rule is not None and rule.precision:
         account["warnings"].append(
@@ -378,10 +367,10 @@ def summary_of(
     tried = sum(retried.values())
     return SimpleNamespace(
         **account,
-        **lost_counts(totals.detection, totals.estimate),
+        **lost_counts(totals),
         **{f"computed_{what}": computed.get(what, 0) for what in ("blocks", "scenes", "estimates")},
         data=store.data_url,
-        results=math.prod(len(axis) for axis in store.pipeline.axes),
+        results=store.pipeline.size(*Stage),
         detected=int(totals.detection[DetectionStatus.detected]),
         seconds=round(seconds, 3),
         retried=tried,
@@ -421,13 +410,14 @@ def status(url: str) -> SimpleNamespace:
     for _, receipt in blocks.receipts(store, blocks.check_whole(store)):
         totals.add(receipt)
         written.append((receipt.written, receipt.wall_s, receipt.scenes_needed))
-    account, settled = account_of(store, totals, totals.needed), None
+    account, settled = account_of(store, totals), None
     if sampled := store.finished and store.run_metadata["counts"].get("sampled"):
         settled = account["conditions"] - sampled["unsettled"]
     elif account["conditions"] is not None:
-        settled = int(InWaves(store).settled_share * account["conditions"])
+        settled = InWaves(store).settled
     writing = not store.finished and is_written(store.storage)
     rate, left = poses_per_second(written), account["poses"] - totals.scenes
+    detection, estimate = map(dict, flag_counts(totals))
     return SimpleNamespace(
         **account,
         **totals.lost,
@@ -436,8 +426,8 @@ def status(url: str) -> SimpleNamespace:
         being_written=writing,
         blocks_done=len(written),
         poses_done=totals.scenes,
-        detection=dict(_by_name(DetectionStatus, totals.detection)),
-        estimate=dict(_by_name(EstimateStatus, totals.estimate)),
+        detection=detection,
+        estimate=estimate,
         poses_per_s=rate,
         seconds_left=left / rate if rate and writing and settled is None else None,
         settled=settled,

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.experiment.grid import TRIAL
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import StoppingRule, digest_of
 from sweep.sampling.rules import Decider, Decision, Waves, make_rule
@@ -52,20 +51,23 @@ class InWaves:
         self._settled_shares = np.zeros(len(self._waves.groups))
         #: Numbers of the blocks that are committed on the basis that they have now.
         self.current: set[int] = set()
+        #: Conditions of the grid.
+        self.conditions = condition_count(store.pipeline)
         for number, receipt in receipts(store, committed(store)):
             self.committed(number, receipt)
         self._next = self._next_wave()
 
     @property
-    def settled_share(self) -> float:
-        """The share of the conditions that need no more trials, or have them all."""
-        return float(self._settled_shares.mean())
+    def settled(self) -> int:
+        """How many of the conditions need no more trials, or have them all."""
+        return int(self._settled_shares.mean() * self.conditions)
 
     def __iter__(self) -> Iterator[list[Work]]:
-        """Yield what each wave has to compute; go on when that is committed."""
+        """Yield what each wave has to compute; go on when that is committed. The last is empty."""
+        yield self._next
         while self._next:
-            yield self._next
             self._next = self._next_wave()
+            yield self._next
 
     def committed(self, number: int, receipt: Receipt) -> None:
         """Note a committed block."""
@@ -83,25 +85,27 @@ class InWaves:
         nothing was needed in a wave, all that is left is one wave.
         """
         last, settled = len(self._waves.ends) - 1, False
-        bases: tuple[int, ...] = ()  # for each wave from 1 on what it follows from
+        # The digests that each wave from 1 on follows from; the next one grows from ``digest``.
+        bases: tuple[int, ...] = ()
         digest = zlib.crc32(digest_of(self._rule).encode())
         for wave in itertools.count():
-            numbers = [*self._waves.numbers(group, wave, last if settled else wave)]
-            basis = bases[-1] if bases else None
             decision = Decision(self._rule, wave, bases, settled) if bases else None
-            pending = [number for number in numbers
-                       if number not in self._known or self._known[number].basis != basis]
-            self.current.update(set(numbers).difference(pending))
-            if pending:
-                yield from ((number, decision) for number in pending)
+            basis = None if decision is None else decision.basis
+            numbers = self._waves.numbers(group, wave, last if settled else wave)
+            found = {number: self._known[number] for number in numbers
+                     if number in self._known and self._known[number].basis == basis}
+            self.current.update(found)
+            if len(found) < len(numbers):
+                yield from ((number, decision) for number in numbers if number not in found)
                 return
-            found = [self._known[number] for number in numbers]
-            needed, scenes = sum(each.needed for each in found), sum(each.scenes for each in found)
+            needed = sum(each.needed for each in found.values())
             ends = settled or wave == last
-            self._settled_shares[group] = 1.0 if ends else 1.0 - needed / scenes
+            self._settled_shares[group] = 1.0 if ends else 1.0 - needed / sum(
+                each.scenes for each in found.values())
             if ends:
                 return
-            digest = zlib.crc32(json.dumps([digest, *(each.content for each in found)]).encode())
+            contents = [found[number].content for number in numbers]
+            digest = zlib.crc32(json.dumps([digest, *contents]).encode())
             bases = (*bases, digest)
             settled = wave > 0 and needed == 0
 
@@ -110,22 +114,16 @@ class InWaves:
 # Conditions of a run in waves, and those that are not settled at its end.
 
 def condition_count(pipeline: Pipeline) -> int:
-    """Return the number of conditions."""
-    return math.prod(len(axis) for axis, kept in zip(
-        pipeline.experiment.scene_axes, _conditions(pipeline), strict=True) if kept)
+    """Return the number of conditions of a run in waves."""
+    assert pipeline.stopping is not None  # noqa: S101  (a section says so)
+    return math.prod(len(pipeline.axis(name) or ()) for name in pipeline.stopping.per)
 
 
 def unsettled_count(store: RunStore, rule: StoppingRule) -> int:
     """Return how many conditions of a complete store would need more than ``max_trials``."""
     decider = Decider.of(store, rule)
     decision = Decision(rule, len(rule.ends), tuple(range(len(rule.ends))))
-    pooled = tuple(k for k, kept in enumerate(_conditions(store.pipeline)) if not kept)
+    pooled = tuple(k for k, axis in enumerate(store.pipeline.experiment.scene_axes)
+                   if axis.name not in rule.per)
     return sum(int(decider.of_group(group, decision).any(axis=pooled).sum())
                for group in range(len(decider.waves.groups)))
-
-
-def _conditions(pipeline: Pipeline) -> list[bool]:
-    """Return which of the scene axes make conditions; cells along the others are pooled."""
-    per = getattr(pipeline.stopping, "per", None)
-    return [axis.name != TRIAL and (per is None or axis.name in per)
-            for axis in pipeline.experiment.scene_axes]

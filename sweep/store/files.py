@@ -149,14 +149,11 @@ def write_document(storage: Store, key: str, content: Mapping[str, Any]) -> None
 def write_whole(path: Path, content: bytes) -> None:
     """Write a new file beside a path, which takes the path's name once everything is written.
 
-    Its own name cannot be foreseen, and it is refused if it exists: nothing is written through a
-    link that waits there. A link at the path is replaced; a file there passes on its permissions.
+    A link at the path is replaced; a file there passes on its permissions.
     """
     temporary = path.with_name(f".sweep-{uuid.uuid4().hex}")
-    file = temporary.open("xb")
     try:
-        with file:
-            file.write(content)
+        temporary.write_bytes(content)
         if path.is_file() and not path.is_symlink():
             temporary.chmod(stat.S_IMODE(path.stat().st_mode))
         temporary.replace(path)

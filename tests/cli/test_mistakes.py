@@ -10,7 +10,6 @@ from support.reports import command
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import SweepError
-from sweep.execution.forecast import FreeDisk
 from sweep.execution.status import close
 from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
@@ -128,8 +127,7 @@ def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.toml").write_text(TEXT)
-    monkeypatch.setattr(
-        "sweep.execution.forecast.free_disk", lambda _url: FreeDisk(100))
+    monkeypatch.setattr("sweep.execution.forecast.free_bytes", lambda _url: 100)
     code, out, err = command(*shlex.split("run small.toml"))
     assert (code, out) == (2, "")
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "

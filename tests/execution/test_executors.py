@@ -60,12 +60,15 @@ def settings_of_the_caller():
 
 
 @pytest.mark.system
-def test_local_cluster_computes_the_same_bits_and_leaves_nothing(undisturbed, tmp_path):
+def test_local_cluster_computes_the_same_bits_and_leaves_nothing(
+    undisturbed, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("sweep.execution.forecast.block_work_s", lambda *_: 0.01)
     settings = settings_of_the_caller()
     me, threads = psutil.Process(), set(threading.enumerate())
     before = me.children(recursive=True)
     url = str(tmp_path / "local.zarr")
-    summary = execute(PIPELINE, url, workers=2, scheduler="local", block_s=0.01)
+    summary = execute(PIPELINE, url, workers=2, scheduler="local")
     assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
     assert same(url, undisturbed)
     assert settings_of_the_caller() == settings

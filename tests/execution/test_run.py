@@ -49,9 +49,10 @@ def undisturbed(pipeline, tmp_path_factory):
 
 
 @pytest.mark.system
-def test_number_of_workers_changes_no_bit(pipeline, undisturbed, tmp_path):
+def test_number_of_workers_changes_no_bit(pipeline, undisturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr("sweep.execution.forecast.block_work_s", lambda *_: 0.02)
     url = str(tmp_path / "run.zarr")
-    summary = execute(pipeline, url, workers=2, block_s=0.02)
+    summary = execute(pipeline, url, workers=2)
     assert same(url, undisturbed)
     assert summary.poses == summary.computed_scenes == 48
     assert summary.results == summary.computed_estimates == 192

@@ -53,6 +53,11 @@ def test_tightened_twice_and_interrupted_is_as_asked_for_at_once(at_once, tmp_pa
     assert needed[0] == 150 < needed[-1] < 450
     assert same(url, at_once)
     assert in_waves(store) == 0
+    drop_block(store, store.blocks[0])  # later ones hold, since its results are as before
+    seen = []
+    with calls_here():
+        execute(pipeline, url, progress=seen.append)
+    assert (seen[-1].needed, seen[-1].settled, seen[-1].done) == (needed[-1], 3, 450)
 
 
 @pytest.mark.long

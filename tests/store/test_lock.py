@@ -14,7 +14,7 @@ from sweep.execution.runner import compute, execute
 from sweep.execution.status import status
 from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
-from sweep.store.files import files_in, write_files, write_whole
+from sweep.store.files import files_in, write_files
 from sweep.store.lifecycle import create_store, open_store, remove_store, reopen
 from sweep.store.lock import changing, is_written, writing
 
@@ -104,13 +104,3 @@ def test_where_folders_cannot_be_locked_a_line_says_so(store, monkeypatch, capsy
     with changing(store.url, store.storage):
         assert not is_written(store.storage)
     assert capsys.readouterr().err.endswith("no locks: keep others from deleting the store\n")
-
-
-def test_nothing_is_written_through_links_that_wait(tmp_path):
-    outside = tmp_path / "mine.txt"
-    outside.write_text("mine")
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    (folder / "result").symlink_to(outside)
-    write_whole(folder / "result", b"ours")
-    assert outside.read_text() == "mine"

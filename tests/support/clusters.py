@@ -24,13 +24,14 @@ def local_cluster(workers=1, **options):
 
 CLIENT = """
 import sys
+from sweep.execution import forecast
 from sweep.execution.runner import execute
 from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
     pipeline, store, scheduler, block_s = sys.argv[1:]
-    execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
-            block_s=float(block_s))
+    forecast.block_work_s = lambda *_: float(block_s)
+    execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None)
 """
 """As `sweep run`, its blocks small."""
 

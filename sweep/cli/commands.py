@@ -887,7 +887,7 @@ def compare(
     workers, overwrite
         As for `run`.
     output : -o --output FIGURE
-        Draw the distributions of the errors into this PNG or SVG file.
+        Draw rates and errors of both into this PNG or SVG file.
     """
     SESSION.stopped = CONTINUES
     return sweep.compare(

@@ -51,9 +51,8 @@ def check_error_model_file(path: str) -> None:
     """
     if Path(path).suffix.lower() != ".json":
         raise ArgumentError(
-            "error_model", path, "expected a file that ends in .json: the model is its formula and "
-            "coefficients, for any language; sweep/analysis/README.md has a reader of 20 lines in "
-            "Python, and sweep.analysis.model_covariance gives covariances for ROS")
+            "error_model", path, "expected a file that ends in .json; pipelines/pose_errors.py "
+            "reads it, and sweep.analysis.model_covariance gives covariances for ROS")
 
 
 def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -176,8 +175,7 @@ def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
     for path in paths:
         write_output_file(Path(path), f"{to_json(content, indent=1)}\n".encode())
     return Findings(
-        [error_model_table(models),
-         *(f"- {line}" for line in (*exponent_lines(models), *warnings_of(models)))],
+        [error_model_table(models), *(f"- {line}" for line in warnings_of(models))],
         content, models, 0,
         (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
 
@@ -223,17 +221,3 @@ def error_model_table(models: xr.Dataset) -> Table:
 def _use(flags: Integers) -> str:
     """Return the flags of the six errors in words."""
     return ", ".join(Use(int(flag)).name.replace("_", " ") for flag in np.unique(flags))
-
-
-def exponent_lines(models: xr.Dataset) -> list[str]:
-    """Return, for each configuration, with which power of the distance sigma of z goes, if any."""
-    along = "distance_m" if models.sizes["distance_m"] > 1 else "side_px"
-    lines = []
-    for _, name, model in models_apart(models):
-        z = model.sel(quantity="z")
-        if models.sizes[along] > 1 and (
-                z["knots"].sel(predictor=["distance_m", "side_px"]) <= 2).all():
-            first, last = (np.log(z["sigma"].isel({along: k}).values).mean() for k in (0, -1))
-            power = (last - first) / np.log(models[along].values[-1] / models[along].values[0])
-            lines.append(f"{name}: sigma of z goes with {along} to the power {power:.1f}")
-    return lines

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,6 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import LogLocator, NullLocator
@@ -76,22 +76,6 @@ REFERENCE: dict[str, Any] = {
 
 # --------------------------------------------------------------------------------------------------
 # A figure, and the panels that its table gives.
-
-
-#: The texts of figures, each a macro.
-CAPTIONS = Environment(
-    loader=PackageLoader("sweep.report"), autoescape=False, undefined=StrictUndefined,  # noqa: S701
-).get_template("captions.jinja").module
-
-
-def caption_of(name: str, **values: object) -> str:
-    """Return the text of a figure, on one line; pages escape it."""
-    return " ".join(str(getattr(CAPTIONS, name)(**values)).split())
-
-
-def sentences(*parts: str) -> str:
-    """Return the parts that are not empty, joined by spaces."""
-    return " ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,6 +245,11 @@ class Panel:
         """Entries of the legend that stand side by side."""
         longest = max((len(line.label) for line in self.lines), default=0)
         return max(1, min(len(self.lines), LEGEND_CHARS // (longest + 6)))
+
+    @property
+    def svg(self) -> bytes:
+        """It as SVG; hundredths of a point are enough, but not of a number in a text."""
+        return re.sub(rb"(\.\d\d)\d+(?=[^<>]*>)", rb"\1", panels_file([self], ".svg"))
 
     @property
     def alt(self) -> str:

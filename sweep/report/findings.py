@@ -19,7 +19,6 @@ import xarray as xr
 
 from sweep.analysis import comparisons, dataset, simulation_gap
 from sweep.analysis import requirements as judged
-from sweep.analysis.estimator import Bins
 from sweep.analysis.requirements import CONFIDENCE, Cause, Decision, Reach, Verdict, described
 from sweep.errors import ArgumentError, check_positive, path_of, texts_of
 from sweep.execution.progress import progress_display, stage_display
@@ -29,10 +28,20 @@ from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, notice, quoted
 from sweep.plugins.recording import is_recording
 from sweep.report import table as tables
-from sweep.report.figure import Figure, caption_of, sentences, write_figure
+from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
 from sweep.report.report_data import read_report_data, trade_lines
-from sweep.report.table import Column, Findings, Table, Value, coordinate, number, table_of
+from sweep.report.table import (
+    Column,
+    Findings,
+    Table,
+    Value,
+    caption_of,
+    coordinate,
+    number,
+    sentences,
+    table_of,
+)
 from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
 from sweep.tradeoff.measurement import measure_trade
 from sweep.tradeoff.pareto import CRITERIA, mark_front
@@ -491,7 +500,7 @@ def compare(
             **{name: each.as_json()["rows"] for name, each in parts.items()}}, table, 0, then)
     gap = simulation_gap(one, other, bins).load()
     if figure is not None:
-        write_figure(gap_figures(one, other, bins), figure)
+        write_figure([gap_figure(gap)], figure)
     found = gap_table(gap)
     return Findings(
         [found, *gap_lines(gap)],
@@ -502,26 +511,20 @@ def compare(
 # --------------------------------------------------------------------------------------------------
 # Photographs beside their simulation.
 
-#: Names of the statistics in a table.
-STATISTICS = {
-    "detection_rate": "detected, %", "flip_rate": "flipped, % of solved",
-    "range_bias_percent": "range bias, %", "rotation_median_deg": "rotation error, median, \u00b0",
-    "rotation_p90_deg": "rotation error, 90 %, \u00b0",
-    "range_median_percent": "range error, median, %", "range_p90_percent": "range error, 90 %, %",
-}
-
 
 def gap_table(gap: xr.Dataset) -> Table:
     """Return a row for each statistic, configuration and bin of `sweep.analysis.simulation_gap`."""
     dims = [str(dim) for dim in gap["detection_rate_gap"].dims]
     groups = list(itertools.product(*(tables.group_cells(gap, dim) for dim in dims)))
-    rows = [
-        [STATISTICS[each.name], *group, *(
-            Value(_scale(each) * value) for value in one[each.name].values.tolist()),
-         "ratio" if each.ratio else "difference",
-         Column("", f"{each.name}_gap", 1.0 if each.ratio else _scale(each)).cells(one)[0]]
-        for each in comparisons.GAP_STATISTICS
-        for group, (_, one) in zip(groups, dataset.each_cell(gap, dims), strict=True)]
+    rows: list[list[Any]] = []
+    for each in comparisons.GAP_STATISTICS:
+        of_both = tables.column(each.name)
+        difference = Column("", f"{each.name}_gap", 1.0 if each.ratio else of_both.scale)
+        rows += [
+            [of_both.heading, *group, *(
+                Value(of_both.scale * value) for value in one[each.name].values.tolist()),
+             "ratio" if each.ratio else "difference", *difference.cells(one)]
+            for group, (_, one) in zip(groups, dataset.each_cell(gap, dims), strict=True)]
     return Table.of(
         "Photographs and simulation, with 95 % intervals of the gap: the difference, or the ratio",
         ["statistic", *dims, *comparisons.SOURCES, "compared by", "gap"], rows, stub=1 + len(dims))
@@ -543,51 +546,17 @@ def gap_lines(gap: xr.Dataset) -> list[str]:
     return lines
 
 
-def _scale(each: comparisons.ComparedRate | comparisons.SolvedQuantile) -> float:
-    return 100.0 if each in comparisons.GAP_RATES else 1.0
+def gap_figure(gap: xr.Dataset) -> Figure:
+    """Return the figure of `sweep.analysis.simulation_gap`: rates and errors of both sources.
 
-
-#: Configurations that are drawn, two panels each.
-MAX_CONFIGURATIONS = 6
-
-#: Percent of the solved poses at which the errors' distributions are drawn.
-PERCENT = np.arange(2.0, 99.0, 2.0)
-
-SHARE = Column("share of solved poses, %", "share", 100)
-
-
-def gap_figures(
-    photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
-) -> list[Figure]:
-    """Return the figures of photographs and a simulation, as `sweep.analysis.simulation_gap`.
-
-    For each configuration the distribution functions of the rotation error and of the depth error
-    of all solved poses; of a simulation that is compared in bins, those within the bins.
+    They are drawn along the bins, if there are any.
     """
-    matched = comparisons.matched_sides(photographs, simulated, bins)
-    sides = matched.poses()
-    values = ([f"{name} {coordinate(each)}" for each in matched.datasets[0][name].values.tolist()]
-              for name in matched.kept)
-    names = [", ".join(each) or "all markers" for each in itertools.product(*values)]
-    figures = []
-    for heading, errors_of in (
-        ("rotation error, deg", dataset.QUANTITIES[0].norm),
-        ("depth error, % of the true depth", lambda poses: poses.range_percent[..., 0]),
-    ):
-        rows: list[list[Any]] = []
-        for k, name in enumerate(names[:MAX_CONFIGURATIONS]):
-            for source, side in zip(comparisons.SOURCES, sides, strict=True):
-                errors = errors_of(side)[k][side.solved[k]]
-                errors = errors[np.isfinite(errors)]
-                if errors.size:
-                    rows += [[name, source, *point] for point in zip(
-                        np.percentile(errors, PERCENT).tolist(), PERCENT.tolist(), strict=True)]
-        figures.append(Figure(
-            heading.partition(" ")[0], heading, "", Table.of(
-                "Shares of the solved poses with at most this error",
-                ["configuration", "source", heading, SHARE.heading], rows, stub=2),
-            [SHARE], heading, "source"))
-    return figures
+    dims = [str(dim) for dim in gap["detection_rate"].dims if dim != "source"]
+    columns = [tables.column(each.name) for each in comparisons.GAP_STATISTICS]
+    binned = [tables.axis_label(gap, dim) for dim in dims if f"{dim}_low" in gap.coords]
+    title = "Photographs and simulation, with 95 % intervals"
+    return Figure("gap", title, "", table_of(gap, title, [*dims, "source"], columns), columns,
+                  binned[-1] if binned else "", "source")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -758,27 +727,18 @@ def measure_tradeoff(
         trade, 0, (f"sweep report {quoted(store)}", "with these costs and a figure of them"))
 
 
-def heading_of(name: str) -> str:
-    """Return a variable's name in words, its unit behind a comma: ``range RMSE, %``."""
-    words, _, unit = name.rpartition("_")
-    words = words.replace("_", " ").replace("rmse", "RMSE")
-    return f"{words}, {'%' if unit == 'percent' else unit}"
-
-
 def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[Column]]:
     """Return a trade with its front and covariances as columns, and the columns of its table.
 
     Columns without any value are left out, but for the cost and the criterion.
     """
-    first = Column(heading_of(criterion), criterion)
     errors = (f"{quantity}_{statistic}_{unit}" for quantity, unit in ERRORS.items()
               for statistic in ("bias", "rmse", "rmse_unflipped", "median", "p95", "p99"))
-    columns = [
-        FRONT, MS, Column("x baseline", "cost_ratio"), Column("detected, %", "detection_rate", 100),
-        Column("flips, %", "flip_rate", 100), first,
-        *(Column(heading_of(name), name) for name in errors if name != criterion),
-        *(Column(f"{quantity} efficiency", f"{quantity}_efficiency") for quantity in ERRORS),
-        Column("NEES", "nees_mean")]
+    names = dict.fromkeys((
+        "detection_rate", "flip_rate", criterion, *errors,
+        *(f"{quantity}_efficiency" for quantity in ERRORS)))
+    columns = [FRONT, MS, Column("x baseline", "cost_ratio"), *map(tables.column, names),
+               Column("NEES", "nees_mean")]
     marked = mark_front(trade, criterion)
     for level in marked["level"].values.tolist() if "covariance_coverage" in marked else ():
         name = f"covered_{level:g}"
@@ -788,7 +748,7 @@ def trade_columns(trade: xr.Dataset, criterion: str) -> tuple[xr.Dataset, list[C
         marked["trusted"] = marked["covariance_trusted"].astype(object).where(
             marked["nees_count"] > 0, None)
         columns.append(Column("covariance trusted", "trusted"))
-    return marked, [each for each in columns if each in (MS, first) or (
+    return marked, [each for each in columns if each.variable in (MS.variable, criterion) or (
         each.variable in marked and bool(marked[each.variable].notnull().any()))]
 
 
@@ -828,12 +788,12 @@ def trade_figure(
         The recommendation.
     """
     criterion = criterion or str(trade.attrs.get("criterion", CRITERION))
-    heading = heading_of(criterion)
+    shown = tables.column(criterion)
     return Figure(
         "trade", "Cost and accuracy", sentences(
-            caption_of("trade", heading=heading, poses=trade.attrs.get("poses", 0)),
+            caption_of("trade", heading=shown.heading, poses=trade.attrs.get("poses", 0)),
             *(f"{line}." for line in lines)),
-        tradeoff_table(trade, criterion), [Column(heading, criterion)], MS.heading, FRONT.heading,
+        tradeoff_table(trade, criterion), [shown], MS.heading, FRONT.heading,
         labels="configuration")
 
 

@@ -25,7 +25,7 @@ from sweep.experiment.experiment import distinct, used_settings, wrong_configura
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
-from sweep.report.table import Column, Table, Value, axis_label, number
+from sweep.report.table import Column, Table, Value, axis_label, column, number
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.tradeoff.pareto import WRONG, conditions_of, configuration_label
 from sweep.typing import Floats
@@ -388,9 +388,8 @@ def grouped(
     axes = {name: some for name, some in known.axes.items() if name in compared}
     combinations, table = _of_each(data, axes, analysis, groups)
     # In the order of the configurations, the best first.
-    ranks = {tuple(each[name] for name in axes): k
-             for k, each in reversed([*enumerate(known.combinations)])}
-    order = sorted(range(len(combinations)), key=lambda k: ranks[tuple(combinations[k].values())])
+    ranked = [{name: each[name] for name in axes} for each in known.combinations]
+    order = np.argsort([ranked.index(each) for each in combinations], kind="stable")
     return table.isel({CONFIGURATION: order})
 
 
@@ -412,12 +411,9 @@ MIN_FLIPPED = 10
 
 #: Numbers of each configuration, and of the named one in the report's cards.
 CARDS = (
-    Column("detected, %", "detection_rate", 100), Column("solved, %", "solved_rate", 100),
-    Column("rotation median, deg", "rotation_median_deg"),
-    Column("rotation RMSE, deg", "rotation_rmse_deg"),
-    Column("range RMSE, %", "range_rmse_percent"),
-    Column("range bias without flips, %", "range_bias_percent", level=0.0),
-    Column("flips, %", "flip_rate", 100))
+    *map(column, ("detection_rate", "solved_rate", "rotation_median_deg", "rotation_rmse_deg",
+                  "range_rmse_percent")),
+    Column("range bias without flips, %", "range_bias_percent", level=0.0), column("flip_rate"))
 
 #: Differences, of two equal configurations 0, where large is good; and ratios, of these 1.
 PAIRED = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
 import textwrap
@@ -49,11 +48,6 @@ MAX_SIDE = 900
 MAX_INCHES, MIN_DPI = 10, 100
 
 MAX_ENLARGEMENT = 24
-
-#: Of the marker's side, shown around it.
-MARGIN = 0.35
-
-MIN_CUT_PX = 4
 
 #: Characters of a caption's line, and entries of its legend side by side.
 CHARS_AN_INCH, MIN_CHARS, COLUMNS = 11, 60, 4
@@ -126,23 +120,6 @@ def _draw(axes: Axes, scene: SceneInspection) -> None:
         for (label, colour), end in zip(AXES.items(), scene.axes_px[1:], strict=True):
             axes.plot(*np.stack([scene.axes_px[0], end]).T, color=colour, linewidth=2, label=label)
     axes.set(xlim=extent[:2], ylim=extent[2:])
-
-
-def cut_to_marker(scene: SceneInspection) -> SceneInspection:
-    """Return a scene whose image is cut to the marker and its surroundings, where it is seen."""
-    corners = scene.true_corners
-    left, top, right, bottom = scene.window
-    if not np.isfinite(corners).all():
-        return scene
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = max(4.0, MARGIN * float((high - low).max()))
-    x0, y0 = np.maximum(np.floor(low - margin), (left, top)).astype(int)
-    x1, y1 = np.minimum(np.ceil(high + margin) + 1, (right, bottom)).astype(int)
-    if x1 - x0 < MIN_CUT_PX or y1 - y0 < MIN_CUT_PX:
-        return scene
-    image = scene.image[y0 - top : y1 - top, x0 - left : x1 - left]
-    return dataclasses.replace(
-        scene, image=np.ascontiguousarray(image), window=(int(x0), int(y0), int(x1), int(y1)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -281,7 +258,7 @@ def _scene(data: ReportData, index: Index, titles: Sequence[str]) -> Scene:
     try:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
-        picture = scene_png(cut_to_marker(inspected))  # the page has a caption of its own
+        picture = scene_png(inspected)  # the page has a caption of its own
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         return shown._replace(result=f"Cannot be drawn on this machine: {exception_line(error)}")
     # The store may be another machine's: as `sweep verify`, within the tolerances for those.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import base64
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from sweep.messages import plain, to_json
 
@@ -162,8 +163,8 @@ class Column(NamedTuple):
         """Whether it is a share."""
         return self.scale == 100
 
-    def cells(self, summary: xr.Dataset) -> list[Any]:
-        """Return the cells of all values of a dataset, in its order."""
+    def cells(self, summary: xr.Dataset | pd.DataFrame) -> list[Any]:
+        """Return the cells of all values of a dataset or a frame, in its order."""
         values = np.ravel(summary[self.variable]).tolist()
         if summary[self.variable].dtype.kind != "f":
             return values
@@ -171,6 +172,29 @@ class Column(NamedTuple):
                 for name in (f"{self.variable}_low", f"{self.variable}_high"))
         return [Value(*(self.scale * end for end in each))
                 for each in zip(values, *ends, strict=True)]
+
+
+#: Last word of a variable's name -> unit of its column, and factor to the unit.
+COLUMN_UNITS = {"rate": ("%", 100.0), "percent": ("%", 1.0), "deg": ("deg", 1.0), "m": ("mm", 1e3)}
+#: Word of a variable's name -> in a heading.
+HEADING_WORDS = {"detection": "detected", "flip": "flips", "rmse": "RMSE", "sd": "SD",
+                 "unflipped": "without flips"}
+#: Word of a variable's name -> where its figure has a dashed line.
+LEVELS = {"bias": 0.0, "efficiency": 1.0}
+
+
+def column(variable: str) -> Column:
+    """Return the column of a variable of an analysis, whose name tells its words and its unit.
+
+    >>> column("position_rmse_unflipped_m")[:3]
+    ('position RMSE without flips, mm', 'position_rmse_unflipped_m', 1000.0)
+    """
+    *words, last = variable.split("_")
+    unit, scale = COLUMN_UNITS.get(last, ("", 1.0))
+    words += [] if unit else [last]
+    heading = " ".join(HEADING_WORDS.get(word, word) for word in words)
+    level = next((LEVELS[word] for word in words if word in LEVELS), None)
+    return Column(f"{heading}, {unit}" if unit else heading, variable, scale, level)
 
 
 def cell_text(cell: Any) -> str:
@@ -188,9 +212,9 @@ def cell_text(cell: Any) -> str:
     return number(cell) if isinstance(cell, float) else str(cell)
 
 
-def group_cells(table: xr.Dataset, name: str) -> list[Any]:
-    """Return the groups along a dimension: words, numbers, or bins."""
-    if f"{name}_low" in table.coords:
+def group_cells(table: xr.Dataset | pd.DataFrame, name: str) -> list[Any]:
+    """Return the groups along a dimension, or in a column: words, numbers, or bins."""
+    if f"{name}_low" in table:
         return list(map(Bin, *(table[f"{name}_{end}"].to_numpy().tolist() for end in (
             "low", "high"))))
     values: list[Any] = table[name].to_numpy().tolist()
@@ -299,12 +323,6 @@ class Table:
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{markdown_text(self.full_caption)}\n\n{table}"
 
-    def html(self) -> str:
-        """Return it as an HTML table, for a notebook."""
-        table: str = pd.DataFrame(self.rows, columns=self.headings).to_html(
-            index=False, border=0, max_rows=MAX_ROWS)
-        return f"<p>{escape(self.full_caption)}</p>{table}"
-
     def as_json(self) -> dict[str, Any]:
         """Return its caption, and its rows by heading as numbers."""
         cells = self.frame.map(
@@ -348,7 +366,7 @@ class Findings:
         return self._printed(Table.markdown, markdown_text)
 
     def _repr_html_(self) -> str:
-        return self._printed(Table.html, lambda line: f"<p>{escape(line)}</p>")
+        return self._printed(PARTS.table, lambda line: f"<p>{escape(line)}</p>")
 
     def _printed(self, table: Callable[[Table], str], line: Callable[[str], str]) -> str:
         texts = [line(part) if isinstance(part, str) else f"{table(part)}\n"
@@ -394,14 +412,42 @@ def table_of(
     wanted = [each for each in wanted if each.variable in summary]
     names = dict.fromkeys(name for each in (*(each.variable for each in wanted), counted)
                           for end in ("", "_low", "_high") if (name := f"{each}{end}") in summary)
-    # Without coordinates, which would not be repeated.
-    (ordered,) = xr.broadcast(xr.Dataset({name: summary[name].variable for name in names}))
-    ordered = ordered.transpose(*dims)
-    cells = zip(*(each.cells(ordered) for each in wanted), strict=True)
-    groups = itertools.product(*(group_cells(summary, dim) for dim in dims))
-    used = np.ravel(ordered[counted]) > 0 if counted in ordered and dims else itertools.repeat(True)
+    # Without dimensions there is one row.
+    frame = summary[[*names]].expand_dims("row").to_dataframe(["row", *dims]).reset_index()
+    if counted in frame and dims:
+        frame = frame[frame[counted] > 0]
     units = sources if sources is not None else summary
-    return Table.of(
-        caption, [*(axis_label(units, dim) for dim in dims), *(each.heading for each in wanted)],
-        [[*group, *row] for group, row, shown in zip(groups, cells, used, strict=False) if shown],
-        stub=len(dims))
+    cells = {axis_label(units, dim): group_cells(frame, dim) for dim in dims}
+    cells |= {each.heading: each.cells(frame) for each in wanted}
+    return Table(caption, pd.DataFrame(cells, dtype=object), len(dims))
+
+
+# --------------------------------------------------------------------------------------------------
+# The templates of pages, their parts, and captions.
+
+
+def base64_text(content: bytes | str) -> str:
+    """Return bytes, or a text in UTF-8, in base64."""
+    return base64.b64encode(content.encode() if isinstance(content, str) else content).decode()
+
+
+TEMPLATES = Environment(
+    loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
+    undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+TEMPLATES.filters |= {"base64": base64_text, "md": markdown_text}
+
+#: HTML of a table, a figure, a scene, a card.
+PARTS: Any = TEMPLATES.get_template("parts.html").module
+
+#: The texts of figures, each a macro.
+CAPTIONS = TEMPLATES.get_template("captions.jinja").module
+
+
+def caption_of(name: str, **values: object) -> str:
+    """Return the text of a figure, on one line; pages escape it."""
+    return " ".join(str(getattr(CAPTIONS, name)(**values)).split())
+
+
+def sentences(*parts: str) -> str:
+    """Return the parts that are not empty, joined by spaces."""
+    return " ".join(part for part in parts if part)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import math
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
-from urllib.parse import quote
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from sweep import analysis
 from sweep.analysis import requirements as judged
@@ -29,53 +26,48 @@ from sweep.experiment.parameters import Stage
 from sweep.measure.flags import BoundStatus, Flag, outcomes, present_values
 from sweep.messages import byte_count, quoted
 from sweep.report import findings, output_file, report_data
-from sweep.report.error_model_file import check_error_model_file, model_findings
-from sweep.report.figure import (
-    MAX_DOTS,
-    MAX_LINES,
-    Figure,
-    Panel,
-    caption_of,
-    panels_file,
-    sentences,
-)
+from sweep.report.error_model_file import model_findings
+from sweep.report.figure import MAX_DOTS, MAX_LINES, Figure, panels_file
 from sweep.report.report_data import AREA, CARDS, CONFIGURATION, IDS, Groups, ReportData, grouped
 from sweep.report.scenes import LEGEND, Scene, scenes_of
-from sweep.report.table import Column, Findings, Table, markdown_text, number, plural, table_of
+from sweep.report.table import (
+    TEMPLATES,
+    Column,
+    Findings,
+    Table,
+    caption_of,
+    column,
+    number,
+    plural,
+    sentences,
+    table_of,
+)
 from sweep.store.files import write_whole
 
 # --------------------------------------------------------------------------------------------------
 # Columns that several figures share.
 
-DETECTED, SOLVED, ROTATION_MEDIAN, _, _, RANGE_BIAS, _ = CARDS
-LOOKED_FOR = Column("looked for", "looked_for")
+DETECTED, SOLVED, _, _, _, RANGE_BIAS, _ = CARDS
+LOOKED_FOR = column("looked_for")
 SOLVED_COUNT = Column("n solved", "solved")
 FLIPS = Column("flips, % of the solved", "flip_rate", 100)
-ROTATION_P95 = Column("rotation p95, deg", "rotation_p95_deg")
-RANGE_MEDIAN = Column("range median, %", "range_median_percent")
-RANGE_P95 = Column("range p95, %", "range_p95_percent")
 RATES = (LOOKED_FOR, DETECTED)
-ERROR_CURVES = (ROTATION_MEDIAN, ROTATION_P95, RANGE_MEDIAN, RANGE_P95)
+ERROR_CURVES = tuple(map(column, (
+    "rotation_median_deg", "rotation_p95_deg", "range_median_percent", "range_p95_percent")))
 ERRORS = (
-    SOLVED, ROTATION_MEDIAN, ROTATION_P95,
-    Column("rotation RMSE without flips, deg", "rotation_rmse_unflipped_deg"),
-    RANGE_MEDIAN, RANGE_P95, Column("range RMSE without flips, %", "range_rmse_unflipped_percent"),
-    RANGE_BIAS, Column("position median, mm", "position_median_m", 1000.0),
-    Column("position p95, mm", "position_p95_m", 1000.0), FLIPS)
-#: Kinds of errors, as `sweep.analysis.error_statistics` takes them.
-SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
+    SOLVED, *ERROR_CURVES[:2], column("rotation_rmse_unflipped_deg"), *ERROR_CURVES[2:],
+    column("range_rmse_unflipped_percent"), RANGE_BIAS, column("position_median_m"),
+    column("position_p95_m"), FLIPS)
 
 #: Bias and standard deviation along the camera's axes and about the angles.
 SIGNED_COLUMNS = (SOLVED_COUNT, RANGE_BIAS, *(
-    Column(f"{name} {words}, {unit}", f"{name}_{statistic}_{stored}", scale,
-           0.0 if words == "bias" else None)
-    for names, unit, stored, scale in (("xyz", "mm", "m", 1000.0),
-                                       (("yaw", "pitch", "roll"), "deg", "deg", 1.0))
-    for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))))
+    column(f"{name}_{statistic}_{unit}")
+    for names, unit in (("xyz", "m"), (("yaw", "pitch", "roll"), "deg"))
+    for name in names for statistic in ("bias", "sd")))
+#: Of these, kinds of errors as `sweep.analysis.error_statistics` takes them.
+SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
 
-EFFICIENCIES = tuple(
-    Column(f"{quantity} efficiency", f"{quantity}_efficiency", level=1.0)
-    for quantity in ("rotation", "range"))
+EFFICIENCIES = tuple(column(f"{quantity}_efficiency") for quantity in ("rotation", "range"))
 
 #: Angles that are lines of one configuration, and panels of several.
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
@@ -161,7 +153,7 @@ def _configurations(data: ReportData) -> Figure | None:
         data, known.summary, {}, "configurations",
         f"Configurations compared: {', '.join(known.axes)}",
         caption_of("configurations"), (LOOKED_FOR, *ERRORS),
-        (SOLVED, ROTATION_MEDIAN, RANGE_MEDIAN, FLIPS), covers=covers)
+        (SOLVED, *ERROR_CURVES[::2], FLIPS), covers=covers)
 
 
 def _trade(data: ReportData) -> Figure | None:
@@ -192,20 +184,19 @@ def _outcomes(data: ReportData) -> Figure:
         (LOOKED_FOR, share), [share], by="outcome")
 
 
-def marker_ranking(results: xr.Dataset, per: Sequence[str], **_: Bins) -> xr.Dataset:
-    """Return the ranking of marker IDs, which are kept apart anyway."""
-    return analysis.marker_ranking(results, [name for name in per if name != IDS])
-
-
 def _ranking(data: ReportData) -> Figure | None:
     """Return the detection rates of marker IDs, the weak ones first."""
     if data.results.sizes.get(IDS, 1) < 2:
         return None
+
+    def ranking(results: xr.Dataset, per: Sequence[str], **_: Bins) -> xr.Dataset:
+        # IDs are kept apart anyway.
+        return analysis.marker_ranking(results, [name for name in per if name != IDS])
+
     table = configuration_table(
-        data, grouped(data, marker_ranking, {IDS: None}, [Stage.detection]), [IDS],
-        "IDs by detection rate", (
-            *RATES, Column("expected, %", "expected_rate", 100),
-            Column("p, adjusted", "p_adjusted"), Column("weak", "weak")))
+        data, grouped(data, ranking, {IDS: None}, [Stage.detection]), [IDS],
+        "IDs by detection rate",
+        (*RATES, *map(column, ("expected_rate", "p_adjusted", "weak"))))
     rates, weak = (table.frame[name].tolist() for name in (DETECTED.heading, "weak"))
     order = sorted(range(len(weak)), key=lambda k: (not weak[k], rates[k]))
     return Figure(
@@ -276,7 +267,7 @@ def tables_of(data: ReportData) -> list[Table]:
     return [
         *([board_table(data)] if boards else []),
         configuration_table(
-            data, grouped(data, signed_error_statistics), (),
+            data, grouped(data, partial(analysis.error_statistics, quantities=SIGNED_GROUPS)), (),
             "Bias and spread of the solved poses without flips", SIGNED_COLUMNS, "solved"),
         *threshold_tables(data),
         *([precision_table(data)]
@@ -291,13 +282,6 @@ def board_table(data: ReportData) -> Table:
         analysis.detection_rate(analysis.per_marker(data.results), dims),
         "Markers of boards, each counted by itself, with 95 % intervals", dims, RATES,
         data.results)
-
-
-def signed_error_statistics(
-    results: xr.Dataset, per: Sequence[str], bins: Bins
-) -> xr.Dataset:
-    """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
-    return analysis.error_statistics(results, per, bins, SIGNED_GROUPS)
 
 
 def threshold_tables(data: ReportData) -> list[Table]:
@@ -324,8 +308,7 @@ def threshold_tables(data: ReportData) -> list[Table]:
 def precision_table(data: ReportData) -> Table:
     """Return a row for each quantity, configuration and condition of a wanted precision."""
     table = analysis.precision_reached(data.results)
-    columns = [Column(name.replace("_", " "), name) for name in (
-        "reached", "value", "half_width", "wanted", "run")]
+    columns = [*map(column, ("reached", "value", "half_width", "wanted", "run"))]
     dims = ["quantity", *(str(dim) for dim in table["reached"].dims if dim != "quantity")]
     return table_of(
         table.assign(reached=in_words(table["reached"], Reached)),
@@ -393,15 +376,15 @@ def answer(data: ReportData) -> Answer:
         If the store lacks what the requirements are of.
     """
     try:
-        decided = required(data) if data.require else None
+        line, compared, tables, details, numbers = required(data) if data.require else (
+            "", report_data.comparison(data), [], [], {})
     except DatasetError as error:
         raise StoreError(f"{data.store}: {error}") from None
-    compared = decided.compared if decided else report_data.comparison(data)
     known = compared.known
     one = known.summary.isel({CONFIGURATION: compared.best})
     tiles = [_tile(one, card) for card in CARDS]
     name = compared.name if known.several else ""
-    line = decided.line if decided else f"{compared.line}." if compared.line else _in_numbers(tiles)
+    line = line or (f"{compared.line}." if compared.line else _in_numbers(tiles))
     if not int(known.summary["looked_for"].sum()):
         line = (f"The {data.pipeline.target_word} was looked for in no pose: it was visible and "
                 "modelled in none.")
@@ -413,10 +396,8 @@ def answer(data: ReportData) -> Answer:
         caption_of("intervals", photographs=of_photographs(data.results)),
         report_data.notes_of(data, {}), data.pooled(*known.axes))
     return Answer(
-        line, notes, name, tiles,
-        [*(decided.tables if decided else ()), compared.table()],
-        [*(decided.details if decided else ()), *tables_of(data)],
-        {"comparison": compared.as_json(), **(decided.numbers if decided else {})})
+        line, notes, name, tiles, [*tables, compared.table()], [*details, *tables_of(data)],
+        {"comparison": compared.as_json(), **numbers})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -426,36 +407,20 @@ def answer(data: ReportData) -> Answer:
 ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
 
 
-class Required(NamedTuple):
-    """The decisions on all requirements.
-
-    Attributes
-    ----------
-    line
-        The answer in one line.
-    compared
-        The configuration that is named against each.
-    tables
-        How far, and the decisions, by configuration.
-    details
-        The decisions at each condition, of the configuration that is named.
-    numbers
-        For JSON: the decision on all together of the configuration that is named, verdicts as
-        `sweep require` and limits as `sweep limit` prints them.
-    """
-
-    line: str
-    compared: report_data.Comparison
-    tables: Sequence[Table]
-    details: Sequence[Table]
-    numbers: Mapping[str, Any]
-
-
-def required(data: ReportData) -> Required:
+def required(
+    data: ReportData,
+) -> tuple[str, report_data.Comparison, list[Table], list[Table], dict[str, Any]]:
     """Return the decisions on the requirements of a store.
 
     The configuration that is named meets all requirements, or else follows them farthest along the
     axis of the conditions; of equals it is the one that the comparison on the same images names.
+
+    Returns
+    -------
+    The answer in one line; the configuration that is named against each; tables of how far, and of
+    the decisions, by configuration; those at each condition, of the configuration that is named;
+    and for JSON the decision on all together of this configuration, verdicts as `sweep require` and
+    limits as `sweep limit` prints them.
 
     Raises
     ------
@@ -485,7 +450,7 @@ def required(data: ReportData) -> Required:
     if limits:
         line += f"; along {along}{_reached(rows[best], others)}"
     every = judged.verdicts(table)
-    return Required(
+    return (
         f"{line}{whose}.", compared,
         [*map(findings.limit_table, limits), findings.decision_table(every)],
         [findings.condition_table(found[best], table, every=True)],
@@ -605,8 +570,6 @@ def write_report(
     for name, value in (("output", output), ("figures", figures)):
         if value is not None and not path_of(name, value).strip():
             raise ArgumentError(name, repr(value), "expected a name")
-    for path in error_model:
-        check_error_model_file(path)
     file = Path(output or f"report.{form or 'html'}")
     form = form or FORMS.get(file.suffix.lower())
     if form not in FORMS.values():
@@ -711,33 +674,7 @@ def page(
 
     With ``folder``, the name of the folder of figures and scenes, it is Markdown.
     """
-    html = not folder
-    environment = Environment(
-        loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
-        undefined=StrictUndefined, trim_blocks=not html, lstrip_blocks=not html)
-    environment.filters |= {
-        "base64": _base64, "code": _code, "md": markdown_text, "quote": quote,
-        "sentence_case": str.capitalize, "svg": _svg,
-    }
-    text = environment.get_template("page.html" if html else "page.jinja").render(
-        title=title, answer=answer, provenance=provenance, figures=figures,
-        scenes=scenes, require=require, base=quote(folder),
-        legend=LEGEND)
+    text = TEMPLATES.get_template("page.jinja" if folder else "page.html").render(
+        title=title, answer=answer, provenance=provenance, figures=figures, scenes=scenes,
+        require=require, folder=folder, legend=LEGEND)
     return text.rstrip("\n") + "\n"
-
-
-def _base64(content: bytes | str) -> str:
-    return base64.b64encode(content.encode() if isinstance(content, str) else content).decode()
-
-
-def _svg(panel: Panel) -> bytes:
-    """Return a panel as SVG; hundredths of a point are enough, but not of a number in a text."""
-    return re.sub(rb"(\.\d\d)\d+(?=[^<>]*>)", rb"\1", panels_file([panel], ".svg"))
-
-
-def _code(text: str, language: str) -> str:
-    """Return text as a fenced block of Markdown."""
-    fence = "```"
-    while fence in text:
-        fence += "`"
-    return f"{fence}{language}\n{text.rstrip()}\n{fence}"

@@ -52,7 +52,7 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path):
     code, out, _ = command(
         "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
     (median,) = (each for each in json.loads(out)["rows"]
-                 if each["statistic"].startswith("rotation error, median")
+                 if each["statistic"].startswith("rotation median")
                  and each["cornerRefinementMethod"] == "subpix")
     # The photographs were rendered with this scene, but for the board around each marker.
     assert 0.5 < median["gap"]["value"] < 2

@@ -12,10 +12,9 @@ them.
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from sweep import experiment, library
 from sweep.errors import (
@@ -25,7 +24,6 @@ from sweep.errors import (
     RunError,
     StoreError,
     SweepError,
-    check_positive,
     path_of,
 )
 from sweep.isolation.child_process import Child
@@ -43,13 +41,14 @@ if TYPE_CHECKING:
     from sweep.diagnosis.diagnosis import diagnose
     from sweep.execution.on_cluster import Cluster
     from sweep.execution.progress import Progress
+    from sweep.execution.runner import RunOptions, limit
     from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.fit import fit
     from sweep.report.findings import measure_tradeoff, require
     from sweep.report.reference import reference
     from sweep.report.table import Findings
     from sweep.report.write_report import write_report
-    from sweep.tradeoff.choice_search import Choice
+    from sweep.tradeoff.choice_search import size
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
@@ -58,31 +57,15 @@ __all__ = [
     "run", "size", "twins", "write_report",
 ]
 
-class LocalOptions(TypedDict, total=False):
-    """Options of runs on this machine, as :func:`run` has them."""
-
-    workers: int | None
-    overwrite: bool
-
-
-class RunOptions(LocalOptions, total=False):
-    """Options of a run that are not its pipeline and store, as :func:`run` has them."""
-
-    client: Client | Cluster | None
-    scheduler: str | None
-    reuse: Sequence[str | os.PathLike[str]]
-    yes: bool
-
-
 experiment.quantity_faults = lambda texts, names: (  # noqa: PLW0108  (imported when it is used)
     library.requirements.quantity_faults(texts, names))
 
 #: Modules of the library by the public names that are imported from them.
 _IMPORTED_ON_USE = {
     "Pipeline": "pipeline", "Progress": "progress", "decode_flags": "dataset",
-    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit",
+    "diagnose": "diagnosis", "error_model": "detection", "fit": "fit", "limit": "runner",
     "measure_tradeoff": "findings", "reference": "reference", "require": "findings",
-    "write_report": "write_report",
+    "size": "choice_search", "write_report": "write_report",
 }
 
 
@@ -191,72 +174,6 @@ def run(
     return open(summary.store)
 
 
-def limit(
-    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
-    *,
-    require: Sequence[str] = (),
-    along: str = "",
-    per: Sequence[str] | None = None,
-    at_all: Sequence[str] | None = None,
-    max_trials: int | None = None,
-    store: str | os.PathLike[str] | None = None,
-    progress: bool | Callable[[Progress], None] | None = None,
-    **options: Unpack[RunOptions],
-) -> xr.Dataset:
-    """Find how far along an axis requirements are met, and return the limits.
-
-    Trials come in waves where they decide; the store of a search is continued, or answers.
-
-    Parameters
-    ----------
-    pipeline
-        As `run` takes it; a store of equally many trials everywhere is analysed as it is.
-    require
-        What must hold, such as "detection >= 0.9", all together (default: those of the
-        pipeline's section [require]).
-    along
-        The axis of the scene that is searched, such as ``distance_m``.
-    per
-        Axes of which each combination of values has its own limit (default: all others).
-    at_all
-        Axes at all of whose values the requirements must hold.
-    max_trials
-        The most trials of a cell (default: that of [search], else 2,400).
-    store
-        Path or URL of the store (default: ``runs/NAME-limit-AXIS.zarr``).
-    workers, client, scheduler, reuse, overwrite, yes, progress
-        As in `run`.
-
-    Returns
-    -------
-    xarray.Dataset
-        As `sweep.analysis.requirement_limits`; the store is in its attributes.
-
-    Raises
-    ------
-    PipelineError, ArgumentError, StoreError, RunError
-        As `run`.
-
-    Examples
-    --------
-    >>> limits = sweep.limit(
-    ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [5, 40]}},
-    ...     require=["detection >= 0.5"], along="side_px", max_trials=40,
-    ...     store=folder / "limit.zarr",
-    ... )
-    >>> limits["value"].item()
-    40.0
-    """
-    # The child imports its packages while this process does.
-    with Child() as child, library.progress.progress_report(progress) as report:
-        limits, summary = library.runner.search_limits(
-            pipeline, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
-            store=store, progress=report, child=child, **options)
-    for line in summary.warnings if summary is not None else ():
-        notice(line)
-    return limits
-
-
 def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray and zarr have it)
     """Open a store's results, lazily; also an unfinished run's.
 
@@ -293,7 +210,7 @@ def photos(
     settings: Sequence[str] = (),
     store: str | os.PathLike[str] | None = None,
     progress: bool | Callable[[Progress], None] | None = None,
-    **options: Unpack[LocalOptions],
+    **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Measure detectors and estimators on photographs of known markers.
 
@@ -314,7 +231,7 @@ def photos(
         "key=value" with TOML values, as ``--set`` takes them: ``'solver=["ippe", "sqpnp"]'``.
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the folder's name).
-    workers, overwrite, progress
+    workers, client, scheduler, reuse, overwrite, yes, progress
         As for :func:`run`.
 
     Returns
@@ -356,7 +273,7 @@ def twins(
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
     progress: bool | Callable[[Progress], None] | None = None,
-    **options: Unpack[LocalOptions],
+    **options: Unpack[RunOptions],
 ) -> xr.Dataset:
     """Simulate the markers of photographs at their poses.
 
@@ -371,7 +288,7 @@ def twins(
         number.
     store
         Path or URL of the twins' store (default: beside the photographs', with the scene's name).
-    workers, overwrite, progress
+    workers, client, scheduler, reuse, overwrite, yes, progress
         As for :func:`run`.
 
     Returns
@@ -401,57 +318,6 @@ def twins(
         store=store or library.prepare.twin_store(photographs, named), progress=progress, **options)
 
 
-def size(
-    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
-    *,
-    store: str | os.PathLike[str] | None = None,
-    limit_s: float = 20.0,
-    progress: bool | Callable[[Progress], None] | None = None,
-    **options: Unpack[RunOptions],
-) -> Choice:
-    """Search the smallest, or the cheapest, choice that meets requirements at all conditions.
-
-    Parameters
-    ----------
-    pipeline
-        As for :func:`run`, with the sections [require] and [search].
-    store, workers, client, scheduler, reuse, overwrite, yes, progress
-        As for :func:`run`.
-    limit_s
-        Seconds of the measurement of costs, where there are alternatives or a budget.
-
-    Returns
-    -------
-    Choice
-        The answer of each alternative (``answers``), the number of the chosen one (``best``, None
-        if none meets everything), costs, the front, and the poses that it took.
-
-    Raises
-    ------
-    ArgumentError, PipelineError, StoreError, RunError
-        As for :func:`run`; a choice that cannot be made is told in a line for each fault.
-
-    Examples
-    --------
-    >>> found = sweep.size({
-    ...     "pose": {"jitter_px": 0.5}, "axes": {"side_px": [4, 40]},
-    ...     "require": {"all": ["detection >= 0.5"]},
-    ...     "search": {"smallest": "side_px", "max_trials": 60},
-    ... }, store=folder / "smallest.zarr")
-    >>> found.answers[found.best].value, found.answers[found.best].next
-    (40.0, 4.0)
-    """
-    check_positive("limit_s", limit_s, "expected a finite number above 0")
-    with (Child() as child, library.progress.progress_report(progress) as report,
-          library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
-        found = library.choice_search.search_choice(
-            library.lifecycle.read_pipeline(pipeline), library.lifecycle.store_of(pipeline, store),
-            limit_s=limit_s, progress=report, stage=stage, child=child, **options)
-    for line in found.notes:
-        notice(line)
-    return found
-
-
 def compare(
     first: str | os.PathLike[str],
     second: str | os.PathLike[str],
@@ -461,7 +327,7 @@ def compare(
     repeats: int = 1,
     store: str | os.PathLike[str] | None = None,
     progress: bool | Callable[[Progress], None] | None = None,
-    **options: Unpack[LocalOptions],
+    **options: Unpack[RunOptions],
 ) -> Findings:
     """Compare photographs with a simulation, or two stores of one pipeline.
 
@@ -477,7 +343,7 @@ def compare(
         Variable of the scene -> edges of bins in which photographs and simulation are compared.
     output
         PNG or SVG file of the distributions of the errors.
-    repeats, store, workers, overwrite, progress
+    repeats, store, workers, client, scheduler, reuse, overwrite, yes, progress
         As for :func:`twins`.
 
     Returns

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from sweep import compilation
-from sweep.cli.command import announce_compilation
 from sweep.errors import MachineFaultError
+from sweep.execution.runner import announce_compilation
 from sweep.experiment.pipeline import Pipeline
 
 TOP = Path(compilation.__file__).parent.parent

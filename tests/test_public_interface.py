@@ -18,6 +18,7 @@ from support.board_photographs import POSES, write_set
 from support.here import calls_here
 from sweep import library
 from sweep.errors import ArgumentError, SweepError
+from sweep.execution import runner
 from sweep.execution.progress import progress_report
 
 FEW = {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 3}}
@@ -61,7 +62,7 @@ def test_every_public_function_says_what_it_takes_returns_and_raises(name):
     taken = inspect.signature(FUNCTIONS[name]).parameters
     several = re.fullmatch(r"Unpack\[(\w+)\]", str(taken["options"].annotation)) if (
         "options" in taken) else None
-    options = getattr(sweep, several[1]).__annotations__ if several else {}
+    options = getattr(runner, several[1]).__annotations__ if several else {}
     assert sorted(", ".join(named).split(", ")) == sorted({*taken, *options} - {"options"})
 
 

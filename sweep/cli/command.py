@@ -198,7 +198,7 @@ CONTINUES = "stopped; the same command continues"
 
 
 # --------------------------------------------------------------------------------------------------
-# Before a run: commands read the pipeline, and say that code is compiled.
+# Before a run: commands read the pipeline.
 
 def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
     """Return settings, as ``--set`` takes them, that say how well quantities are to be known.
@@ -247,31 +247,6 @@ def read_pipeline(
     if pipeline.stopping is not None:
         library.rules.make_rule(pipeline)
     return pipeline
-
-
-#: Seconds that the renderer takes to compile, which every run needs.
-COMPILATION_S = 8
-
-#: Seconds that `photometric_real` takes beyond that.
-PHOTOGRAPH_S = 20
-
-#: Seconds that the bound and `photometric` take beyond that.
-LIKELIHOOD_S = 10
-
-
-def announce_compilation(pipeline: Pipeline) -> None:
-    """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
-    solvers = pipeline.values_of("solver")
-    fits = "photometric" in solvers or bool(set(pipeline.values_of("bound")) - {"none"})
-    seconds = sum(
-        length for needed, module, name, length in (
-            (True, "model.coverage", "accumulate", COMPILATION_S),
-            (fits, "measure.likelihood", "descend", LIKELIHOOD_S),
-            ("photometric_real" in solvers, "measure.photograph", "locate_photograph",
-             PHOTOGRAPH_S))
-        if needed and not library.compilation.is_cached(f"sweep.{module}", name))
-    if seconds:
-        notice(f"compiling, once for this version: about {seconds} s")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -353,7 +328,6 @@ def executed(
     pipeline: Pipeline, store: str, lines: Sequence[str], workers: int | None, *, overwrite: bool
 ) -> SimpleNamespace:
     """Run a pipeline into a store, after lines on stderr on what it was made of."""
-    announce_compilation(pipeline)
     for line in lines:
         notice(line)
     SESSION.stopped = CONTINUES

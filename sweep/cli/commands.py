@@ -18,7 +18,6 @@ from sweep.cli.command import (
     SESSION,
     Names,
     Numbers,
-    announce_compilation,
     command,
     command_line,
     detected_line,
@@ -31,7 +30,7 @@ from sweep.cli.command import (
 )
 from sweep.errors import ArgumentError
 from sweep.isolation.child_process import Child
-from sweep.messages import byte_count, duration, notice, plain, quoted
+from sweep.messages import byte_count, duration, plain, quoted
 
 if TYPE_CHECKING:
     from sweep.evaluation.inspection import SceneInspection
@@ -94,7 +93,6 @@ def run(
     source = pipeline or str(Path(library.__file__).parent / "examples" / f"{example}.toml")
     with Child() as child, library.progress.progress_display() as display:
         read = read_pipeline(source, settings, precision, max_trials)
-        announce_compilation(read)
         SESSION.stopped = f"{CONTINUES}, without --overwrite" if overwrite else CONTINUES
         summary = library.runner.execute(
             read, library.lifecycle.store_of(source, store), workers=workers, scheduler=scheduler,
@@ -148,7 +146,7 @@ def plan(
         As for `run`.
     """
     read = read_pipeline(pipeline, settings, precision, max_trials)
-    announce_compilation(read)
+    library.runner.announce_compilation(read)
     facts, listed = read.facts, read.facts.parts
     expected = library.forecast.forecast(read, workers)
     bound = library.block.bound_notes(read)
@@ -568,8 +566,6 @@ def size(
         Time limit of the measurement of costs, in seconds (default: 20).
     """
     read = read_pipeline(pipeline, settings)
-    library.choice_search.chosen_by(read)
-    announce_compilation(read)
     SESSION.stopped = CONTINUES
     with library.progress.progress_display() as bar:
         choice = sweep.size(
@@ -616,14 +612,11 @@ def limit(
     """
     figure = library.output_file.figure_file(output)
     SESSION.stopped = CONTINUES
-    with Child() as child, library.progress.progress_display() as display:
-        limits, summary = library.runner.search_limits(
+    with library.progress.progress_display() as display:
+        limits = sweep.limit(
             pipeline, require=requirements, along=along, per=per, at_all=at_all,
-            max_trials=max_trials, settings=settings, store=store, begin=announce_compilation,
-            workers=workers, scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes,
-            progress=display, child=child)
-    for line in summary.warnings if summary is not None else ():
-        notice(line)
+            max_trials=max_trials, settings=settings, store=store, workers=workers,
+            scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=display)
     if figure is not None:
         library.figure.write_figure([library.findings.limit_figure(limits)], figure)
     return library.findings.limit_findings(limits)
@@ -933,7 +926,7 @@ def export(
         Export also what takes more than 10 GB, or more than is free on the disk.
     """
     read = read_pipeline(pipeline, settings)
-    announce_compilation(read)
+    library.runner.announce_compilation(read)
     SESSION.stopped = CONTINUES
     with library.progress.stage_display() as stage:
         result = library.export.export(

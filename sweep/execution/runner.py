@@ -7,12 +7,13 @@ import importlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
+from sweep import compilation
 from sweep.errors import (
     ArgumentError,
     PipelineError,
@@ -25,7 +26,7 @@ from sweep.errors import (
 from sweep.execution import TIME_LIMIT_S, forecast, status
 from sweep.execution.block_task import is_reusable, match
 from sweep.execution.executors import SMALL_RUN_S, Children, Executor, Failed
-from sweep.execution.progress import Progress, ProgressReport
+from sweep.execution.progress import Progress, ProgressReport, progress_report
 from sweep.execution.waves import InWaves
 from sweep.experiment.grid import TRIAL
 from sweep.experiment.parameters import Stage
@@ -51,6 +52,25 @@ if TYPE_CHECKING:
 
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: prepare, compute and finish, in order.
+
+#: Seconds that compilation takes: for all runs, for `photometric_real` beyond that, and for the
+#: bound and `photometric`.
+RENDERER_S, PHOTOGRAPH_S, LIKELIHOOD_S = 8, 20, 10
+
+
+def announce_compilation(pipeline: Pipeline) -> None:
+    """Say in a line on stderr that a pipeline's functions are compiled, if they have not been."""
+    solvers = pipeline.values_of("solver")
+    fits = "photometric" in solvers or bool(set(pipeline.values_of("bound")) - {"none"})
+    seconds = sum(
+        length for needed, module, name, length in (
+            (True, "model.coverage", "accumulate", RENDERER_S),
+            (fits, "measure.likelihood", "descend", LIKELIHOOD_S),
+            ("photometric_real" in solvers, "measure.photograph", "locate_photograph",
+             PHOTOGRAPH_S))
+        if needed and not compilation.is_cached(f"sweep.{module}", name))
+    if seconds:
+        notice(f"compiling, once for this version: about {seconds} s")
 
 
 def execute(
@@ -97,7 +117,7 @@ def execute(
         Block timeout in seconds; the search for a scene that never returns keeps within it
         (default: 600, or ten times a block's work if that is more).
     progress
-        Called before the first block and after each one.
+        Called before the first block and after each one; a line says that code is compiled.
     child
         The process that measures scenes and computes small runs, if the caller started it earlier
         (`Child()`), so that it has imported its packages by now.
@@ -124,6 +144,8 @@ def execute(
     if retry_failed and reuse:
         raise ArgumentError(
             "reuse", path_of("reuse", reuse[0]), "expected no retry_failed beside it")
+    if progress is not None:
+        announce_compilation(pipeline)
     url = path_of("store", store) if store is not None else f"runs/{pipeline.name}.zarr"
     begun = _store_to_continue(url, pipeline, overwrite)
     again = status.failed_blocks(begun) if retry_failed and begun is not None else {}
@@ -323,63 +345,106 @@ def _continuable_errors(without: str = "") -> Iterator[None]:
 MAX_TRIALS = 2400
 
 
-def search_limits(
-    source: Pipeline | Mapping[str, Any] | str | os.PathLike[str], *,
-    require: Sequence[str] = (), along: str = "",
-    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+class RunOptions(TypedDict, total=False):
+    """Options of a run that are not its pipeline and store, as `sweep.run` has them."""
+
+    workers: int | None
+    client: Client | Cluster | None
+    scheduler: str | None
+    reuse: Sequence[str | os.PathLike[str]]
+    overwrite: bool
+    yes: bool
+
+
+def limit(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    require: Sequence[str] = (),
+    along: str = "",
+    per: Sequence[str] | None = None,
+    at_all: Sequence[str] | None = None,
     max_trials: int | None = None,
-    settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
-    begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
-) -> tuple[xr.Dataset, SimpleNamespace | None]:
-    """Run a search, and return its limits and the run's summary, None if nothing had to run.
+    settings: Sequence[str] = (),
+    store: str | os.PathLike[str] | None = None,
+    progress: bool | ProgressReport | None = None,
+    **options: Unpack[RunOptions],
+) -> xr.Dataset:
+    """Find how far along an axis requirements are met, and return the limits.
+
+    Trials come in waves where they decide; the store of a search is continued, or answers.
 
     Parameters
     ----------
-    source
-        A pipeline, its content or file, or a store: one of a search is continued, and one of
-        equally many trials everywhere is analysed as it is.
-    require, along, per, at_all, max_trials, store
-        As `sweep.limit` has them.
+    pipeline
+        As `sweep.run` takes it; a store of equally many trials everywhere is analysed as it is.
+    require
+        What must hold, such as "detection >= 0.9", all together (default: those of the
+        pipeline's section [require]).
+    along
+        The axis of the scene that is searched, such as ``distance_m``.
+    per
+        Axes of which each combination of values has its own limit (default: all others).
+    at_all
+        Axes at all of whose values the requirements must hold.
+    max_trials
+        The most trials of a cell (default: that of [search], else 2,400).
     settings
-        As ``--set`` takes them.
-    begin
-        Is called with the pipeline before it is run.
-    options
-        Of `sweep.execution.runner.execute`.
+        "key=value" with TOML values, as ``--set`` takes them.
+    store
+        Path or URL of the store (default: ``runs/NAME-limit-AXIS.zarr``).
+    workers, client, scheduler, reuse, overwrite, yes, progress
+        As in `sweep.run`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As `sweep.analysis.requirement_limits`; the store is in its attributes.
 
     Raises
     ------
-    PipelineError, StoreError, RunError, ArgumentError
-        As `sweep.limit`.
+    PipelineError, ArgumentError, StoreError, RunError
+        As `sweep.run`.
+
+    Examples
+    --------
+    >>> limits = sweep.limit(
+    ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [5, 40]}},
+    ...     require=["detection >= 0.5"], along="side_px", max_trials=40,
+    ...     store=folder / "limit.zarr",
+    ... )
+    >>> limits["value"].item()
+    40.0
     """
     from sweep.analysis.requirements import requirement_limits  # noqa: PLC0415  (slow to import)
 
     chosen = search_settings(require, along, per, at_all, max_trials)
-    if isinstance(source, (str, os.PathLike)) and lifecycle.names_store(source):
-        stored = lifecycle.open_store(os.fspath(source))
+    if isinstance(pipeline, (str, os.PathLike)) and lifecycle.names_store(pipeline):
+        stored = lifecycle.open_store(os.fspath(pipeline))
         if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
             if not stored.finished:
                 raise StoreError(lifecycle.unfinished_line(stored))
-            results = lifecycle.open_dataset(os.fspath(source))
+            results = lifecycle.open_dataset(os.fspath(pipeline))
             limits = requirement_limits(results, require, along, per, at_all)
-            return limits.assign_attrs(store=os.fspath(source)), None
+            return limits.assign_attrs(store=os.fspath(pipeline))
         if store is None and not settings:
-            store = source
+            store = pipeline
     try:
-        pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
+        read = lifecycle.read_pipeline(pipeline, [*settings, *chosen])
     except PipelineError as error:
         if NO_TRIALS not in str(error):
             raise
         chosen += search_settings(max_trials=MAX_TRIALS)
-        pipeline = lifecycle.read_pipeline(source, [*settings, *chosen])
-    searched = getattr(pipeline.stopping, "along", "")
+        read = lifecycle.read_pipeline(pipeline, [*settings, *chosen])
+    searched = getattr(read.stopping, "along", "")
     if not searched:
-        names = [axis.name for axis in pipeline.axes_of(Stage.scene)
+        names = [axis.name for axis in read.axes_of(Stage.scene)
                  if axis.is_numeric and axis.name != TRIAL]
         raise ArgumentError("along", along, f"expected one of {', '.join(names) or 'its axes'}")
-    begin(pipeline)
     if store is None:
-        store = Path("runs") / f"{pipeline.name}-limit-{searched}.zarr"
-    summary = execute(pipeline, store, **options)
+        store = Path("runs") / f"{read.name}-limit-{searched}.zarr"
+    with progress_report(progress) as report:
+        summary = execute(read, store, progress=report, **options)
+    for line in summary.warnings:
+        notice(line)
     limits = requirement_limits(lifecycle.open_dataset(summary.store))
-    return limits.assign_attrs(store=summary.store), summary
+    return limits.assign_attrs(store=summary.store)

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from sweep.analysis.dataset import DRAWS, computed_scenes
 from sweep.analysis.requirements import Answer, Decision, answers
-from sweep.execution.progress import ProgressReport, StageReport
-from sweep.execution.runner import execute
+from sweep.errors import check_positive
+from sweep.execution.progress import ProgressReport, StageReport, progress_report, stage_display
+from sweep.execution.runner import RunOptions, execute
 from sweep.experiment.document import SEARCH
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import CHOICES, StoppingRule
-from sweep.isolation.child_process import Child, Interrupts
-from sweep.messages import refusal
+from sweep.isolation.child_process import Interrupts
+from sweep.messages import notice, refusal
 from sweep.sampling.searches import choice_shares, product_of
-from sweep.store.lifecycle import open_dataset
+from sweep.store.lifecycle import open_dataset, read_pipeline, store_of
 from sweep.tradeoff.costs import measure, median_interval, sample_scenes
 from sweep.tradeoff.pareto import pareto_front
 
@@ -118,9 +120,6 @@ def choice_costs(
 # --------------------------------------------------------------------------------------------------
 # A requirement in, a decision out: the search for the choice of a pipeline's section [search].
 
-#: Time limit of the measurement of costs, in seconds.
-SECONDS = 20.0
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -152,7 +151,7 @@ class Choice:
     poses: int
     cells: int
     most_trials: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     @property
     def grid_poses(self) -> int:
@@ -208,52 +207,63 @@ class Choice:
         return self.budget_ms is None or (cost is not None and cost.high <= self.budget_ms)
 
 
-def search_choice(
-    pipeline: Pipeline, store: str | os.PathLike[str] | None = None, *,
-    limit_s: float = SECONDS, progress: ProgressReport | None = None,
-    stage: StageReport | None = None, child: Child | None = None, **options: Any,
+def size(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    store: str | os.PathLike[str] | None = None,
+    limit_s: float = 20.0,
+    progress: bool | ProgressReport | None = None,
+    **options: Unpack[RunOptions],
 ) -> Choice:
-    """Search the choice of a pipeline's section [search], and measure what alternatives cost.
+    """Search the smallest, or the cheapest, choice that meets requirements at all conditions.
 
     Parameters
     ----------
     pipeline
-        With the sections [require] and [search].
-    store
-        Of the search (default: ``runs/NAME.zarr``); one that is finished answers at once.
+        As for `sweep.run`, with the sections [require] and [search].
+    store, workers, client, scheduler, reuse, overwrite, yes, progress
+        As for `sweep.run`.
     limit_s
-        Seconds of the measurement of costs; it is made only where there is something to compare,
-        or a budget.
-    progress, stage
-        Called after each block of the run, and while costs are measured.
-    child
-        As `sweep.execution.runner.execute` takes it, with ``options``.
+        Seconds of the measurement of costs, where there are alternatives or a budget.
+
+    Returns
+    -------
+    Choice
+        The answer of each alternative (``answers``), the number of the chosen one (``best``, None
+        if none meets everything), costs, the front, and the poses that it took.
 
     Raises
     ------
-    PipelineError
-        If the pipeline has no section [search].
-    SweepError
-        As `sweep.execution.runner.execute` and `sweep.analysis.check_requirements`.
+    ArgumentError, PipelineError, StoreError, RunError
+        As for `sweep.run`; a choice that cannot be made is told in a line for each fault.
+
+    Examples
+    --------
+    >>> found = sweep.size({
+    ...     "pose": {"jitter_px": 0.5}, "axes": {"side_px": [4, 40]},
+    ...     "require": {"all": ["detection >= 0.5"]},
+    ...     "search": {"smallest": "side_px", "max_trials": 60},
+    ... }, store=folder / "smallest.zarr")
+    >>> found.answers[found.best].value, found.answers[found.best].next
+    (40.0, 4.0)
     """
-    rule = chosen_by(pipeline)
-    summary = execute(pipeline, store, progress=progress, child=child, **options)
+    check_positive("limit_s", limit_s, "expected a finite number above 0")
+    read = read_pipeline(pipeline)
+    rule = read.stopping
+    if rule is None or rule.kind not in CHOICES:
+        example = 'smallest = "size_m", max_trials = 5000'
+        raise refusal([f"{read.source}: expected what is chosen: [{SEARCH}] {example}"])
+    with progress_report(progress) as report:
+        summary = execute(read, store_of(pipeline, store), progress=report, **options)
     results = open_dataset(summary.store)
-    found = tuple(answers(results, rule, choice_shares(pipeline, rule)))
+    found = tuple(answers(results, rule, choice_shares(read, rule)))
     costs: Sequence[Cost | None] = [None] * len(found)
-    if len(found) > 1 or pipeline.budget_ms is not None:
-        costs = choice_costs(
-            pipeline, rule, found, limit_s, stage or (lambda _what, _share: None))
+    if len(found) > 1 or read.budget_ms is not None:
+        with stage_display() if progress else contextlib.nullcontext() as stage:
+            costs = choice_costs(read, rule, found, limit_s, stage or (lambda _what, _share: None))
     trials = computed_scenes(results).sum(DRAWS).compute()
+    for line in summary.warnings:
+        notice(line)
     return Choice(
-        summary.store, rule, pipeline.budget_ms, product_of(pipeline, rule.at_all), found,
+        summary.store, rule, read.budget_ms, product_of(read, rule.at_all), found,
         tuple(costs), int(trials.sum()), trials.size, int(trials.max()), tuple(summary.warnings))
-
-
-def chosen_by(pipeline: Pipeline) -> StoppingRule:
-    """Return the choice of a pipeline; PipelineError if it has no section [search]."""
-    rule = pipeline.stopping
-    if rule is not None and rule.kind in CHOICES:
-        return rule
-    example = 'smallest = "size_m", max_trials = 5000'
-    raise refusal([f"{pipeline.source}: expected what is chosen: [{SEARCH}] {example}"])

@@ -18,7 +18,7 @@ import sweep
 from sweep.analysis.requirements import Decision, check_requirements
 from sweep.experiment.pipeline import Pipeline
 from sweep.report.findings import headline
-from sweep.tradeoff.choice_search import search_choice
+from sweep.tradeoff.choice_search import size
 
 SIZES = Path(__file__).parents[2] / "pipelines" / "sizes"
 NAMES = ("dip", "cheapest", "smallest_marker", "farthest", "dictionary")
@@ -47,7 +47,7 @@ def brute_force(pipeline, choice, place):
 def compared(name, folder):
     """Search, run the grid, and print whether they agree; return whether they do."""
     pipeline = Pipeline.from_toml(SIZES / f"{name}.toml", SETTINGS)
-    choice = search_choice(pipeline, f"{folder}/{name}.zarr", workers=1)
+    choice = size(pipeline, store=f"{folder}/{name}.zarr", workers=1)
     print(f"\n{name}", headline(choice), sep="\n  ", flush=True)
     table, poses = brute_force(pipeline, choice, f"{folder}/{name}_grid.zarr")
     rule, agreed = choice.rule, True

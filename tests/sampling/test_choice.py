@@ -40,7 +40,7 @@ def chosen(monkeypatch):
         monkeypatch.setattr(choice_search, "execute", lambda *_, **__: SimpleNamespace(
             store="runs/a.zarr", warnings=()))
         monkeypatch.setattr(choice_search, "open_dataset", lambda _: results)
-        return choice_search.search_choice(pipeline)
+        return choice_search.size(pipeline)
 
     return choice
 

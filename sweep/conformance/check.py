@@ -4,49 +4,55 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, PipelineError, PluginError
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import SceneBatch, detections_of, scenes_at
+from sweep.evaluation.results import Failure
+from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError
-from sweep.measure.detectors import FITS, OPENCV, fitting_order, make_detector
+from sweep.measure.detectors import FITS, OPENCV, fitting_order
 from sweep.measure.estimation import Estimates, pose_error
 from sweep.measure.estimators import SOLVERS, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import dictionary_names, marker_count, missing_package
-from sweep.model.renderers import render_all
+from sweep.model.scene import Scenes
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.loading import DeclaredPlugin, PluginSetting, described
-from sweep.typing import Floats, Grey, Integers
+from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
 # The scenes on which plug-ins are tried: free of noise, and each with its point reflection.
 
 SCENES = 32
-CAMERA = {"width_px": 640, "height_px": 480, "fx_px": 600.0, "fy_px": 600.0}
-SIDES_PX = (60.0, 150.0)
-STEEP_DEG = (80.0, 85.0)
+SIDES_PX, STEEP_DEG = (60.0, 150.0), (80.0, 85.0)
 RANGES = {
     "azimuth_deg": (0, 180), "roll_deg": (0, 180), "tilt_deg": (0, 45), "bearing_x_deg": (-8, 8),
     "bearing_y_deg": (-8, 8),
 }
 
+#: Frames in which no marker can be seen: plain, and noise of all grey levels; some of few pixels.
+ODD = {
+    "width_px": (640, 640, 640, 319, 53, 8), "height_px": (480, 480, 480, 241, 37, 8),
+    "background": (128, 0, 128, 128, 128, 128), "noise_grey": (0, 0, 100, 100, 100, 100),
+    "side_px": (0.01,) * 6,
+}
+
 
 def trial_pipeline(
     kind: str, name: str, dictionary: str, settings: Sequence[str], folder: str,
-    of_boards: bool = False, count: int = SCENES,
+    of_boards: bool = False, count: int = SCENES, noise_grey: float = 0.0,
 ) -> Pipeline:
     """Return the pipeline of ``count`` scenes and one setting of a detector, or of a solver.
 
     Scene i + count/2 is scene i turned by 180° about the image's centre, exactly. Behind them are
-    count/2 scenes that are seen nearly from the side.
+    count/2 scenes that are seen nearly from the side, and the frames of :data:`ODD`.
 
     Raises
     ------
@@ -54,23 +60,21 @@ def trial_pipeline(
         If there is no such detector or solver, or a setting is not valid.
     """
     rng, half = np.random.default_rng(20), count // 2
-    drawn: dict[str, NDArray[Any]] = {
-        parameter: rng.uniform(*ends, half) for parameter, ends in RANGES.items()}
+    drawn = pd.DataFrame({name: rng.uniform(*ends, half) for name, ends in RANGES.items()})
     drawn["side_px"] = np.geomspace(*SIDES_PX, half).round(2)
     if not of_boards and dictionary in dictionary_names():  # an unknown one is refused below
         drawn["marker_id"] = rng.integers(marker_count(dictionary), size=half)
-    reflected = drawn | {
-        "azimuth_deg": drawn["azimuth_deg"] + 180, "roll_deg": drawn["roll_deg"] + 180,
-        "bearing_x_deg": -drawn["bearing_x_deg"], "bearing_y_deg": -drawn["bearing_y_deg"],
-    }
-    steep = drawn | {"tilt_deg": rng.uniform(*STEEP_DEG, half)}
+    drawn = drawn.assign(width_px=640, height_px=480, noise_grey=noise_grey)
+    reflected = drawn.copy()
+    reflected[["azimuth_deg", "roll_deg"]] += 180
+    reflected[["bearing_x_deg", "bearing_y_deg"]] *= -1
+    steep = drawn.assign(tilt_deg=rng.uniform(*STEEP_DEG, half))
+    scenes = pd.concat([drawn, reflected, steep, pd.DataFrame(ODD)]).fillna(0).round(6)
     document: dict[str, Any] = {
-        "title": "Conformance", "camera": CAMERA, "marker": {"dictionary": dictionary},
+        "title": "Conformance", "camera": {"fx_px": 600.0, "fy_px": 600.0},
+        "marker": {"dictionary": dictionary}, "scene": {"window": "full"},
         "detector": {"detector": name},
-        "axes": {"trial_scene": {"zip": {
-            parameter: np.concatenate([
-                each[parameter] for each in (drawn, reflected, steep)]).round(6).tolist()
-            for parameter in drawn}}},
+        "axes": {"trial_scene": {"zip": scenes.convert_dtypes().to_dict("list")}},
     }
     if kind == "estimator":
         document["detector"] = {"detector": OPENCV, "cornerRefinementMethod": "subpix"}
@@ -83,21 +87,8 @@ def trial_pipeline(
     return pipeline
 
 
-def trial_scenes(pipeline: Pipeline, count: int = SCENES) -> SceneBatch:
-    """Return the first ``count`` scenes of :func:`trial_pipeline`."""
-    return scenes_at(pipeline.experiment, [np.arange(count)])
-
-
-def trial_images(batch: SceneBatch) -> list[Grey]:
-    """Return the scenes' images, whole frames (480, 640)."""
-    frame = batch.scenes.frame
-    whole = np.concatenate([np.zeros_like(frame), frame], axis=1)
-    images = render_all(batch.scenes, np.arange(len(frame)), batch.boxes, whole)
-    return [np.ascontiguousarray(image) for image in images]
-
-
 # --------------------------------------------------------------------------------------------------
-# A trial of a detector, and of a solver: its answers to numbered inputs, held against the truth.
+# Answers of a detector, or of a solver, to numbered scenes, held against the truth.
 
 OK, NOTE, FAULT = "ok", "note", "fault"
 
@@ -110,14 +101,9 @@ class Finding(NamedTuple):
     numbers: Mapping[str, Any] = {}
 
 
-#: Answer to an input: arrays; none of them where nothing was found.
+#: Answer to a scene, empty where nothing was found: a detector's IDs (n,) and corners (n, 4, 2) px,
+#: or all numbers of a solver's estimate.
 Answer = tuple[Any, ...]
-
-#: Sizes and grey levels (low, and the high that is not reached) of images that are none of ours.
-ODD_IMAGES = (
-    (480, 640, 128, 129), (480, 640, 0, 1), (480, 640, 0, 256), (241, 319, 0, 256),
-    (37, 53, 0, 256), (8, 8, 0, 256),
-)
 
 #: Largest mean offset of a detector that conforms, and standard errors that are allowed beside it.
 MAX_OFFSET_PX, STANDARD_ERRORS = 0.02, 4.0
@@ -126,42 +112,49 @@ MAX_OFFSET_PX, STANDARD_ERRORS = 0.02, 4.0
 MAX_ROTATION_DEG, MAX_POSITION_PERCENT = 5.0, 5.0
 
 
-class DetectorTrial:
-    """A detector; its inputs are images, an answer has IDs (n,) and corners (n, 4, 2) px.
+def answers_to(pipeline: Pipeline, kind: str, numbers: Sequence[int]) -> list[Answer]:
+    """Search scenes of a trial together, in an order, and solve them if a solver is tried.
 
-    The first ``asked`` are scenes; ``odd`` has what lines on the others begin with.
+    Raises
+    ------
+    PluginError
+        If the plug-in raises, or returns what cannot be an answer.
     """
-
-    checks = ("returns markers", "finds markers", "keeps conventions", "repeats itself",
-              "has no memory", "survives odd images")
-    found, hint = "detected", ""
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        (self.setting,) = pipeline.experiment.detectors
-        self.find = make_detector(self.setting)
-        batch, rng = trial_scenes(pipeline), np.random.default_rng(1)
-        self.scenes = batch.scenes
-        self.images = trial_images(batch) + [
-            rng.integers(low, high, (height, width)).astype(np.uint8)
-            for height, width, low, high in ODD_IMAGES]
-        self.asked = SCENES
-        self.odd = [f"an image of {each.shape[1]} x {each.shape[0]} px: "
-                    for each in self.images[SCENES:]]
-
-    def answers(self, numbers: Sequence[int]) -> list[Answer]:
-        """Search images in an order."""
-        dictionary, answers = self.scenes.dictionary[0], list[Answer]()
-        for number in numbers:
-            image = self.images[number]
-            corners, ids, _ = self.find(image, dictionary, max(image.shape))
-            answers.append(() if ids is None or not len(ids) else (
-                np.ravel(ids), np.reshape(corners, (-1, 4, 2)).astype(np.float64)))
+    batch, failures = scenes_at(pipeline.experiment, [np.array(numbers)]), list[Failure]()
+    (found,), _ = detections_of(batch, batch.visible[:, None], failures, keep=True)
+    if failures:
+        raise PluginError(failures[0].text.strip().rpartition("PluginError: ")[2])
+    answers: list[Answer] = [()] * len(numbers)
+    if kind == "detector":
+        for row, output in found.outputs.items():
+            if output.ids is not None:
+                corners = np.reshape(output.corners, (-1, 4, 2)).astype(np.float64)
+                answers[row] = np.ravel(output.ids), corners
         return answers
+    (setting,), rows = batch.experiment.estimators, np.flatnonzero(
+        found.flags == DetectionStatus.detected)
+    if len(rows):
+        estimates = build(setting)(detections_for(setting, batch, found, rows))
+        columns = [getattr(estimates, each.name) for each in dataclasses.fields(Estimates)]
+        for row, estimate in zip(rows.tolist(), zip(*columns, strict=True), strict=True):
+            answers[row] = estimate if estimate[0] == EstimateStatus.solved else ()
+    return answers
 
-    def judged(self, answers: Sequence[Answer]) -> Finding:
-        """Demand IDs, order of corners and centre of the first pixel as they are declared."""
-        record = self.setting.record() if isinstance(self.setting, PluginSetting) else None
-        return judged_corners(answers, self.scenes.marker_id, self.scenes.corners_px, record)
+
+def judged_poses(answers: Sequence[Answer], scenes: Scenes) -> Finding:
+    """Demand poses of the marker in the camera's frame, in metres, in N scenes."""
+    rows = [row for row, answer in enumerate(answers) if answer]
+    if not rows:
+        return Finding(FAULT, "no pose was solved")
+    _, rotation, translation, *_ = map(np.array, zip(*filter(None, answers), strict=True))
+    truth = scenes.translation[rows]
+    error = pose_error(rotation, translation, scenes.rotation[rows], truth)
+    away = np.linalg.norm(error.translation_m, axis=1) / np.linalg.norm(truth, axis=1)
+    turned, percent = np.degrees(np.median(error.rotation_angle_rad)), 100 * np.median(away)
+    right = turned <= MAX_ROTATION_DEG and percent <= MAX_POSITION_PERCENT
+    return Finding(
+        OK if right else FAULT,
+        f"median errors {turned:.2g} deg and {percent:.2g} % of the distance")
 
 
 def judged_corners(
@@ -227,46 +220,6 @@ def judged_corners(
     return Finding(FAULT, line, numbers)
 
 
-class SolverTrial:
-    """A solver; its inputs are OpenCV's detections, an answer has all numbers of an estimate."""
-
-    checks = ("returns poses", "solves scenes", "keeps frames", "repeats itself",
-              "ignores the batch", "survives odd detections")
-    found, hint = "solved", "; expected poses of marker to camera, OpenCV's axes, metres"
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        batch = trial_scenes(pipeline, len(pipeline.axes[0]))
-        (setting,) = pipeline.experiment.estimators
-        self.solve = build(setting)
-        (result,), _ = detections_of(batch, batch.visible[:, None], [], keep=True)
-        self.rows = np.flatnonzero(result.flags == DetectionStatus.detected)
-        self.scenes, self.seen = batch.scenes, detections_for(setting, batch, result, self.rows)
-        self.asked = int((self.rows < SCENES).sum())
-        self.odd = [""] * (len(self.rows) - self.asked)
-
-    def answers(self, numbers: Sequence[int]) -> list[Answer]:
-        """Solve detections together, in an order."""
-        estimates = self.solve(self.seen.take(np.array(numbers, dtype=np.intp)))
-        columns = [getattr(estimates, each.name) for each in dataclasses.fields(Estimates)]
-        return [numbers if numbers[0] == EstimateStatus.solved else ()
-                for numbers in zip(*columns, strict=True)]
-
-    def judged(self, answers: Sequence[Answer]) -> Finding:
-        """Demand poses of the marker in the camera's frame, in metres."""
-        rows = self.rows[[number for number, answer in enumerate(answers) if answer]]
-        if not len(rows):
-            return Finding(FAULT, "no pose was solved")
-        _, rotation, translation, *_ = map(np.array, zip(*filter(None, answers), strict=True))
-        truth = self.scenes.translation[rows]
-        error = pose_error(rotation, translation, self.scenes.rotation[rows], truth)
-        away = np.linalg.norm(error.translation_m, axis=1) / np.linalg.norm(truth, axis=1)
-        turned, percent = np.degrees(np.median(error.rotation_angle_rad)), 100 * np.median(away)
-        right = turned <= MAX_ROTATION_DEG and percent <= MAX_POSITION_PERCENT
-        return Finding(
-            OK if right else FAULT,
-            f"median errors {turned:.2g} deg and {percent:.2g} % of the distance")
-
-
 # --------------------------------------------------------------------------------------------------
 # The six checks, which run in a child process that the plug-in may end or never leave.
 
@@ -278,44 +231,59 @@ FEWEST_SHARE = 0.75
 
 PREFERRED = "DICT_APRILTAG_36h11"
 
-TRIALS: dict[str, Any] = {"detector": DetectorTrial, "estimator": SolverTrial}
+CHECKS = {
+    "detector": ("returns markers", "finds markers", "keeps conventions", "repeats itself",
+                 "has no memory", "survives odd images"),
+    "estimator": ("returns poses", "solves scenes", "keeps frames", "repeats itself",
+                  "ignores the batch", "survives odd detections"),
+}
 
 
-def findings_of(trial: DetectorTrial | SolverTrial) -> Iterator[Finding]:
+def findings_of(kind: str, pipeline: Pipeline) -> Iterator[Finding]:
     """Yield the findings of the six checks in their order; a PluginError ends them."""
-    every = range(trial.asked)
-    first = trial.answers(every)
+    answers, every = partial(answers_to, pipeline, kind), range(SCENES)
+    first = answers(every)
     yield Finding(OK, "right shapes and types")
 
-    found, asked = sum(map(bool, first)), trial.asked
-    verdict = FAULT if found < max(1, FEWEST_SHARE * asked) else OK if found == asked else NOTE
-    hint = trial.hint if verdict == FAULT else ""
+    found, of_detector = sum(map(bool, first)), kind == "detector"
+    verdict = OK if found == SCENES else NOTE if found >= FEWEST_SHARE * SCENES else FAULT
+    word = "detected" if of_detector else "solved"
+    hint = "; expected poses of marker to camera, OpenCV's axes, metres"
+    line = f"{word} in {found} of {SCENES} scenes"
     yield Finding(
-        verdict, f"{trial.found} in {found} of {asked} scenes{hint}", {trial.found: found})
+        verdict, line + hint * (verdict == FAULT and not of_detector), {word: found})
 
-    yield trial.judged(first)
+    scenes = scenes_at(pipeline.experiment, [np.array(every)]).scenes
+    if of_detector:
+        (setting,) = pipeline.experiment.detectors
+        record = setting.record() if isinstance(setting, PluginSetting) else None
+        yield judged_corners(first, scenes.marker_id, scenes.corners_px, record)
+    else:
+        yield judged_poses(first, scenes)
 
     def same(orders: Sequence[Sequence[int]], how: str) -> Finding:
         """Demand the same bits in other calls."""
         different = {number for order in orders
-                     for number, answer in zip(order, trial.answers(order), strict=True)
+                     for number, answer in zip(order, answers(order), strict=True)
                      if _bits(answer) != _bits(first[number])}
         if different:
             return Finding(FAULT, f"called {how}, it gives other results in {len(different)} of "
-                           f"{asked} scenes")
+                           f"{SCENES} scenes")
         return Finding(OK, f"the same bits, called {how}")
 
     yield same([every], "again")
 
-    odd = dict[str, None]()
-    for number, name in enumerate(trial.odd, asked):
+    told = dict[str, None]()
+    for number in range(SCENES, len(pipeline.axes[0])):
         try:
-            trial.answers([number])
+            answers([number])
         except PluginError as error:
-            odd[f"{name}{error}"] = None
+            width, height = (pipeline.axes[0].columns[side][number]
+                             for side in ("width_px", "height_px"))
+            told[f"a frame of {width} x {height} px: {error}"] = None
     yield same([every[::-1], *([row] for row in every)], "in reverse order, alone, after odd input")
 
-    yield Finding(NOTE if odd else OK, "; ".join(odd) or "no error")
+    yield Finding(NOTE if told else OK, "; ".join(told) or "no error")
 
 
 def _bits(answer: Answer) -> bytes:
@@ -330,7 +298,7 @@ _running: list[Iterator[Finding]] = []
 def _next(number: int, kind: str, pipeline: Pipeline) -> Finding:
     """Return the finding of the next check of :func:`trial_pipeline`'s plug-in; number 0 begins."""
     if number == 0:
-        _running[:] = [findings_of(TRIALS[kind](pipeline))]
+        _running[:] = [findings_of(kind, pipeline)]
     return next(_running[0])
 
 
@@ -371,7 +339,7 @@ def check_plugin(
     if name == OPENCV or name in SOLVERS:
         plugin = DeclaredPlugin("detector" if name == OPENCV else "estimator", name)
     else:
-        tried = [each for each in described(name, folder) if each.kind in TRIALS]
+        tried = [each for each in described(name, folder) if each.kind in CHECKS]
         if not tried:
             raise ArgumentError(
                 "name", name, "expected a detector or a solver; runs check the others")
@@ -382,7 +350,7 @@ def check_plugin(
     pipeline = trial_pipeline(plugin.kind, name, dictionary, settings, folder, plugin.of_boards)
     findings = dict[str, Finding]()
     with Child("sweep.conformance.check") as child:
-        for number, check in enumerate(TRIALS[plugin.kind].checks):
+        for number, check in enumerate(CHECKS[plugin.kind]):
             try:
                 findings[check] = child.call(
                     _next, number, plugin.kind, pipeline, limit_s=time_limit_s)

@@ -1,4 +1,4 @@
-"""The adapters of other packages' detectors and solvers, and the markers of their own families.
+"""The adapters of other packages' detectors, Locus' solver, and markers of their own families.
 
 References are the packages themselves; tests skip where one is missing.
 """
@@ -31,10 +31,13 @@ MODULES = {
 }
 
 
+PLUGINS, LOCUS = Path(__file__).parents[2] / "pipelines" / "plugins", "locus_board:SOLVER"
+
+
 def refusal(document, *settings):
     """The faults of a document, one a line."""
     with pytest.raises(PipelineError) as refused:
-        Pipeline.from_dict(document, settings)
+        Pipeline.from_dict(document, settings, folder=PLUGINS)
     return "\n".join(refused.value.faults)
 
 
@@ -111,7 +114,7 @@ CHARUCO = {"kind": "charuco", "squares_x": 5, "squares_y": 4, "square_m": 0.065,
            "legacy_pattern": True}
 
 
-def board_document(board, solver="locus-board", **marker):
+def board_document(board, solver=LOCUS, **marker):
     return {
         "seed": 5, "camera": {"width_px": 640, "height_px": 480, "fx_px": 700},
         "marker": {"dictionary": "DICT_APRILTAG_36h11", "size_m": 0.05, "quiet_zone_modules": 1,
@@ -142,8 +145,8 @@ def test_a_detectors_markers_make_the_boards_pose(detector):
 ], ids=["grid", "grid, own detector", "charuco", "markers of a charuco"])
 def test_locus_own_estimator_gives_the_boards_pose_and_covariance(board, settings):
     pytest.importorskip("locus")
-    results = run_cells(
-        Pipeline.from_dict(board_document(board), settings), [np.arange(4)]).columns
+    pipeline = Pipeline.from_dict(board_document(board), settings, folder=PLUGINS)
+    results = run_cells(pipeline, [np.arange(4)]).columns
     assert (results["estimate"][0] == EstimateStatus.solved).all()
     assert results["rotation_error_deg"][0].max() < 0.3
     assert np.abs(results["translation_error_m"][0]).max() < 1e-3
@@ -158,7 +161,7 @@ def test_locus_own_estimator_gives_the_boards_pose_and_covariance(board, setting
 ])
 def test_boards_that_locus_lacks_are_failures_that_say_why(settings, expected):
     pytest.importorskip("locus")
-    pipeline = Pipeline.from_dict(board_document(CHARUCO), settings)
+    pipeline = Pipeline.from_dict(board_document(CHARUCO), settings, folder=PLUGINS)
     results = run_cells(pipeline, [np.arange(1)])
     assert (results.columns["estimate"][0] == EstimateStatus.failed).all()
     assert expected in results.failures[0].text
@@ -253,9 +256,9 @@ CIRCLE, WARPED = ("tagCircle21h7", 38), ("STAG_HD21", 1)
 
 @pytest.mark.parametrize(("document", "settings", "named"), [
     (board_document(GRID), ["points='each_marker'"],
-     "markers beside solver = locus-board, which chooses by"),
+     f"markers beside solver = {LOCUS}, which chooses by"),
     (board_document(GRID), ["refine='lm'"],
-     "none beside solver = locus-board, which chooses by itself"),
+     f"none beside solver = {LOCUS}, which chooses by itself"),
     (board_document({}), [], "a solver of single markers, or a board: give kind under [board]"),
     (family_document(*CIRCLE), [], "IDs from 0 to 37, which is what tagCircle21h7 has"),
     (family_document(*WARPED), ["renderer=warp"], "exact for STag's markers"),

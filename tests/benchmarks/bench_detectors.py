@@ -17,9 +17,11 @@ import numpy as np
 
 from benchmarks.tables import header, row
 from sweep.analysis.intervals import wilson
-from sweep.conformance.check import trial_images, trial_pipeline, trial_scenes
+from sweep.conformance.check import trial_pipeline
+from sweep.evaluation.search import scenes_at
 from sweep.isolation.child_process import Child, ChildDiedError
 from sweep.measure.detectors import make_detector
+from sweep.model.renderers import render_all
 
 TAG, STAG = "DICT_APRILTAG_36h11", "STAG_HD21"
 METHODS = {
@@ -40,9 +42,10 @@ def searched(name, scenes, noise):
     cv2.setNumThreads(1)
     detector, dictionary, chosen = METHODS[name]
     pipeline = trial_pipeline(
-        "detector", detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", count=scenes)
-    batch = trial_scenes(pipeline, scenes)
-    shown, images = batch.scenes, trial_images(batch)
+        "detector", detector, dictionary, chosen, ".", count=scenes, noise_grey=noise)
+    rows, frame = np.arange(scenes), np.tile([0, 0, 640, 480], (scenes, 1))
+    batch = scenes_at(pipeline.experiment, [rows])
+    shown, images = batch.scenes, render_all(batch.scenes, rows, batch.boxes, frame)
     find = make_detector(pipeline.experiment.detectors[0])
     find(images[0], dictionary, 640)  # what is made once is made
     errors, seconds = np.full((scenes, 4, 2), np.nan), np.full(scenes, np.nan)

@@ -1,4 +1,7 @@
-"""AprilTag's C library, in three packages: pyapriltags, pupil-apriltags, robotpy-apriltag."""
+"""The detectors of other packages: AprilTag's C library in three of them, Locus, STag.
+
+A package is imported only when its detector is made.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from sweep.adapters import adapter
 from sweep.plugins import DetectorPlugin, Markers, parameter
+
+
+def adapter(
+    package: str, meaning: str, make: Callable[..., Any], settings: type[Any], **fields: Any
+) -> DetectorPlugin:
+    """Return the detector of a package that is an extra of ours, with other ``fields`` of it."""
+    return DetectorPlugin(**{
+        "make": make, "settings": settings, "meaning": f"{meaning} ({package})",
+        "distribution": package, "install": f"pip install 'fiducial-sweep[{package}]'", **fields,
+    })
+
+
+# --------------------------------------------------------------------------------------------------
+# AprilTag's C library, in three packages: pyapriltags, pupil-apriltags, robotpy-apriltag.
 
 #: Families that OpenCV lacks; they are drawn as AprilTag draws them.
 OWN_FAMILIES = (
@@ -75,7 +91,7 @@ def apriltag(
 
         return markers
 
-    return adapter(DetectorPlugin, package, meaning, make, **{
+    return adapter(package, meaning, make, **{
         "settings": AprilTagSettings, "families": FAMILIES, "corner_order": (1, 0, 3, 2),
         "pixel_center": 0.5, **fields})
 
@@ -151,3 +167,85 @@ ROBOTPY_APRILTAG = apriltag(
     "robotpy-apriltag", "WPILib's build of AprilTag's C library", with_wpilib,
     settings=WPILibSettings, distribution=("robotpy-apriltag", "robotpy-native-apriltag"),
     families={"DICT_APRILTAG_16h5": "tag16h5", "DICT_APRILTAG_36h11": "tag36h11"})
+
+
+# --------------------------------------------------------------------------------------------------
+# Locus.
+
+#: Of AprilTag's and ArUco's dictionaries.
+LOCUS_FAMILIES = {
+    "DICT_4X4_50": "ArUco4x4_50",
+    "DICT_4X4_100": "ArUco4x4_100",
+    "DICT_6X6_250": "ArUco6x6_250",
+    "DICT_APRILTAG_16h5": "AprilTag16h5",
+    "DICT_APRILTAG_36h11": "AprilTag36h11",
+    "DICT_ARUCO_MIP_36h12": "ArUcoMip36h12",
+}
+
+LOCUS_PROFILES = ("standard", "grid", "high_accuracy")
+
+
+@dataclass(frozen=True)
+class LocusSettings:
+    """The profile, and choices beside it."""
+
+    locus_profile: str = parameter(
+        "standard", "Locus: the shipped profile of settings", choices=LOCUS_PROFILES)
+    locus_decimation: int = parameter(
+        1, "Locus: decimation of the image before the search", 1, 64)
+
+
+def locus_search(settings: LocusSettings, family: str) -> Callable[[Any], Markers]:
+    """Return the search for markers of one family."""
+    import locus  # noqa: PLC0415  (optional)
+
+    detector = locus.Detector(
+        profile=settings.locus_profile, decimation=settings.locus_decimation, threads=1,
+        families=[getattr(locus.TagFamily, family)])
+
+    def search(image: Any) -> Markers:
+        found = detector.detect(image)
+        return Markers(found.corners, found.ids, found.rejected_corners)
+
+    return search
+
+
+LOCUS = adapter(
+    "locus-tag", "Locus", locus_search, LocusSettings, families=LOCUS_FAMILIES, pixel_center=0.5)
+
+
+# --------------------------------------------------------------------------------------------------
+# STag, for markers of its own.
+
+LIBRARIES = {f"STAG_HD{distance}": str(distance) for distance in range(11, 25, 2)}
+
+
+@dataclass(frozen=True)
+class StagSettings:
+    """What STag lets choose."""
+
+    error_correction: int = parameter(
+        -1, "STag: most wrong bits of a marker that is taken; -1: half of the library's distance",
+        -1, 11)
+
+
+def stag_search(settings: StagSettings, library: str) -> Callable[[Any], Markers]:
+    """Return the search for markers of one library."""
+    import stag  # noqa: PLC0415  (optional)
+
+    most = (int(library) - 1) // 2
+    if settings.error_correction > most:
+        raise ValueError(
+            f"error_correction = {settings.error_correction}: HD{library} allows at most {most}")
+
+    def search(image: Any) -> Markers:
+        corners, ids, rejected = stag.detectMarkers(
+            image, int(library), settings.error_correction)
+        return Markers(
+            np.reshape(corners, (-1, 4, 2)), np.ravel(np.asarray(ids, dtype=np.int64)),
+            np.reshape(rejected, (-1, 4, 2)))
+
+    return search
+
+
+STAG = adapter("stag-python", "STag", stag_search, StagSettings, families=LIBRARIES)

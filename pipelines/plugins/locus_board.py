@@ -1,93 +1,34 @@
-"""Locus: its detector of markers, and its estimator of boards."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
+"""A solver of boards: Locus' own, which searches the images by itself."""
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
-
 import numpy as np
+from sweep.adapters.detectors import LOCUS_FAMILIES, LOCUS_PROFILES
+from sweep.plugins import EstimatorPlugin, Poses, parameter
 
-from sweep.adapters import adapter
-from sweep.plugins import DetectorPlugin, EstimatorPlugin, Markers, Poses, parameter
+# From our board's frame (y up, z out) to Locus', which has the same origin (y down, z in).
+Z_IN = np.diag([1.0, -1.0, -1.0])
 
-# --------------------------------------------------------------------------------------------------
-# The detector, for AprilTag's and ArUco's dictionaries.
-
-FAMILIES = {
-    "DICT_4X4_50": "ArUco4x4_50",
-    "DICT_4X4_100": "ArUco4x4_100",
-    "DICT_6X6_250": "ArUco6x6_250",
-    "DICT_APRILTAG_16h5": "AprilTag16h5",
-    "DICT_APRILTAG_36h11": "AprilTag36h11",
-    "DICT_ARUCO_MIP_36h12": "ArUcoMip36h12",
-}
-
-PROFILES = ("standard", "grid", "high_accuracy")
-
+# Corners (4, 2) of an upright square of side 1.
+SQUARE = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 @dataclass(frozen=True)
-class LocusSettings:
-    """The profile, and choices beside it."""
-
-    locus_profile: str = parameter(
-        "standard", "Locus: the shipped profile of settings", choices=PROFILES)
-    locus_decimation: int = parameter(
-        1, "Locus: decimation of the image before the search", 1, 64)
-
-
-def make(settings: LocusSettings, family: str) -> Callable[[Any], Markers]:
-    """Return the search for markers of one family."""
-    import locus  # noqa: PLC0415  (optional)
-
-    detector = locus.Detector(
-        profile=settings.locus_profile, decimation=settings.locus_decimation, threads=1,
-        families=[getattr(locus.TagFamily, family)])
-
-    def search(image: Any) -> Markers:
-        found = detector.detect(image)
-        return Markers(found.corners, found.ids, found.rejected_corners)
-
-    return search
-
-
-DETECTOR = adapter(
-    DetectorPlugin, "locus-tag", "Locus", make, LocusSettings, families=FAMILIES, pixel_center=0.5)
-
-
-# --------------------------------------------------------------------------------------------------
-# The estimators of boards, which detect and solve on their own.
-
-#: From our board's frame (y up, z out) to Locus', which has the same origin (y down, z in).
-_Z_IN = np.diag([1.0, -1.0, -1.0])
-
-#: Corners (4, 2) of an upright square of side 1.
-_SQUARE = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
-
-
-@dataclass(frozen=True)
-class LocusBoardSettings:
-    """The detector's profile, and the corners of a chessboard that are used."""
-
+class Settings:
     locus_board_profile: str = parameter(
-        "standard", "Locus' boards: the shipped profile of settings", choices=PROFILES)
+        "standard", "Locus' boards: the shipped profile of settings", choices=LOCUS_PROFILES)
     locus_chessboard: bool = parameter(
         True, "Locus' boards: of a charuco, the corners of its chessboard (CharucoRefiner) in "
         "place of those of its markers (BoardEstimator)")
 
-
-def make_board_estimator(settings: LocusBoardSettings) -> Callable[[Any], Poses]:
-    """Return the estimator of boards' poses from their images."""
+def make(settings):
     import locus  # noqa: PLC0415  (optional)
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
 
     @lru_cache(maxsize=64)
-    def tools(board: Any, scale: float) -> tuple[Any, Any]:
+    def tools(board, scale):
         """Return Locus' detector for a board, and its estimator; ValueError if it has none."""
-        if board.dictionary not in FAMILIES:
+        if board.dictionary not in LOCUS_FAMILIES:
             raise ValueError(f"locus-tag has no family for {board.dictionary}")
-        family = getattr(locus.TagFamily, FAMILIES[board.dictionary])
+        family = getattr(locus.TagFamily, LOCUS_FAMILIES[board.dictionary])
         detector = locus.Detector(
             profile=settings.locus_board_profile, threads=1, families=[family])
         if board.marker_ids != tuple(range(len(board))):
@@ -109,7 +50,7 @@ def make_board_estimator(settings: LocusBoardSettings) -> Callable[[Any], Poses]
             locus.BoardEstimator.from_charuco)
         return detector, chosen(charuco)
 
-    def solve(detections: Any) -> Poses:
+    def solve(detections):
         count = len(detections.targets)
         poses = Poses(*(np.full((count, *shape), np.nan) for shape in ((3, 3), (3,), (6, 6))))
         for i, (board, image) in enumerate(
@@ -127,7 +68,7 @@ def make_board_estimator(settings: LocusBoardSettings) -> Callable[[Any], Poses]
                 continue
             # Quaternions are w, x, y, z there.
             turn = Rotation.from_quat(np.roll(found.board_pose[3:], -1)).as_matrix()
-            poses.rotation[i], poses.translation[i] = turn @ _Z_IN, found.board_pose[:3]
+            poses.rotation[i], poses.translation[i] = turn @ Z_IN, found.board_pose[:3]
             if found.board_cov is not None:
                 # Theirs is along the board's axes.
                 to_camera = np.kron(np.eye(2), turn)
@@ -136,8 +77,7 @@ def make_board_estimator(settings: LocusBoardSettings) -> Callable[[Any], Poses]
 
     return solve
 
-
-def grid_of(corners_m: Any) -> tuple[int, int, float, float]:
+def grid_of(corners_m):
     """Return rows, columns, gap and side of a grid whose markers have corners (n, 4, 3) in metres.
 
     ValueError for another board.
@@ -151,12 +91,12 @@ def grid_of(corners_m: Any) -> tuple[int, int, float, float]:
     row, column = np.divmod(np.arange(count), columns)
     places = np.stack([column, -row], axis=1) * step
     off = np.array(corners_m)
-    off[..., :2] -= (places - places.mean(axis=0))[:, None] + side * _SQUARE
+    off[..., :2] -= (places - places.mean(axis=0))[:, None] + side * SQUARE
     if count % columns or np.abs(off).max() > near:
         raise ValueError("locus-tag has grids and charucos: expected kind = grid")
     return count // columns, columns, step - side, side
 
-
-SOLVER = adapter(
-    EstimatorPlugin, "locus-tag", "Locus' own board estimator, which searches the image by itself",
-    make_board_estimator, LocusBoardSettings, needs_images=True, of_boards=True)
+SOLVER = EstimatorPlugin(
+    make=make, settings=Settings, needs_images=True, of_boards=True, distribution="locus-tag",
+    install="pip install 'fiducial-sweep[locus-tag]'",
+    meaning="Locus' own board estimator (locus-tag)")

@@ -233,11 +233,6 @@ def stag_search(settings: StagSettings, library: str) -> Callable[[Any], Markers
     """Return the search for markers of one library."""
     import stag  # noqa: PLC0415  (optional)
 
-    most = (int(library) - 1) // 2
-    if settings.error_correction > most:
-        raise ValueError(
-            f"error_correction = {settings.error_correction}: HD{library} allows at most {most}")
-
     def search(image: Any) -> Markers:
         corners, ids, rejected = stag.detectMarkers(
             image, int(library), settings.error_correction)

@@ -17,14 +17,14 @@ from sweep.evaluation.results import Failure
 from sweep.evaluation.search import detections_of, scenes_at
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError
-from sweep.measure.detectors import FITS, OPENCV, fitting_order
+from sweep.measure.detectors import FITS, OPENCV, PluginSetting, fitting_order
 from sweep.measure.estimation import Estimates, pose_error
 from sweep.measure.estimators import SOLVERS, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import dictionary_names, marker_count, missing_package
 from sweep.model.scene import Scenes
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.loading import DeclaredPlugin, PluginSetting, described
+from sweep.plugins.loading import DeclaredPlugin, described
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from sweep.errors import ArgumentError, StoreError
 from sweep.experiment.document import file_text
 from sweep.messages import nearest, nearest_file, plain, refusal
 from sweep.model.pose import rotation_of_vector
-from sweep.plugins.recording import OF_TARGET, REJECTED
+from sweep.plugins.loading import OF_TARGET, REJECTED
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ class Answers:
     image
         (M,) indices into the names of the images.
     marker_id
-        (M,) IDs; :data:`sweep.plugins.recording.REJECTED` for candidates that were not decoded,
-        :data:`sweep.plugins.recording.OF_TARGET` for poses of a board, or of any target, as such.
+        (M,) IDs; :data:`sweep.plugins.loading.REJECTED` for candidates that were not decoded,
+        :data:`sweep.plugins.loading.OF_TARGET` for poses of a board, or of any target, as such.
     corners
         (M, 4, 2) px of the image; NaN where none were given.
     rotation, translation

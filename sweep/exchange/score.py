@@ -21,7 +21,7 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import FITS, fitting_order
 from sweep.messages import plain
-from sweep.plugins.recording import REJECTED, SUFFIX, Recording
+from sweep.plugins.loading import REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.store.locations import translate_errors
 from sweep.typing import Floats, Integers

@@ -20,7 +20,12 @@ from sweep.experiment.parameters import NAMED_BY, PARAMETERS, WORLD, Stage
 from sweep.experiment.photographs import recorded_poses
 from sweep.experiment.schema import Variable, drawn_variables, variables_of
 from sweep.measure import detectors
-from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
+from sweep.measure.detectors import (
+    AnyDetectorSetting,
+    BoardDetectorSetting,
+    DetectorSetting,
+    PluginSetting,
+)
 from sweep.measure.estimators import SOLVERS, EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.likelihood import BoundSetting
 from sweep.messages import label
@@ -31,7 +36,7 @@ from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, c
 from sweep.model.exposure import hidden, not_modelled, outside_frame
 from sweep.model.pose import angles_of_rotation, viewing_angle
 from sweep.model.scene import Scenes, build_cameras, build_scenes
-from sweep.plugins.loading import DeclaredPlugin, PluginSetting
+from sweep.plugins.loading import DeclaredPlugin
 from sweep.typing import Floats, Masks
 
 T = TypeVar("T")
@@ -689,5 +694,4 @@ class Facts:
 def _described(plugin: DeclaredPlugin) -> str:
     """Return a plug-in in words: kind, name, versions."""
     versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
-    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
-    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "")

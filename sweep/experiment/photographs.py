@@ -27,7 +27,7 @@ from sweep.model.camera import Column
 from sweep.model.image_file import Part, reference
 from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
-from sweep.plugins.recording import ArrayFile
+from sweep.plugins.loading import ArrayFile
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -38,8 +38,7 @@ from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS, decode_grey, read_image, read_regular
 from sweep.model.scene import RENDERERS, is_renderer
 from sweep.model.sensor import MAX_LEVEL
-from sweep.plugins.loading import DeclaredPlugin
-from sweep.plugins.recording import is_recording
+from sweep.plugins.loading import DeclaredPlugin, is_recording
 
 # --------------------------------------------------------------------------------------------------
 # Two kinds of rules: of values that cannot meet on the grid, and of parameters that have no place

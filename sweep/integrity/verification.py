@@ -24,10 +24,9 @@ from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline, cell, parse_selection, selection_text
 from sweep.isolation.child_process import Child, ChildError
 from sweep.isolation.crash_isolation import run_cells_isolated
-from sweep.measure.detectors import OPENCV
+from sweep.measure.detectors import OPENCV, PluginSetting
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest, plain, refusal
-from sweep.plugins.loading import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import scenes_needed
 from sweep.store import blocks, files, lifecycle

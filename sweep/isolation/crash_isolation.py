@@ -16,10 +16,9 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure
 from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildError, ChildRaisedError
-from sweep.measure.detectors import make_detector
+from sweep.measure.detectors import PluginSetting, make_detector
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plugins.loading import PluginSetting
 from sweep.store.blocks import selected
 from sweep.typing import Masks
 

@@ -19,7 +19,7 @@ from sweep.errors import PluginError
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary
 from sweep.model.polygon import side_lengths
-from sweep.plugins.loading import PluginSetting, call, made, real_numbers
+from sweep.plugins.loading import DeclaredPlugin, call, real_numbers
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -356,6 +356,51 @@ def opencv_board(board: Board) -> cv2.aruco.Board:
 
 
 # --------------------------------------------------------------------------------------------------
+# Plug-ins, as detectors and solvers are made from them.
+
+@dataclass(frozen=True, slots=True)
+class PluginSetting:
+    """One setting of a plug-in, as a value: the plug-in itself is imported where it is used.
+
+    Attributes
+    ----------
+    plugin
+        The plug-in.
+    values
+        Name and value of each of its settings.
+    folder
+        Where its file is.
+    """
+
+    plugin: DeclaredPlugin
+    values: tuple[tuple[str, Any], ...]
+    folder: str
+
+    def record(self) -> Any:
+        """Return the plug-in's record; PluginError if it is not the one that was declared."""
+        return self.plugin.record(self.folder)
+
+    def instance(self) -> Any:
+        """Return its settings as an instance of the plug-in's own dataclass; None without.
+
+        PluginError if the dataclass refuses them.
+        """
+        settings = self.record().settings
+        return settings and call(self.plugin.name, partial(settings, **dict(self.values)))
+
+    def made(self, *arguments: Any) -> Callable[..., Any]:
+        """Return the function that its ``make`` returns for these settings and arguments.
+
+        PluginError if it raises, or returns none.
+        """
+        name = self.plugin.name
+        function = call(name, self.record().make, self.instance(), *arguments)
+        if not callable(function):
+            raise PluginError(f"{name}: make returns a {type(function).__name__}, not a function")
+        return cast("Callable[..., Any]", function)
+
+
+# --------------------------------------------------------------------------------------------------
 # A plug-in's detector: its conventions are turned into ours, and what it returns is checked.
 
 #: Markers, or candidates, that are believed of an image with one marker.
@@ -368,15 +413,14 @@ def plugged(setting: PluginSetting) -> FindFunction:
     It raises PluginError, in one line, if the plug-in lacks the dictionary, cannot be made, raises,
     or returns what cannot be a detection.
     """
-    name, record, settings = setting.plugin.name, setting.record(), setting.instance()
+    name, record = setting.plugin.name, setting.record()
 
     @lru_cache(maxsize=64)
     def search_for(dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
         families = record.families
         if families is not None and dictionary not in families:
             raise PluginError(f"{name}: no dictionary {dictionary}; it has {', '.join(families)}")
-        family = dictionary if families is None else families[dictionary]
-        return made(name, record.make, settings, family)
+        return setting.made(dictionary if families is None else families[dictionary])
 
     def quadrilaterals(what: str, returned: Any) -> Floats:
         """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""

@@ -11,13 +11,14 @@ import numpy as np
 
 from sweep.declaration import drawn, parameter
 from sweep.errors import PluginError
+from sweep.measure.detectors import PluginSetting
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator, credible_estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.solver import OPENCV_SOLVERS, Solver
 from sweep.model.lens import COUNTS
 from sweep.plugins import Poses
-from sweep.plugins.loading import DeclaredPlugin, PluginSetting, call, made, real_numbers
+from sweep.plugins.loading import DeclaredPlugin, call, real_numbers
 
 # --------------------------------------------------------------------------------------------------
 # A plug-in's solver: what it returns is checked as our own solvers' poses are.
@@ -33,8 +34,7 @@ def plugged(setting: PluggedEstimatorSetting) -> PoseEstimator:
     them the plug-in uses. It raises PluginError, in one line, if the plug-in raises, or returns
     what cannot be poses.
     """
-    name = setting.solver
-    solve = made(name, setting.own.record().make, setting.own.instance())
+    name, solve = setting.solver, setting.own.made()
 
     def estimates(detections: Detections) -> Estimates:
         count = len(detections)

@@ -15,8 +15,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
 from sweep.plugins import Poses
-from sweep.plugins.loading import PluginSetting
-from sweep.plugins.recording import OF_TARGET, REJECTED, Recording, is_recording
+from sweep.plugins.loading import OF_TARGET, REJECTED, Recording, is_recording
 from sweep.typing import Floats, Grey, Integers
 
 
@@ -157,6 +156,6 @@ def detection_source(
 
     ``keys`` returns the keys (N,) of their images.
     """
-    if isinstance(setting, PluginSetting) and is_recording(setting.plugin.name):
+    if isinstance(setting, detectors.PluginSetting) and is_recording(setting.plugin.name):
         return RecordedSearch(setting.record().recording, scenes, targets, keys())
     return ImageSearch(setting, on_board, scenes, targets)

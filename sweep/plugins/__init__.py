@@ -86,12 +86,9 @@ class Plugin:
     install: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be called, and distributions without names."""
+        """Refuse what cannot be called."""
         if not callable(getattr(self, self.function)):
             raise TypeError(f"{self.function}: expected a class or function")
-        needed: Any = self.distribution
-        if not isinstance(needed, str | Sequence) or not all(isinstance(k, str) for k in needed):
-            raise TypeError(f"distribution = {needed!r}: expected a name, or several")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +113,6 @@ class DetectorPlugin(Plugin):
     margin_px
         Width of the border around the marker whose pixels can change the detection, px, or a
         function from the settings to it: only this is searched. None: the whole frame is.
-    threads
-        Threads that a search uses; runs have a process a processor, so that 1 suits them.
     """
 
     make: Callable[[Any, str], Callable[[Any], Any]]
@@ -125,14 +120,10 @@ class DetectorPlugin(Plugin):
     corner_order: tuple[int, int, int, int] = (0, 1, 2, 3)
     families: Mapping[str, str] | None = field(default=None, hash=False)
     margin_px: int | Callable[[Any], int] | None = None
-    threads: int = 1
 
     def __post_init__(self) -> None:
         """Refuse conventions that cannot be."""
         super().__post_init__()
-        families: Any = self.families
-        if not isinstance(families, Mapping | None):
-            raise TypeError(f"families = {families!r}: expected names by dictionary, or None")
         if sorted(self.corner_order) != [0, 1, 2, 3]:
             raise ValueError(
                 f"corner_order = {self.corner_order!r}: expected the numbers 0 to 3, each once"
@@ -201,8 +192,6 @@ class EffectPlugin(Plugin):
             raise ValueError(f"step = {self.step!r}: expected light or signal")
         if self.widens not in get_args(Widens):
             raise ValueError(f"widens = {self.widens!r}: expected nothing, noise or uneven light")
-        if self.settings is None:
-            raise TypeError("expected settings, of which the first is the switch")
 
 
 @dataclass(frozen=True, kw_only=True)

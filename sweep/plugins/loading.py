@@ -1,4 +1,4 @@
-"""Plug-ins: found by entry point or file, declared, loaded, and called."""
+"""Plug-ins, and recordings of other programs: found by entry point or file, declared, called."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
+import io
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, Self, cast, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from sweep.declaration import Declared, declared_fields
 from sweep.errors import ArgumentError, PluginError
 from sweep.messages import exception_line, nearest, nearest_file, plain
-from sweep.plugins import RECORDS, Plugin, Widens
-from sweep.plugins.recording import is_recording, recorded_detector
+from sweep.plugins import RECORDS, DetectorPlugin, Markers, Plugin, Widens
+from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # Whatever a plug-in prints goes to stderr, and whatever it raises is an error of its own.
@@ -51,17 +51,13 @@ def _its_faults(begin: str, path: str = "") -> Iterator[None]:
     """Raise PluginError for whatever is raised, also for an attempt to exit: one line.
 
     The line begins with a text and ends, for a plug-in in a file, with its line of the file. If
-    memory runs out, or the user interrupts, that is raised. Workers ignore interrupts: there a
-    plug-in raised it itself.
+    memory runs out, or the user interrupts, that is raised.
     """
     try:
         yield
-    except MemoryError:
+    except (MemoryError, KeyboardInterrupt):
         raise
     except BaseException as error:
-        ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-        if isinstance(error, KeyboardInterrupt) and not ignored:
-            raise
         lines = [line for file, line, *_ in traceback.extract_tb(error.__traceback__)
                  if file == path]
         where = f" (line {lines[-1]} of {Path(path).name})" if lines else ""
@@ -79,14 +75,6 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """
     with contextlib.redirect_stdout(sys.stderr), _its_faults(f"{name}: raises"):
         return function(*arguments)
-
-
-def made(name: str, make: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """Return the function that a plug-in's ``make`` returns; raises as :func:`call`."""
-    function = call(name, make, *arguments)
-    if not callable(function):
-        raise PluginError(f"{name}: make returns a {type(function).__name__}, not a function")
-    return cast("Callable[..., Any]", function)
 
 
 def real_numbers(
@@ -136,6 +124,179 @@ def real_numbers(
 
 
 # --------------------------------------------------------------------------------------------------
+# Files of arrays, the same bytes for the same arrays.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFile:
+    """A dataclass of arrays, tuples of texts, texts and numbers that a ``.npz`` file holds.
+
+    Attributes
+    ----------
+    meaning
+        Description of the file, in words that follow "expected".
+    version
+        The number in its array ``version``.
+    shapes
+        Field -> shape of its array: lengths, or letters, each of which stands for one length.
+    """
+
+    meaning: ClassVar[str]
+    version: ClassVar[int]
+    shapes: ClassVar[Mapping[str, tuple[int | str, ...]]]
+
+    def content(self) -> bytes:
+        """Return the content of the file: the same bytes for the same attributes."""
+        file, names = io.BytesIO(), [each.name for each in dataclasses.fields(self)]
+        np.savez_compressed(  # its members have a fixed date
+            file, version=self.version, **{name: getattr(self, name) for name in names})
+        return file.getvalue()
+
+    @classmethod
+    def read(cls, path: str | Path) -> tuple[Self, str]:
+        """Return what a file holds, and the file's SHA-256; it is read once in each process.
+
+        Raises
+        ------
+        PluginError
+            If it cannot be read, or is none; in words that follow "expected".
+        """
+        with reading(cls.meaning, Path(path)):
+            state = Path(path).stat()
+            read: tuple[Self, str] = _read(
+                cast("Any", cls), str(path), state.st_mtime_ns, state.st_size)
+        return read
+
+
+@contextlib.contextmanager
+def reading(what: str, path: Path) -> Iterator[None]:
+    """Raise PluginError, in words that follow "expected", if the file of something is at fault."""
+    try:
+        yield
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or exception_line(error)
+        raise PluginError(
+            f"{what} in {plain(path.parent)} ({plain(reason)}{nearest_file(path)})") from None
+
+
+@lru_cache(maxsize=16)
+def _read(
+    kind: type[ArrayFile], path: str, modified_ns: int, size: int  # noqa: ARG001  (the key)
+) -> Any:
+    """Return what a file holds, and its SHA-256; any exception if it is none."""
+    content, hints = Path(path).read_bytes(), get_type_hints(kind)
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        arrays = dict(archive)
+    if arrays.pop("version") != kind.version:
+        raise ValueError("of another version")
+    record = kind(**{
+        name: hints[name](array.item()) if array.ndim == 0
+        else tuple(array.tolist()) if array.dtype.kind == "U" else array
+        for name, array in arrays.items()})
+    lengths: dict[int | str, int] = {}
+    for name, shape in kind.shapes.items():
+        found = np.shape(getattr(record, name))
+        lengths = dict(zip(shape, found, strict=False)) | lengths
+        wanted = tuple(each if isinstance(each, int) else lengths.get(each, each) for each in shape)
+        if found != wanted:
+            raise ValueError(f"{name}: expected the shape {wanted}, not {found}")
+    return record, hashlib.sha256(content).hexdigest()
+
+
+# --------------------------------------------------------------------------------------------------
+# Recorded detections as a detector.
+#
+# What another program found in exported images is a detector: `sweep score` writes a recording of
+# it, which pipelines name as a file `.npz`.
+
+SUFFIX = ".npz"
+
+#: The ID of a candidate that was not decoded.
+REJECTED = -1
+
+#: The ID of a pose that is of the target as a whole, not of one of its markers.
+OF_TARGET = -2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording(ArrayFile):
+    """Detections of M markers in exported images: frame's pixels, OpenCV's conventions.
+
+    Attributes
+    ----------
+    exported
+        Sorted keys of all images that were exported.
+    image
+        (M,) sorted keys of the images with the markers.
+    marker_id
+        (M,) IDs; :data:`REJECTED` for candidates that were not decoded, :data:`OF_TARGET` for poses
+        of the target as a whole.
+    corners
+        (M, 4, 2) px in the frame; NaN where only a pose was given.
+    rotation, translation
+        (M, 3, 3) and (M, 3): poses, target to camera, metres; NaN where only corners were given.
+    """
+
+    meaning = "detections that `sweep score` recorded"
+    version = 1
+    shapes = {  # noqa: RUF012
+        "exported": ("images",), "image": ("M",), "marker_id": ("M",), "corners": ("M", 4, 2),
+        "rotation": ("M", 3, 3), "translation": ("M", 3)}
+    exported: NDArray[np.uint64]
+    image: NDArray[np.uint64]
+    marker_id: NDArray[np.int64]
+    corners: Floats
+    rotation: Floats
+    translation: Floats
+
+    def rows(self, key: np.uint64) -> slice:
+        """Return the rows of an image.
+
+        Raises
+        ------
+        PluginError
+            If the image was not exported.
+        """
+        listed, rows = (
+            slice(*(int(np.searchsorted(keys, key, side)) for side in ("left", "right")))
+            for keys in (self.exported, self.image))
+        if listed.start == listed.stop:
+            raise PluginError(
+                "its image is not among those that were exported; export it, and score again")
+        return rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedDetector(DetectorPlugin):
+    """A detector whose detections are those of a recording, whatever the image."""
+
+    recording: Recording
+
+
+def is_recording(name: str) -> bool:
+    """Return whether a detector's name is the file of recorded detections.
+
+    >>> is_recording("mine.npz"), is_recording("opencv")
+    (True, False)
+    """
+    return name.endswith(SUFFIX)
+
+
+def recorded_detector(path: Path) -> tuple[RecordedDetector, str]:
+    """Return the detector of a file of recorded detections, and the file's SHA-256.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be read, or is none; in words that follow "expected".
+    """
+    recording, digest = Recording.read(path)
+    return RecordedDetector(
+        make=lambda settings, family: lambda image: Markers((), ()),  # noqa: ARG005
+        margin_px=0, meaning="detections that another program made", recording=recording,
+    ), digest
+
+
+# --------------------------------------------------------------------------------------------------
 # Plug-ins by name: entry points, whose names are read without importing, and files.
 #
 # A file is executed from the bytes whose digest is taken. It is a module of its own: one that
@@ -155,15 +316,15 @@ def offered(kind: str) -> EntryPoints:
 
 def _entry_point(kind: str, name: str) -> EntryPoint:
     """Return an installed plug-in's entry point; PluginError if not exactly one has the name."""
-    names = sorted(offered(kind).names)
-    found = [each for each in offered(kind) if each.name == name]
-    if not found:
-        hint = nearest(name, names) or f"; installed: {', '.join(names) or 'none'}"
-        raise PluginError(f"an installed {kind} plug-in, or file:name beside the pipeline{hint}")
-    if len(found) > 1:
+    entries, names = offered(kind), sorted(offered(kind).names)
+    found = tuple(entries.select(name=name))
+    if len(found) == 1:
+        return found[0]
+    if found:
         owners = " and ".join(sorted(each.dist.name for each in found if each.dist))
         raise PluginError(f"a name that one distribution offers: {owners} both have it")
-    return found[0]
+    hint = nearest(name, names) or f"; installed: {', '.join(names) or 'none'}"
+    raise PluginError(f"an installed {kind} plug-in, or file:name beside the pipeline{hint}")
 
 
 def file_of(name: str) -> str:
@@ -203,13 +364,8 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
     if is_recording(name):
         found, digest = recorded_detector(path)
     elif file_of(name):
-        try:
+        with reading(f"the file {plain(file_of(name))}", path):
             source = path.read_bytes()
-        except (OSError, ValueError) as error:
-            reason = f"{getattr(error, 'strerror', None) or error}{nearest_file(path)}"
-            raise PluginError(
-                f"the file {plain(file_of(name))} in {plain(folder)} ({reason}); packages offer "
-                "plug-ins by entry points") from None
         digest = hashlib.sha256(source).hexdigest()
         names, attribute = vars(_module(str(path), digest, source)), name.rpartition(":")[2]
         if attribute not in names:
@@ -227,10 +383,10 @@ def load(kind: str, name: str, folder: str) -> tuple[Plugin, str, Versions]:
     if not isinstance(found, record):
         raise PluginError(f"a record {record.__name__}, not a value of type {type(found).__name__}")
     needed = found.distribution
-    for distribution in [needed] * bool(needed) if isinstance(needed, str) else needed:
+    for distribution in (needed,) if isinstance(needed, str) else needed:
         try:
             versions[distribution] = importlib.metadata.version(distribution)
-        except importlib.metadata.PackageNotFoundError:
+        except Exception:  # also of what is no name
             command = found.install or f"pip install {distribution}"
             raise PluginError(f"the distribution {distribution}, which is not installed: "
                               f"`{command}`") from None
@@ -267,6 +423,9 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
 #: Types that a setting may have.
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
 
+#: Declarations that are taken over from a plug-in's record.
+TRAITS = ("needs_images", "of_boards", "random", "widens", "step")
+
 #: Key of the plug-ins in a store's metadata.
 RECORDED = "plugins"
 
@@ -289,8 +448,6 @@ class DeclaredPlugin:
         Its settings.
     dictionaries
         Dictionaries that a detector knows; empty for all.
-    threads
-        Threads that it uses.
     needs_images, of_boards, random, widens, step
         As :class:`sweep.plugins.EstimatorPlugin` and :class:`sweep.plugins.EffectPlugin` have them.
     """
@@ -303,7 +460,6 @@ class DeclaredPlugin:
     digest: str = ""
     settings: tuple[Declared, ...] = ()
     dictionaries: tuple[str, ...] = ()
-    threads: int = 1
     needs_images: bool = False
     of_boards: bool = False
     random: bool = False
@@ -333,27 +489,11 @@ class DeclaredPlugin:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a store records it."""
-        settings = [
-            {field.name: value for field in dataclasses.fields(setting)
-             if (value := getattr(setting, field.name)) != field.default}
-            | {"types": [kind.__name__ for kind in setting.types]}
-            for setting in self.settings
-        ]
+        settings = [  # what is not given is left out
+            {key: value for key, value in vars(setting).items()
+             if value != getattr(Declared, key, dataclasses.MISSING)}
+            | {"types": [kind.__name__ for kind in setting.types]} for setting in self.settings]
         return dataclasses.asdict(self) | {"versions": dict(self.versions), "settings": settings}
-
-    @staticmethod
-    def from_json(record: Mapping[str, Any]) -> DeclaredPlugin:
-        """Return the plug-in of a record; AttributeError, KeyError or TypeError if it is none."""
-        settings = tuple(
-            Declared(**_with_tuples(setting) | {
-                "types": tuple(TYPES[kind] for kind in setting["types"])})
-            for setting in record["settings"])
-        return DeclaredPlugin(**_with_tuples(record) | {
-            "versions": tuple(sorted(record["versions"].items())), "settings": settings})
-
-
-def _with_tuples(table: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
 
 
 def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
@@ -364,38 +504,18 @@ def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
     KeyError, TypeError, ValueError, AttributeError
         If they are not what :meth:`DeclaredPlugin.to_json` returns.
     """
-    return tuple(map(DeclaredPlugin.from_json, metadata.get(RECORDED, ())))
+    def fields(table: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+        return {key: tuple(value) if isinstance(value, list) else value
+                for key, value in table.items()} | others
 
-
-@dataclass(frozen=True, slots=True)
-class PluginSetting:
-    """One setting of a plug-in, as a value: the plug-in itself is imported where it is used.
-
-    Attributes
-    ----------
-    plugin
-        The plug-in.
-    values
-        Name and value of each of its settings.
-    folder
-        Where its file is.
-    """
-
-    plugin: DeclaredPlugin
-    values: tuple[tuple[str, Any], ...]
-    folder: str
-
-    def record(self) -> Any:
-        """Return the plug-in's record; PluginError if it is not the one that was declared."""
-        return self.plugin.record(self.folder)
-
-    def instance(self) -> Any:
-        """Return its settings as an instance of the plug-in's own dataclass; None without.
-
-        PluginError if the dataclass refuses them.
-        """
-        settings = self.record().settings
-        return settings and call(self.plugin.name, partial(settings, **dict(self.values)))
+    plugins = []
+    for plugin in metadata.get(RECORDED, ()):
+        settings = tuple(
+            Declared(**fields(each, types=tuple(TYPES[kind] for kind in each["types"])))
+            for each in plugin["settings"])
+        versions = tuple(sorted(plugin["versions"].items()))
+        plugins.append(DeclaredPlugin(**fields(plugin, versions=versions, settings=settings)))
+    return tuple(plugins)
 
 
 def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
@@ -407,32 +527,28 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
         In one line, what was expected instead.
     """
     record, digest, versions = load(kind, name, folder)
-    traits = ("threads", "needs_images", "of_boards", "random", "widens", "step")
     return DeclaredPlugin(
         kind, name, record.meaning, versions, file_of(name), digest, _settings(kind, record),
         tuple(getattr(record, "families", None) or ()),
-        **{trait: getattr(record, trait) for trait in traits if hasattr(record, trait)},
+        **{trait: value for trait, value in vars(record).items() if trait in TRAITS},
     )
 
 
 def _settings(kind: str, record: Plugin) -> tuple[Declared, ...]:
     """Return the settings that a plug-in's dataclass declares."""
-    if record.settings is None:
-        return ()
     types = [name for name in TYPES if name != "str" or kind not in ("effect", "renderer")]
-    declared: list[Declared] = []
-    try:
-        wrong = [each.name for each in dataclasses.fields(record.settings)
-                 if "declaration" not in each.metadata]
-        declared += () if wrong else declared_fields(record.settings).values()
+    expected = (
+        f"settings of the {kind} as a dataclass with `name: type = parameter(default, meaning)`, "
+        f"of the types {', '.join(types)}; not so:")
+    with _its_faults(expected):
+        fields = dataclasses.fields(record.settings) if record.settings else ()
+        wrong = [each.name for each in fields if "declaration" not in each.metadata]
+        declared = [] if wrong or not record.settings else [
+            *declared_fields(record.settings).values()]
         wrong += [each.name for each in declared
                   if each.reads or not {one.__name__ for one in each.types} <= {*types}]
-    except Exception as error:
-        wrong = [exception_line(error)]
     if wrong:
-        raise PluginError(
-            f"settings of the {kind} as a dataclass with `name: type = parameter(default, "
-            f"meaning)`, of the types {', '.join(types)}; not so: {', '.join(wrong)}")
+        raise PluginError(f"{expected} {', '.join(wrong)}")
     if kind == "effect" and not declared:
         raise PluginError("settings, of which the first switches the effect on")
     return tuple(declared)

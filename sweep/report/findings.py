@@ -26,7 +26,7 @@ from sweep.execution.runner import execute
 from sweep.experiment.draws import REPLICATES
 from sweep.experiment.pipeline import parse_selection
 from sweep.messages import label, nearest, notice, quoted
-from sweep.plugins.recording import is_recording
+from sweep.plugins.loading import is_recording
 from sweep.report import table as tables
 from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file

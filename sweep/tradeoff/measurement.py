@@ -24,8 +24,7 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
-from sweep.plugins.loading import printing_to_stderr
-from sweep.plugins.recording import is_recording
+from sweep.plugins.loading import is_recording, printing_to_stderr
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_groups
 from sweep.store.lock import changing
 from sweep.store.provenance import differences

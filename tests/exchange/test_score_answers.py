@@ -21,7 +21,7 @@ from sweep.exchange.score import prepare
 from sweep.experiment.grid import Block
 from sweep.experiment.pipeline import Pipeline, cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plugins.recording import Recording
+from sweep.plugins.loading import Recording
 from sweep.store.lifecycle import open_store
 
 DICTIONARIES = 'dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]'

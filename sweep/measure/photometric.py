@@ -22,7 +22,7 @@ from sweep.measure.solver import (
     reprojection_px,
 )
 from sweep.model.board import box_corners, extent_of, own_sheets, sheets_m, unit_m
-from sweep.model.coverage import LEVELS, POSE
+from sweep.model.coverage import POSE
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
 from sweep.typing import Floats
@@ -30,23 +30,24 @@ from sweep.typing import Floats
 # --------------------------------------------------------------------------------------------------
 # First poses of one target, marker or board, and the part of the image that is fitted.
 
-def marker_poses(detections: Detections, *, refined: bool) -> list[list[Pose]]:
-    """Return both planar solutions of each marker's corners, then of its refined corners."""
+def marker_poses(detections: Detections, *, refined: bool) -> tuple[Floats, Floats]:
+    """Return both planar solutions of each marker's corners, then of its refined corners.
+
+    Rotations (N, K, 3, 3) and translations (N, K, 3); K is 2 or 4.
+    """
     found = [detections.corners, *([refined_corners(detections)] if refined else [])]
     solved = [
         both_planar_solutions(corners, detections.cameras, detections.size_m) for corners in found
-    ] if len(detections) else []
-    return [
-        [(rotation[i, k], translation[i, k]) for rotation, translation in solved for k in range(2)]
-        for i in range(len(detections))
     ]
+    rotations, translations = zip(*solved, strict=True)
+    return np.concatenate(rotations, axis=1), np.concatenate(translations, axis=1)
 
 
-def board_poses(one: Detections, *, refined: bool) -> list[Pose]:
+def board_poses(one: Detections, *, refined: bool) -> tuple[Floats, Floats]:
     """Return poses of a board from its corners, and from those after ``cv2.cornerSubPix``.
 
-    The poses from the corners of all markers, and that of the marker on which most of the others
-    agree: one marker that is wrong spoils the former.
+    Rotations (K, 3, 3) and translations (K, 3). The poses from the corners of all markers, and that
+    of the marker on which most of the others agree: one marker that is wrong spoils the former.
     """
     poses: list[Pose] = []
     points = one.objects_m.reshape(-1, 3)
@@ -58,7 +59,8 @@ def board_poses(one: Detections, *, refined: bool) -> list[Pose]:
             each = poses_of_each_marker(points, pixels, one.cameras)
             away = [_typical_error_px(pose, one, corners) for pose in each]
             poses += [each[k] for k in np.argsort(away)[:1].tolist() if math.isfinite(away[k])]
-    return poses
+    rotations, translations = zip(*poses, strict=True) if poses else ((), ())
+    return np.reshape(rotations, (-1, 3, 3)), np.reshape(translations, (-1, 3))
 
 
 def _typical_error_px(pose: Pose, one: Detections, corners: Floats) -> float:
@@ -88,58 +90,64 @@ def refined_corners(detections: Detections) -> Floats:
     return refined
 
 
-def start_states(poses: list[Pose], middle: Floats, spread_px: float) -> Floats:
+def start_states(
+    rotations: Floats, translations: Floats, middle: Floats, spread_px: float
+) -> Floats:
     """Return the states (K, 18) of a target's middle at the finite ones of some poses."""
-    levels = np.zeros(LEVELS)
-    states = [
-        likelihood.state_of(rotation, translation + rotation @ middle, spread_px, levels)
-        for rotation, translation in poses
-    ]
-    return np.array([each for each in states if np.isfinite(each).all()])
+    states = np.zeros((len(rotations), likelihood.STATE_LENGTH))
+    states[:, likelihood.ROTATION] = rotations.reshape(-1, 9)
+    states[:, POSITION] = translations + rotations @ middle
+    states[:, likelihood.SPREAD] = spread_px
+    return states[np.isfinite(states).all(axis=1)]
 
 
-def first_side_m(one: Detections) -> float:
+def first_side_m(detections: Detections, row: int) -> float:
     """Return the assumed side of a target's first marker."""
-    target = one.targets[0]
+    target = detections.targets[row]
     if target.is_marker:
-        return float(one.size_m[0])
-    return float(one.scale[0]) * unit_m(target) * module_count(target.dictionary)
+        return float(detections.size_m[row])
+    return float(detections.scale[row]) * unit_m(target) * module_count(target.dictionary)
 
 
-def window_of(one: Detections, poses: list[Pose]) -> list[int]:
-    """Return the fitted part of the image: left, top, right, bottom.
+def window_of(
+    detections: Detections, row: int, rotations: Floats, translations: Floats
+) -> list[int]:
+    """Return the fitted part of a target's image: left, top, right, bottom.
 
     Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
-    of a board its sheet in any of the poses.
+    of a board its sheet in any of the poses (K, 3, 3), (K, 3).
     """
-    (target,), (image,), (origin,) = one.targets, one.images, one.origins
+    target = detections.targets[row]
     modules = module_count(target.dictionary)
+    margin = likelihood.BACKGROUND_MARGIN_PX
     if target.is_marker:
-        low, high = one.corners[0].min(axis=0), one.corners[0].max(axis=0)
-        share = 1.5 * (target.margin or 0.0) / modules
-        margin = likelihood.BACKGROUND_MARGIN_PX + share * (high - low)
-        low, high = low - margin, high + margin
+        low, high = detections.corners[row].min(axis=0), detections.corners[row].max(axis=0)
+        margin = margin + 1.5 * (target.margin or 0.0) / modules * (high - low)
     else:
-        scale = first_side_m(one) / modules
+        scale = first_side_m(detections, row) / modules
         sheet = (
             box_corners(extent_of(target).target[None]) * scale if target.is_planar
             else sheets_m(target)[: own_sheets(target)].reshape(1, -1, 3)
             * (scale / unit_m(target))
         )
+        camera = detections.cameras.take(np.array([row]))
         pixels = np.concatenate([
-            one.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
-            for rotation, translation in poses
+            camera.project(transform_points(sheet, rotation[None], translation[None]))[0]
+            for rotation, translation in zip(rotations, translations, strict=True)
         ])
-        if not np.isfinite(pixels).any():
+        pixels = pixels[np.isfinite(pixels).all(axis=1)]
+        if not len(pixels):
             return [0, 0, 0, 0]
-        low = np.nanmin(pixels, axis=0) - likelihood.BACKGROUND_MARGIN_PX
-        high = np.nanmax(pixels, axis=0) + likelihood.BACKGROUND_MARGIN_PX
-    size = np.array(image.shape[::-1])
-    window: list[int] = np.concatenate([
-        np.clip(np.floor(low) - origin, 0, size),
-        np.clip(np.ceil(high) + 1 - origin, 0, size),
-    ]).astype(np.int64).tolist()
-    return window
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+    height, width = detections.images[row].shape
+    origin = detections.origins[row]
+    left, top = (low - margin - origin).tolist()
+    right, bottom = (high + margin - origin).tolist()
+    # Origins are whole numbers: the part begins and ends at whole pixels of the frame.
+    return [
+        min(max(math.floor(left), 0), width), min(max(math.floor(top), 0), height),
+        min(max(math.ceil(right) + 1, 0), width), min(max(math.ceil(bottom) + 1, 0), height),
+    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -179,15 +187,19 @@ class Photometric:
         out = Estimates.none(len(detections), EstimateStatus.solver_failed)
         other_translation = np.full((len(detections), 3), np.nan)
         markers = detections.targets.are_markers
-        planar = marker_poses(detections, refined=self.refined) if markers else []
+        if markers and len(detections):
+            planar = marker_poses(detections, refined=self.refined)
+        points = 4 * np.bincount(detections.owner, minlength=len(detections))
         for i in range(len(detections)):
-            one = detections.take(np.array([i]))
-            if one.corners.size < 2 * MIN_POINTS:
+            if points[i] < MIN_POINTS:
                 out.status[i] = EstimateStatus.too_few_points
                 continue
-            poses = planar[i] if markers else board_poses(one, refined=self.refined)
-            middle = float(one.scale[0]) * likelihood.middle_m(one.targets[0])
-            states = self._fitted(one, poses, middle, out, i) if poses else None
+            poses = (
+                (planar[0][i], planar[1][i]) if markers
+                else board_poses(detections.take(np.array([i])), refined=self.refined)
+            )
+            middle = float(detections.scale[i]) * likelihood.middle_m(detections.targets[i])
+            states = self._fitted(detections, i, poses, middle, out)
             if states is None:
                 continue
             (rotation, position), (turned, moved) = (
@@ -195,7 +207,7 @@ class Photometric:
             )
             out.rotation[i], out.translation[i] = rotation, position
             out.alternative_rotation[i], other_translation[i] = turned, moved - turned @ middle
-            out.point_count[i] = one.corners.size // 2
+            out.point_count[i] = points[i]
             arm = -rotation @ middle
             if arm.any():
                 out.translation[i] += arm
@@ -206,49 +218,55 @@ class Photometric:
         return out
 
     def _fitted(
-        self, one: Detections, poses: list[Pose], middle: Floats, out: Estimates, i: int
+        self, detections: Detections, row: int, poses: tuple[Floats, Floats], middle: Floats,
+        out: Estimates,
     ) -> tuple[Floats, Floats] | None:
-        """Write all but poses of an estimate; return the states of the best and next minimum.
+        """Write all but poses of a row's estimate; return the states of the best and next minimum.
 
-        Returns None if there is no pose. ``middle`` (3,) is what states are the pose of.
+        Returns None if there is no pose. The fit starts at ``poses``, rotations (K, 3, 3) and
+        translations (K, 3); ``middle`` (3,) is what states are the pose of.
         """
-        noise_grey, blur_px = float(one.noise_grey[0]), float(one.blur_px[0])
+        noise_grey, blur_px = float(detections.noise_grey[row]), float(detections.blur_px[row])
         spread = max(blur_px, LIKELY_SPREAD_PX) if self.spread_free else blur_px
-        starts = start_states(poses, middle, spread)
-        left, top, right, bottom = window_of(one, poses)
-        if not len(starts) or right - left < 2 or bottom - top < 2:
+        starts = start_states(*poses, middle, spread)
+        if not len(starts):
             return None
-        image = one.images[0][top:bottom, left:right].astype(np.float64)
-        if len(one.beside):
-            image[one.beside[0][top:bottom, left:right]] = np.nan
+        left, top, right, bottom = window_of(detections, row, *poses)
+        if right - left < 2 or bottom - top < 2:
+            return None
+        image = detections.images[row][top:bottom, left:right].astype(np.float64)
+        if len(detections.beside):
+            image[detections.beside[row][top:bottom, left:right]] = np.nan
         free = POSE + 1 if self.spread_free else POSE
         information = np.empty((free, free))
+        target = detections.targets[row]
 
         def seen_from(pose: Pose) -> likelihood.MarkerView:
             return likelihood.marker_view(
-                one.targets[0], first_side_m(one), one.cameras.optics(0),
-                one.origins[0] + np.array([left, top]), likelihood.noise_variance(noise_grey), pose,
+                target, first_side_m(detections, row), detections.cameras.optics(row),
+                detections.origins[row] + np.array([left, top]),
+                likelihood.noise_variance(noise_grey), pose,
             )
 
-        view = seen_from(poses[0])
+        view = seen_from((poses[0][0], poses[1][0]))
         state, level, reached, other, freedom = (
-            likelihood.locate_exactly(image, starts, view, information) if one.targets[0].is_planar
+            likelihood.locate_exactly(image, starts, view, information) if target.is_planar
             else likelihood.locate_in_sight(image, starts, view, seen_from, information)
         )
         if not math.isfinite(level) or freedom < 1:
             return None
         if not reached:
-            out.status[i] = EstimateStatus.not_converged
+            out.status[row] = EstimateStatus.not_converged
             return None
         chi_square = level / view.variance
-        out.status[i] = (
+        out.status[row] = (
             EstimateStatus.solved if likelihood.explains(chi_square, freedom, noise_grey)
             else EstimateStatus.not_explained
         )
         covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
         if exists:
-            out.covariance[i] = covariance
-        out.residual_ratio[i] = chi_square / freedom
+            out.covariance[row] = covariance
+        out.residual_ratio[row] = chi_square / freedom
         return state, other
 
 
@@ -265,14 +283,17 @@ class PhotometricReal(Photometric):
     tone: bool
 
     def _fitted(
-        self, one: Detections, poses: list[Pose], middle: Floats, out: Estimates, i: int
+        self, detections: Detections, row: int, poses: tuple[Floats, Floats], middle: Floats,
+        out: Estimates,
     ) -> tuple[Floats, Floats] | None:
         # The first of the two planar solutions of each set of corners: the other one is its mirror.
-        starts = start_states(poses[::2], middle, FIRST_SPREAD_PX)
+        starts = start_states(poses[0][::2], poses[1][::2], middle, FIRST_SPREAD_PX)
+        target, on_board = detections.targets[row], detections.on_board
         view = photograph_view(
-            one.targets[0], one.on_board[0] if one.on_board else None, float(one.size_m[0]),
-            one.corners[0], one.cameras.optics(0), one.images[0], one.origins[0], self.tone,
-        ) if len(starts) and one.targets.are_markers else None
+            target, on_board[row] if on_board else None, float(detections.size_m[row]),
+            detections.corners[row], detections.cameras.optics(row), detections.images[row],
+            detections.origins[row], self.tone,
+        ) if len(starts) and target.is_marker else None
         if view is None or pixel_count(view) <= SIZE:
             return None
         covariance = np.empty((POSE, POSE))
@@ -280,15 +301,15 @@ class PhotometricReal(Photometric):
         if not math.isfinite(level):
             return None
         if not reached:
-            out.status[i] = EstimateStatus.not_converged
+            out.status[row] = EstimateStatus.not_converged
             return None
         largest = math.inf if math.isnan(misfit) else covariance.diagonal()[:3].max()
         if abs(state[WHITE] - state[BLACK]) < MIN_CONTRAST or not largest < math.pi**2:
             return None
-        out.status[i] = (
+        out.status[row] = (
             EstimateStatus.not_explained if misfit > MAX_MISFIT_PX else EstimateStatus.solved
         )
-        out.covariance[i], out.misfit_px[i] = covariance, misfit
-        noise = likelihood.noise_variance(float(one.noise_grey[0]))
-        out.residual_ratio[i] = level / (noise * freedom)
+        out.covariance[row], out.misfit_px[row] = covariance, misfit
+        noise = likelihood.noise_variance(float(detections.noise_grey[row]))
+        out.residual_ratio[row] = level / (noise * freedom)
         return state, other

@@ -52,9 +52,9 @@ class Pair:
         self._arrays = arrays
 
     @property
-    def draws(self) -> Masks:
-        """Which draws were run in both: (groups, cells, draws)."""
-        return self.first.draws & self.second.draws
+    def run(self) -> Masks:
+        """Poses that were run in both."""
+        return self.first.run & self.second.run
 
     @property
     def compared(self) -> Masks:

@@ -39,8 +39,8 @@ class DrawnPoses(Protocol):
     """A view of a block's poses: what statistics read."""
 
     @property
-    def draws(self) -> Masks:
-        """Which draws were run: (groups, cells, draws)."""
+    def run(self) -> Masks:
+        """Which poses were run: (groups, cells, draws, settings)."""
         ...
 
 
@@ -89,6 +89,8 @@ class Columns(Generic[ViewT]):
             cuts.append([slice(start, start + step) for start in range(0, max(length, 1), step)])
         self._blocks = list(itertools.product(*cuts))
         self._views: dict[int, ViewT] = {}
+        #: Means (groups, components) by the functions of their values and of the poses that count.
+        self.means: dict[tuple[Any, Any], Floats] = {}
 
     def map(self, function: Callable[[ViewT, tuple[slice, ...]], ResultT]) -> list[ResultT]:
         """Return the results of a function of each block's view and place."""
@@ -598,7 +600,8 @@ class Mean(Statistic[ViewT]):
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
         """Return value, low and high."""
         sums = self.sums(columns)
-        return symmetric(sums.estimate(sums.mean[:, 0], sums.values[..., 0]), level)
+        columns.means[self.values, self.used] = mean = sums.mean
+        return symmetric(sums.estimate(mean[:, 0], sums.values[..., 0]), level)
 
     def sums(
         self, columns: Columns[ViewT], centre: Floats | None = None, *, largest: bool = False
@@ -615,7 +618,7 @@ class Mean(Statistic[ViewT]):
             if centre is not None:
                 values = component_sum(
                     np.square(values - centre[groups, None, None, None]))[..., None]
-            sums = [np.where(used[..., None], values, 0.0), used, poses.draws[..., None]]
+            sums = [np.where(used[..., None], values, 0.0), used, poses.run]
             if largest:
                 sums.append(np.where(used, values[..., 0], -np.inf).max(
                     axis=3, initial=-np.inf)[..., None])
@@ -639,7 +642,8 @@ class MeanLength(Mean[ViewT]):
     def interval(self, columns: Columns[ViewT], design: Design, level: float) -> Interval:  # noqa: ARG002
         """Return value, low and high."""
         sums = self.sums(columns)
-        mean, components = sums.mean, sums.mean.shape[1]
+        columns.means[self.values, self.used] = mean = sums.mean
+        components = mean.shape[1]
         length = np.linalg.norm(mean, axis=1)
         with np.errstate(all="ignore"):
             direction = np.where(
@@ -746,7 +750,9 @@ class StandardDeviation(RootMeanSquare[ViewT]):
 
     def scores(self, columns: Columns[ViewT], *, largest: bool) -> Sums:
         """Return the sums of squared distances to the mean, each times n / (n - 1)."""
-        sums = self.sums(columns, self.sums(columns).mean, largest=largest)
+        centre = columns.means.get((self.values, self.used))  # of the bias
+        centre = self.sums(columns).mean if centre is None else centre
+        sums = self.sums(columns, centre, largest=largest)
         n = Sample(sums.used).n[:, None, None]
         with np.errstate(all="ignore"):
             factor = n / (n - 1.0)

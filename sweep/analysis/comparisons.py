@@ -18,7 +18,7 @@ from scipy import special
 from sweep.analysis import dataset, estimator, intervals
 from sweep.analysis.dataset import DRAWS, ERROR_INPUTS, QUANTITIES, Poses, Quantity, axes_of
 from sweep.analysis.estimator import INTERVAL, Bins, Columns, Count, Design, Mean, Output, Statistic
-from sweep.analysis.intervals import LEVEL, MIN_UNITS
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.summaries import DETECTION_RATE, FLIP_RATE
 from sweep.errors import ArgumentError, DatasetError
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED, Stage
@@ -267,18 +267,29 @@ class RateDifference(Statistic[Pair]):
             lessened = np.where(cross > 0, corrected, cross * scale**2)
             correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
 
-            def reach(up: Floats, down: Floats) -> Floats:
-                squares = up**2 - 2 * correlation * up * down + down**2
-                return np.sqrt(np.maximum(squares, 0.0))
-
-            difference = rates[0] - rates[1]
-            low = difference - reach(rates[0] - ends[0][0], ends[1][1] - rates[1])
-            high = difference + reach(ends[0][1] - rates[0], rates[1] - ends[1][0])
+            difference, low, high = difference_interval(
+                (rates[1], *ends[1]), (rates[0], *ends[0]), correlation)
         _, fewer = estimator.scaled_to_draws(np.minimum(first, second), n, draws)
         discordant = np.maximum(estimator.scaled_to_draws(first + second, n, draws)[0], fewer)
         p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
         return [*counts, difference, *(
             np.where(compared.drawn, each, np.nan) for each in (low, high, p_value))]
+
+
+def difference_interval(first: Any, second: Any, correlation: Any) -> tuple[Any, Any, Any]:
+    """Return the difference of two estimates, second minus first, and the ends of its interval.
+
+    It follows from their own intervals, ``first`` and ``second`` being (value, low, high), and the
+    correlation of their errors: Newcombe, as above; of any estimates Zou, "Toward using confidence
+    intervals to compare correlations", Psychological Methods 12, 2007.
+    """
+    def reach(up: Any, down: Any) -> Any:
+        return np.sqrt(np.maximum(up**2 - 2 * correlation * up * down + down**2, 0.0))
+
+    (value, low, high), (other, other_low, other_high) = first, second
+    difference = other - value
+    return (difference, difference - reach(other - other_low, high - value),
+            difference + reach(other_high - other, value - low))
 
 
 def _differences(quantity: Quantity) -> list[PairStatistic]:
@@ -767,15 +778,12 @@ class Sides(NamedTuple):
         Edges of the bins, by name.
     paired
         Whether the simulation is the photographs' twin.
-    single
-        Whether each unit of the simulation has one marker.
     """
 
     datasets: tuple[xr.Dataset, xr.Dataset]
     kept: tuple[str, ...]
     bins: Bins
     paired: bool
-    single: bool
 
     def poses(self) -> list[Poses]:
         """Return the poses within the bins of both, (configurations, 1, units, markers)."""
@@ -806,7 +814,7 @@ def matched_sides(
         )
     for side in (photographs, simulated):
         dataset.require_poses(side)
-    paired, single = is_twin(simulated), not dataset.of_photographs(simulated)
+    paired = is_twin(simulated)
     first, second, kept = _same_configurations(photographs, simulated, paired=paired)
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
@@ -823,12 +831,12 @@ def matched_sides(
         first, second = first.isel({DRAWS: some}), _gathered(second, at)
         if std is not None:
             second = _with_uncertain_truth(second, _gathered(std, at), kept)
-    elif single and scene:
+    elif scene and not dataset.of_photographs(simulated):
         # Each scene counts as a photograph.
         second = second.drop_vars(DRAWS, errors="ignore").stack(
             unit=sorted(scene, key=lambda name: name != DRAWS), create_index=False)
         second = second.rename(unit=DRAWS).assign_coords({PHOTOGRAPHS: ""})
-    return Sides((first, second), kept, bins, paired, single)
+    return Sides((first, second), kept, bins, paired)
 
 
 def is_measured(results: xr.Dataset) -> bool:
@@ -949,24 +957,22 @@ SOURCES = ("photographs", "simulated")
 
 PERCENTS = {"median": 50, "p90": 90}
 
+#: Photographs from which errors have intervals.
+MIN_UNITS = 5
+
+#: The dimension of photographs, or simulated scenes.
+UNIT = "unit"
+
 
 class ComparedRate(estimator.Rate[Poses]):
     """A rate that is compared by its difference."""
 
     ratio = False
 
-    def gap(self, first: xr.Dataset, second: xr.Dataset) -> tuple[xr.DataArray, ...]:
-        """Return the difference of two tables' rates, with its interval."""
-        (value, low, high), (other, other_low, other_high) = (
-            [table[f"{self.name}{end}"] for end in INTERVAL] for table in (first, second))
-        gap = other - value
-        return (gap, gap - np.hypot(other - other_low, high - value),
-                gap + np.hypot(other_high - other, value - low))
-
 
 @dataclass(frozen=True)
 class SolvedQuantile(Statistic[Poses]):
-    """A quantile of the errors (...) of solved poses, with the replicates of its bootstrap.
+    """A quantile of the errors (...) of solved poses.
 
     Attributes
     ----------
@@ -974,19 +980,20 @@ class SolvedQuantile(Statistic[Poses]):
         Of the errors, at or below it.
     ratio
         Whether it is compared by its ratio, or else by its difference.
-    single
-        Whether each unit has one marker at most.
     """
 
     error: Callable[[Poses], Floats]
     percent: int = 50
     ratio: bool = False
-    single: bool = False
+
+    @property
+    def below(self) -> str:
+        """Name of the number of errors (unit,) at or below it, minus the expected number."""
+        return f"{self.name}_below"
 
     def outputs(self) -> Sequence[Output]:
-        """Return the quantile with its interval, its units, and the replicates."""
-        return [*super().outputs(), Output(f"{self.name}_units", "", "1", "i8"),
-                Output(f"{self.name}_replicates", "", self.units, dims=("replicate",))]
+        """Return the quantile with its interval, and what each unit has below it."""
+        return [*super().outputs(), Output(self.below, "", "1", dims=(UNIT,))]
 
     def arrays(self, columns: Columns[Poses], design: Design) -> Sequence[NDArray[Any]]:
         """Return these; without an interval of fewer than `MIN_UNITS` units."""
@@ -994,27 +1001,12 @@ class SolvedQuantile(Statistic[Poses]):
             errors = self.error(poses)
             return [np.where(poses.solved & np.isfinite(errors), errors, np.nan)]
 
-        errors, = columns.joined(solved)  # without cells if there is nothing
-        errors = errors.reshape(len(errors), errors.shape[2], errors.shape[1] * errors.shape[3])
-        used = ~np.isnan(errors)
-        units = used.any(axis=2).sum(axis=1)
-        interval = estimator.quantile_intervals(
-            errors[:, None], used.sum(axis=2)[:, None], [self.percent], design)[:, 0]
-        interval[units < MIN_UNITS, 1:] = np.nan
-        counts = None if self.single else intervals.unit_counts(errors.shape[1])
-        replicates = [intervals.resampled_quantiles(*each, counts, self.percent / 100.0)
-                      for each in zip(errors, used, strict=True)]
-        return [*interval.T, units, np.array(replicates)]
-
-    def gap(self, first: xr.Dataset, second: xr.Dataset) -> tuple[xr.DataArray, ...]:
-        """Return the ratio or the difference of two tables' quantiles, with its interval."""
-        compared = np.divide if self.ratio else np.subtract
-        value, replicates = (compared(second[name], first[name])
-                             for name in (self.name, f"{self.name}_replicates"))
-        units = np.minimum(first[f"{self.name}_units"], second[f"{self.name}_units"])
-        return (value, *xr.apply_ufunc(
-            intervals.percentile_interval, replicates, units, input_core_dims=[["replicate"], []],
-            output_core_dims=[[], []], vectorize=True))
+        errors, = columns.joined(solved)  # a single cell; none if there is nothing
+        used = (~np.isnan(errors)).sum(axis=3)
+        interval = estimator.quantile_intervals(errors, used, [self.percent], design)[:, 0]
+        interval[(used > 0).sum(axis=(1, 2)) < MIN_UNITS, 1:] = np.nan
+        below = (errors <= interval[:, :1, None, None]).sum(axis=3) - self.percent / 100.0 * used
+        return [*interval.T, below.sum(axis=1)]
 
 
 GAP_RATES = tuple(ComparedRate(each.name, each.meaning, each.successes, each.used)
@@ -1089,10 +1081,9 @@ def simulation_gap(
 
     95 % intervals in which a photograph with all its markers is the draw; NaN of errors in fewer
     than five photographs. Of rates and quantiles they are as in `sweep.analysis.error_statistics`;
-    of differences of rates Newcombe's (Statistics in Medicine 17, 1998, method 10), which does not
-    count on the pairing. Those of gaps of quantiles are of the bootstrap by photograph
-    (`sweep.analysis.intervals`), in which twins are drawn together with their photographs; scenes
-    of other simulations are drawn by themselves.
+    of gaps they follow from both of these (Newcombe, Statistics in Medicine 17, 1998; of ratios
+    from their logarithms). Gaps of rates do not count on the pairing; of quantiles of twins the
+    errors of both are correlated as their numbers of errors below them, photograph by photograph.
 
     Examples
     --------
@@ -1105,10 +1096,9 @@ def simulation_gap(
     """
     sides = matched_sides(photographs, simulated, bins)
     tables = [
-        estimator.aggregate(side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept, [
-            *COUNTS, *GAP_RATES, *(replace(each, single=single) for each in GAP_QUANTILES)],
-            Poses, sides.bins, stopped=False)
-        for side, single in zip(sides.datasets, (False, sides.single), strict=True)]
+        estimator.aggregate(side, dataset.pose_arrays(side, ERROR_INPUTS), sides.kept,
+                            [*COUNTS, *GAP_STATISTICS], Poses, sides.bins, stopped=False)
+        for side in sides.datasets]
     tables = [table.drop_vars([name for name, value in table.coords.items() if not value.dims])
               for table in tables]
     gaps: dict[str, xr.DataArray] = {}
@@ -1118,8 +1108,23 @@ def simulation_gap(
             f"{each.name}_gap", f"{words}: {each.meaning}", "1" if each.ratio else each.units)
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps |= {output.name: array.assign_attrs(cf_attributes(output.meaning, output.units))
-                     for output, array in zip(outputs, each.gap(*tables), strict=True)}
+                     for output, array in zip(outputs, _gap(
+                         each, *tables, paired=sides.paired), strict=True)}
+    tables = [table.drop_dims(UNIT) for table in tables]
     both = xr.concat(tables, "source", coords="minimal", compat="override", join="override")
-    return both.drop_vars([
-        f"{each.name}_{more}" for each in GAP_QUANTILES for more in ("units", "replicates")],
-    ).assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(paired=int(sides.paired))
+    return both.assign(gaps).assign_coords(source=list(SOURCES)).assign_attrs(
+        paired=int(sides.paired))
+
+
+def _gap(
+    each: ComparedRate | SolvedQuantile, first: xr.Dataset, second: xr.Dataset, *, paired: bool
+) -> Sequence[xr.DataArray]:
+    """Return the difference or ratio of a statistic in two tables, with its interval."""
+    correlation: Any = 0.0
+    if paired and isinstance(each, SolvedQuantile):
+        correlation = xr.corr(first[each.below], second[each.below], UNIT).fillna(0.0)
+    one, other = ([table[f"{each.name}{end}"] for end in INTERVAL] for table in (first, second))
+    if not each.ratio:
+        return difference_interval(one, other, correlation)
+    found = difference_interval([*map(np.log, one)], [*map(np.log, other)], correlation)
+    return [np.exp(end) for end in found]

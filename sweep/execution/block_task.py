@@ -27,7 +27,7 @@ from sweep.experiment.pipeline import Pipeline, file_digest
 from sweep.experiment.sampling import StoppingRule
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
-from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.measure.flags import DetectionStatus, EstimateStatus, flag_counts
 from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision
 from sweep.store import blocks
@@ -418,8 +418,8 @@ def _computed(
         scenes=len(block),
         computed={"scenes": len(rows), "detections": int(need.any(axis=2).sum()),
                   "estimates": int(need.sum())},
-        detection=np.bincount(values["detection"].ravel()).tolist(),
-        estimate=np.bincount(values["estimate"].ravel()).tolist(),
+        detection=flag_counts(DetectionStatus, values["detection"]),
+        estimate=flag_counts(EstimateStatus, values["estimate"]),
         seconds=seconds,
         failures=blocks.recorded(pipeline, block, cells.failures, rows.tolist()),
     )

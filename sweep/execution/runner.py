@@ -34,7 +34,6 @@ from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import NO_TRIALS, search_settings
 from sweep.isolation.child_process import Child, Interrupts, default_workers
 from sweep.isolation.crash_isolation import check_plugins
-from sweep.measure.flags import DetectionStatus
 from sweep.messages import notice
 from sweep.sampling.rules import make_rule
 from sweep.store import blocks, lifecycle
@@ -270,7 +269,7 @@ def compute(
         if progress is not None:
             progress(Progress(
                 totals.scenes, pipeline.size(Stage.scene),
-                int(totals.detection[DetectionStatus.detected]), *(() if waves is None else (
+                totals.detection["detected"], *(() if waves is None else (
                     totals.needed, waves.settled, waves.conditions))))
 
     with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):

@@ -15,14 +15,13 @@ from sweep.evaluation.block import bound_notes
 from sweep.execution.waves import InWaves, condition_count, unsettled_count
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import selection_text
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, looked_for
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain, quoted
 from sweep.processor import differing_processors
 from sweep.store import blocks
 from sweep.store.blocks import FailedCell, Receipt, RunStore
 from sweep.store.lifecycle import open_store, write_groups
 from sweep.store.lock import is_written
-from sweep.typing import Integers
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -44,7 +43,7 @@ class Totals:
     scenes, needed
         Scenes, and how many of them were needed.
     detection, estimate
-        Counts of cells; the flag is the index.
+        Counts of cells by the name of the flag.
     processors
         Blocks by the features of the processors that computed them.
     lost
@@ -53,8 +52,8 @@ class Totals:
 
     scenes: int = 0
     needed: int = 0
-    detection: Integers = field(default_factory=lambda: np.zeros(len(DetectionStatus), np.int64))
-    estimate: Integers = field(default_factory=lambda: np.zeros(len(EstimateStatus), np.int64))
+    detection: Counter[str] = field(default_factory=Counter)
+    estimate: Counter[str] = field(default_factory=Counter)
     processors: Counter[str] = field(default_factory=Counter)
     lost: dict[str, list[FailedCell]] = field(default_factory=lambda: {"crashed": [], "failed": []})
 
@@ -63,8 +62,8 @@ class Totals:
         self.scenes += receipt.scenes
         self.needed += receipt.scenes_needed
         self.processors.update(receipt.processors)
-        self.detection[: len(receipt.detection)] += receipt.detection
-        self.estimate[: len(receipt.estimate)] += receipt.estimate
+        self.detection.update(receipt.detection)
+        self.estimate.update(receipt.estimate)
         for cell in receipt.failures:
             if len(self.lost[cell.kind]) < MAX_ROWS:
                 self.lost[cell.kind].append(cell)
@@ -81,7 +80,7 @@ class Totals:
         counts = store.run_metadata["counts"]
         totals = Totals(
             needed=counts.get("sampled", {}).get("needed", 0),
-            detection=np.array(counts["detection"]), estimate=np.array(counts["estimate"]),
+            detection=Counter(counts["detection"]), estimate=Counter(counts["estimate"]),
             processors=Counter(counts["processors"]))
         if any(lost_counts(totals).values()):
             listing = Totals()
@@ -96,20 +95,10 @@ class Totals:
         return self.lost["failed"] + self.lost["crashed"]
 
 
-def flag_counts(counted: Totals | Receipt) -> tuple[Counter[str], Counter[str]]:
-    """Return the counts of the flags that occur, by name: of detections, and of estimates."""
-    detection, estimate = (
-        Counter({flag.name: int(count) for flag, count in zip(flags, counts, strict=False)
-                 if count})
-        for flags, counts in (
-            (DetectionStatus, counted.detection), (EstimateStatus, counted.estimate)))
-    return detection, estimate
-
-
 def lost_counts(counted: Totals | Receipt) -> dict[str, int]:
     """Return how many cells crashed and failed."""
-    detection, estimate = flag_counts(counted)
-    return {kind: detection[kind] + estimate[kind] for kind in ("crashed", "failed")}
+    return {kind: counted.detection.get(kind, 0) + counted.estimate.get(kind, 0)
+            for kind in ("crashed", "failed")}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -171,9 +160,8 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
         A cell to look at where nothing was detected, as ``--at`` takes it.
     """
     groups, advice = failure_groups(totals.cells), ""
-    counts = flag_counts(totals)
     shares, warnings = [0.0], list[str]()
-    for cells, flags in zip(("detections", "estimates"), counts, strict=True):
+    for cells, flags in (("detections", totals.detection), ("estimates", totals.estimate)):
         lost = {kind: flags[kind] for kind in ("failed", "crashed") if flags[kind]}
         tried = flags.total() - sum(flags[name] for name in NOT_TRIED)
         share = sum(lost.values()) / max(tried, 1)
@@ -190,7 +178,7 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
     if others:
         rest = sum(group["count"] for group in others)
         warnings.append(f"  {rest:,} x for {len(others):,} other reasons")
-    nothing = "" if 1.0 in shares else _nothing_found(*counts)
+    nothing = "" if 1.0 in shares else _nothing_found(totals)
     if groups or nothing:
         places = [group["at"] for group in shown] if groups else [first]
         words = [word for at in places if at for word in ("--at", at)]
@@ -201,12 +189,13 @@ def outcome_of(url: str, totals: Totals, first: str) -> dict[str, Any]:
             "failures": groups, "warnings": warnings, "advice": advice}
 
 
-def _nothing_found(*counts: Counter[str]) -> str:
+def _nothing_found(totals: Totals) -> str:
     """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
-    stages: tuple[tuple[type[Flag], str], ...] = (
-        (DetectionStatus, "nothing was detected"), (EstimateStatus, "no pose was estimated"))
-    for (flags, what), counted in zip(stages, counts, strict=True):
-        needed = Counter({name: count for name, count in counted.items() if name != "not_needed"})
+    stages: tuple[tuple[type[Flag], Counter[str], str], ...] = (
+        (DetectionStatus, totals.detection, "nothing was detected"),
+        (EstimateStatus, totals.estimate, "no pose was estimated"))
+    for flags, counts, what in stages:
+        needed = Counter({name: count for name, count in counts.items() if name != "not_needed"})
         if needed and not any(flags[name].present for name in needed):
             ((name, count),) = needed.most_common(1)
             return f"warning: {what}: {count:,} {name} ({flags[name].meaning.rstrip('.')})"
@@ -234,9 +223,7 @@ def close(store: RunStore) -> None:
         if receipt.seconds["scene"]:
             costs[number] = receipt.seconds
     counts: dict[str, Any] = {
-        "detection": totals.detection.tolist(), "estimate": totals.estimate.tolist(),
-        "processors": dict(totals.processors),
-    }
+        name: getattr(totals, name) for name in ("detection", "estimate", "processors")}
     if (rule := store.pipeline.stopping) is not None:
         counts["sampled"] = {"needed": totals.needed, "unsettled": unsettled_count(store, rule)}
     write_groups(store, {"cost": _cost(store, costs), "failures": _failure_table(totals)}, counts)
@@ -320,7 +307,8 @@ def account_of(store: RunStore, totals: Totals) -> dict[str, Any]:
     outcome["warnings"] += bound_notes(pipeline)
     return {
         "store": store.url, "poses": pipeline.size(Stage.scene), "blocks": len(store.blocks),
-        "looked_for": looked_for(totals.detection.tolist()),
+        "looked_for": sum(count for name, count in totals.detection.items()
+                          if DetectionStatus[name].counted),
         "needed": totals.needed if in_waves else None,
         "conditions": condition_count(pipeline) if in_waves else None, **outcome,
     }
@@ -371,7 +359,7 @@ def summary_of(
         **{f"computed_{what}": computed.get(what, 0) for what in ("blocks", "scenes", "estimates")},
         data=store.data_url,
         results=store.pipeline.size(*Stage),
-        detected=int(totals.detection[DetectionStatus.detected]),
+        detected=totals.detection["detected"],
         seconds=round(seconds, 3),
         retried=tried,
         recovered=tried - sum(failed_blocks(store, retried).values()),
@@ -394,7 +382,7 @@ def status(url: str) -> SimpleNamespace:
     As `account_of`, with the pipeline's ``title`` or name; whether every block is committed and the
     store is closed (``finished``), and whether a process writes it (``being_written``), on S3 also
     one that was killed less than two minutes ago; ``blocks_done`` and ``poses_done``; cells by flag
-    of ``detection`` and ``estimate``, without flags that no cell has; ``poses_per_s`` over the last
+    of ``detection`` and ``estimate``, the most frequent first; ``poses_per_s`` over the last
     minute of work, and ``seconds_left`` at that rate, None if unknown and of a store that nobody
     writes; the cells that ``crashed`` and ``failed``, at most 1,000 of each; of a run in waves, the
     conditions ``settled`` that need no more trials; blocks by the features of the ``processors``
@@ -417,7 +405,6 @@ def status(url: str) -> SimpleNamespace:
         settled = InWaves(store).settled
     writing = not store.finished and is_written(store.storage)
     rate, left = poses_per_second(written), account["poses"] - totals.scenes
-    detection, estimate = map(dict, flag_counts(totals))
     return SimpleNamespace(
         **account,
         **totals.lost,
@@ -426,8 +413,8 @@ def status(url: str) -> SimpleNamespace:
         being_written=writing,
         blocks_done=len(written),
         poses_done=totals.scenes,
-        detection=detection,
-        estimate=estimate,
+        detection=dict(totals.detection.most_common()),
+        estimate=dict(totals.estimate.most_common()),
         poses_per_s=rate,
         seconds_left=left / rate if rate and writing and settled is None else None,
         settled=settled,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -39,10 +39,15 @@ from sweep.store.provenance import differences, excerpt
 StoredValues = dict[str, NDArray[Any]]
 
 
-def stored_values(store: RunStore, index: Mapping[str, int | slice]) -> StoredValues:
-    """Return every variable at an index along axes; axes that it does not name are whole."""
+def values_at(
+    store: RunStore, array_of: Callable[[str], Any], index: Mapping[str, int | slice]
+) -> StoredValues:
+    """Return every variable's array at an index along axes; axes that it does not name are whole.
+
+    ``array_of`` gives the array of a variable, in its own dimensions.
+    """
     return {
-        variable.name: np.asarray(store.array(variable.name)[tuple(
+        variable.name: np.asarray(array_of(variable.name)[tuple(
             index.get(name, slice(None)) for name in variable.dimensions(store.pipeline))])
         for variable in store.variables
     }
@@ -61,24 +66,6 @@ def current_pipeline(store: RunStore) -> tuple[Pipeline, list[str]]:
         stored.text, name=stored.name, source=store.url, folder=stored.folder,
     )
     return pipeline, differences(pipeline, stored, store.fingerprint)
-
-
-def computable(store: RunStore) -> Pipeline:
-    """Return a store's pipeline, to be computed on this machine.
-
-    Raises
-    ------
-    StoreError
-        If it would give other numbers.
-    PipelineError
-        If it cannot be computed at all, for want of a file, say.
-    """
-    pipeline, changes = current_pipeline(store)
-    if changes:
-        raise StoreError("\n".join(
-            [f"{store.url}: cannot be recomputed on this machine:", *changes]
-        ))
-    return pipeline
 
 
 # --------------------------------------------------------------------------------------------------
@@ -230,30 +217,29 @@ def check_scenes(
     MachineFaultError
         If this machine cannot compute them.
     """
-    metadata = {f"{variable.name}/zarr.json" for variable in store.variables}
-    if unreadable := metadata & {each.where for each in report.damage}:
-        report.not_sampled = f"{min(unreadable)} is damaged"
-    elif not (sample and sound):
-        report.not_sampled = (
+    unreadable = {f"{variable.name}/zarr.json" for variable in store.variables}.intersection(
+        each.where for each in report.damage)
+    if unreadable or not sample or not sound:
+        report.not_sampled = f"{min(unreadable)} is damaged" if unreadable else (
             "there is no sound block" if sample else "a sample of 0 scenes was asked for")
-    else:
-        try:
-            pipeline = computable(store)
-        except SweepError as error:
-            report.not_sampled = str(error).splitlines()[-1].strip()
-            return
-        scenes = _drawn(store, sample, sound)
-        report.sampled = len(scenes)
-        if not scenes:
-            report.not_sampled = "every scene that was drawn had crashed"
-            return
-        computed = _recomputed(pipeline, [scene.cell for scene in scenes])
-        damage = _compared(store, scenes, computed)
-        if damage and (part := _changing(pipeline, scenes, computed)):
-            report.unstable = part
-            damage = [Damage(part, f"not deterministic: {part}: scenes that were recomputed twice "
-                                   "on the same images differ")]
-        report.damage += damage
+        return
+    try:
+        pipeline, changes = current_pipeline(store)
+    except SweepError as error:
+        changes = str(error).splitlines()
+    scenes = [] if changes else _drawn(store, sample, sound)
+    if not scenes:
+        report.not_sampled = changes[-1].strip() if changes else (
+            "every scene that was drawn had crashed")
+        return
+    report.sampled = len(scenes)
+    computed = _recomputed(pipeline, [scene.cell for scene in scenes])
+    damage = _compared(store, scenes, computed)
+    if damage and (part := _changing(pipeline, scenes, computed)):
+        report.unstable = part
+        damage = [Damage(part, f"not deterministic: {part}: scenes that were recomputed twice "
+                               "on the same images differ")]
+    report.damage += damage
 
 
 def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Scene]:
@@ -274,8 +260,9 @@ def _drawn(store: RunStore, count: int, sound: Mapping[int, Receipt]) -> list[Sc
         drawn |= {(number, block.cell(int(row))) for row in rows}
     names = [axis.name for axis in store.pipeline.experiment.scene_axes]
     scenes = [
-        Scene(number, cell, stored_values(
-            store, {name: slice(k, k + 1) for name, k in zip(names, cell, strict=True)}),
+        Scene(number, cell, values_at(
+            store, store.array,
+            {name: slice(k, k + 1) for name, k in zip(names, cell, strict=True)}),
             tuple(sound[number].processors) == (processor(),))
         for number, cell in sorted(drawn)
     ]
@@ -296,20 +283,26 @@ def _recomputed(
     return run_cells_isolated(pipeline, list(np.array(cells, dtype=np.intp).T), need, limit_s)
 
 
+def _scene_values(store: RunStore, computed: CellsResult, row: int) -> StoredValues:
+    """Return every variable of a recomputed scene as the store lays it out, scene axes of 1."""
+    axes = len(store.pipeline.experiment.scene_axes)
+    one = Block((0,) * axes, (1,) * axes)
+    return {
+        variable.name: to_dataset_layout(
+            variable, store.pipeline, one, computed.columns[variable.name][:, row : row + 1])
+        for variable in store.variables
+    }
+
+
 def _compared(store: RunStore, scenes: Sequence[Scene], computed: CellsResult) -> list[Damage]:
     """Return the recomputed scenes that differ from the stored ones.
 
     On another processor few of them may.
     """
     names = [axis.name for axis in store.pipeline.experiment.scene_axes]
-    one = Block((0,) * len(names), (1,) * len(names))
     found: list[tuple[bool, Damage]] = []
     for row, scene in enumerate(scenes):
-        values = {
-            variable.name: to_dataset_layout(
-                variable, store.pipeline, one, computed.columns[variable.name][:, row : row + 1])
-            for variable in store.variables
-        }
+        values = _scene_values(store, computed, row)
         if difference := compare(
                 values, scene.stored, store.variables, same_processor=scene.exact):
             at = selection_text(store.pipeline, dict(zip(names, scene.cell, strict=True)))
@@ -425,7 +418,10 @@ def repair(
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
     store = lifecycle.open_unchecked(url, "r+")
-    pipeline = computable(store) if numbers else store.pipeline
+    pipeline, changes = current_pipeline(store) if numbers else (store.pipeline, [])
+    if changes:
+        raise StoreError(
+            "\n".join([f"{store.url}: cannot be recomputed on this machine:", *changes]))
     store = lifecycle.reopen(store, drop=numbers)
     if before.finished and numbers:
         execute(pipeline, url, workers=workers, time_limit_s=time_limit_s, yes=True)
@@ -522,7 +518,7 @@ def reproduce(
 
 
 def _reproduced(
-    store: RunStore, pipeline: Pipeline, changes: list[str], index: Mapping[str, int],
+    store: RunStore, pipeline: Pipeline, changes: list[str], index: dict[str, int],
     done: Container[int], whole_frame: bool, time_limit_s: float,
 ) -> Reproduction:
     """Recompute the cell at an index along the axes; ``done`` has the committed blocks."""
@@ -532,19 +528,13 @@ def _reproduced(
         if axes else 0
         for axes in map(pipeline.axes_of, (Stage.detection, Stage.estimation))
     )
-    configuration = {
-        Stage.scene: 0, Stage.detection: setting,
-        Stage.estimation: setting * pipeline.size(Stage.estimation) + estimator,
-    }
     cells = _recomputed(pipeline, [corner], time_limit_s, (setting, estimator))
-    recomputed = {
-        v.name: cells.columns[v.name][configuration[v.stage]][0].astype(v.dtype)
-        for v in store.variables
-    }
+    within = index | {axis.name: 0 for axis in pipeline.experiment.scene_axes}
+    recomputed = values_at(store, _scene_values(store, cells, 0).__getitem__, within)
     number, stored, exact, unneeded = store.blocks.number(Block(corner, corner)), None, False, False
     if number in done:
         _, receipt = next(blocks.receipts(store, [number]))
-        values = stored_values(store, index)
+        values = values_at(store, store.array, index)
         unneeded = bool(values["detection"] == DetectionStatus.not_needed)
         stored = None if unneeded else values
         exact = not (unneeded or changes) and tuple(receipt.processors) == (processor(),)
@@ -555,7 +545,7 @@ def _reproduced(
     inspected, image = _inspected(cell(pipeline, full_at), whole_frame, time_limit_s)
     return Reproduction(
         full_at, recomputed, stored, difference, exact,
-        {stage.name: cells.seconds[stage.name][number] for stage, number in configuration.items()},
+        {stage: sum(seconds) for stage, seconds in cells.seconds.items()},
         cells.failures, changes, pipeline, inspected, image, unneeded,
     )
 

@@ -7,9 +7,12 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from enum import IntEnum
 from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Flag(IntEnum):
@@ -181,13 +184,14 @@ def present_values(flags: Iterable[Flag]) -> list[int]:
     return [int(member) for member in flags if member.present]
 
 
-def looked_for(counts: Sequence[int]) -> int:
-    """Return how many of the detection stage's cells were looked for; ``counts`` are by flag.
+def flag_counts(flags: type[Flag], values: NDArray[np.uint8]) -> dict[str, int]:
+    """Return how often each flag that occurs does, by name.
 
-    >>> looked_for([5, 600, 20])
-    620
+    >>> flag_counts(DetectionStatus, np.array([[1, 1], [3, 1]], dtype=np.uint8))
+    {'detected': 3, 'rejected': 1}
     """
-    return sum(count for flag, count in zip(DetectionStatus, counts, strict=False) if flag.counted)
+    counts = np.bincount(values.ravel()).tolist()
+    return {flag.name: count for flag, count in zip(flags, counts, strict=False) if count}
 
 
 def uncounted_values(flags: Iterable[Flag]) -> list[int]:

@@ -191,7 +191,7 @@ class Receipt:
     computed
         "scenes", "detections" and "estimates" -> how many were computed and not reused.
     detection, estimate
-        How often each flag occurs, by its value.
+        How often each flag occurs, by name.
     seconds
         Stage -> seconds for each configuration; empty where nothing was computed.
     failures
@@ -213,8 +213,8 @@ class Receipt:
     processors: Sequence[str]
     scenes: int
     computed: Mapping[str, int]
-    detection: Sequence[int]
-    estimate: Sequence[int]
+    detection: Mapping[str, int]
+    estimate: Mapping[str, int]
     seconds: Mapping[str, Sequence[float]]
     failures: Sequence[FailedCell]
     wall_s: float = 0.0
@@ -226,8 +226,8 @@ class Receipt:
     @property
     def scenes_needed(self) -> int:
         """How many of its scenes were needed, for the precision that was asked for."""
-        unneeded = sum(self.detection[DetectionStatus.not_needed :][:1])
-        return self.scenes - unneeded * self.scenes // max(sum(self.detection), 1)
+        unneeded = self.detection.get(DetectionStatus.not_needed.name, 0)
+        return self.scenes - unneeded * self.scenes // max(sum(self.detection.values()), 1)
 
     def to_bytes(self) -> bytes:
         """Return the chunk that a store holds: a text of JSON, the bytes that Zarr writes."""
@@ -323,7 +323,7 @@ def begin_block(store: RunStore, block: Block) -> bool:
         key = f"{BEGUN}/{store.blocks.number(block)}"
         if files.read_files(store.storage, [key]) != [None]:
             return True
-        files.write_document(store.storage, key, {})
+        files.write_files(store.storage, {key: b"{}"})
     return False
 
 

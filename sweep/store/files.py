@@ -141,11 +141,6 @@ def read_json(storage: Store, key: str) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def write_document(storage: Store, key: str, content: Mapping[str, Any]) -> None:
-    """Write a JSON document."""
-    write_files(storage, {key: encoded(content)})
-
-
 def write_whole(path: Path, content: bytes) -> None:
     """Write a new file beside a path, which takes the path's name once everything is written.
 

@@ -11,9 +11,8 @@ import time
 import uuid
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -50,11 +49,10 @@ if TYPE_CHECKING:
 # The layout of a store: its arrays, their metadata, and the values of its coordinates.
 
 #: Version of the layout of stores; another one is refused.
-FORMAT = 8
+FORMAT = 9
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedArray:
+class PlannedArray(NamedTuple):
     """One array of a store.
 
     Attributes
@@ -74,29 +72,25 @@ class PlannedArray:
     chunks: tuple[int, ...]
     dtype: str
     dimensions: tuple[str, ...]
+    attributes: dict[str, Any]
     fill: Any = None
-    attributes: dict[str, Any] = field(default_factory=dict)
     values: NDArray[Any] | None = None
     coordinate: bool = False
-
-    def create(self, group: zarr.Group) -> None:
-        """Create the array and write its values."""
-        array = group.create_array(
-            self.path, shape=self.shape, chunks=self.chunks, dtype=self.dtype,
-            dimension_names=self.dimensions, compressors=files.codecs(), attributes=self.attributes,
-            # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
-            config={"write_empty_chunks": True}, fill_value=self.fill,
-        )
-        if self.values is not None:
-            array[...] = self.values
 
 
 def planned_files(planned: Iterable[PlannedArray]) -> dict[str, bytes]:
     """Return the contents of the files that an empty store has by key, except the root's."""
     memory = MemoryStore()
     group = zarr.open_group(memory, mode="w", zarr_format=3)
-    for array in planned:
-        array.create(group)
+    for each in planned:
+        array = group.create_array(
+            each.path, shape=each.shape, chunks=each.chunks, dtype=each.dtype,
+            dimension_names=each.dimensions, compressors=files.codecs(), attributes=each.attributes,
+            # Also what equals the fill value (a tilt of 0): a missing chunk is a deleted one.
+            config={"write_empty_chunks": True}, fill_value=each.fill,
+        )
+        if each.values is not None:
+            array[...] = each.values
     return {key: content for key, content in files.files_in(memory).items() if key != "zarr.json"}
 
 
@@ -111,20 +105,18 @@ def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[Planned
             array = array.astype(object)
         planned.append(PlannedArray(
             name, array.shape, array.shape,
-            "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions, None,
-            with_description(name, attributes), array, coordinate=dimensions != (name,),
-        ))
+            "string" if array.dtype == object else array.dtype.str.lstrip("<>|="), dimensions,
+            with_description(name, attributes), None, array, dimensions != (name,)))
     for variable in pipeline.experiment.variables:
         names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
         chunks = tuple(
             scene_extent.get(name, length) for name, length in zip(names, shape, strict=True))
         planned.append(PlannedArray(
-            variable.name, shape, chunks, variable.dtype, names, variable.fill,
-            with_description(variable.name, variable.attributes()),
-            coordinate=bool(variable.drawn_as),
-        ))
+            variable.name, shape, chunks, variable.dtype, names,
+            with_description(variable.name, variable.attributes()), variable.fill,
+            coordinate=bool(variable.drawn_as)))
     count = len(Blocks(tuple(map(len, axes)), extents))
-    planned.append(PlannedArray(files.RECEIPTS, (count,), (1,), "string", ("block",)))
+    planned.append(PlannedArray(files.RECEIPTS, (count,), (1,), "string", ("block",), {}))
     return planned
 
 
@@ -343,8 +335,8 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             files.delete_folder(outside, folder)
             raise
         if remote:  # the URL points to it once it is complete
-            files.write_document(
-                outside, "zarr.json", GROUP | {"attributes": {locations.POINTER: run_id}})
+            files.write_files(outside, {"zarr.json": files.encoded(
+                GROUP | {"attributes": {locations.POINTER: run_id}})})
     return open_store(url, "r+")
 
 
@@ -627,8 +619,8 @@ def write_root(
             for key, content in zip(keys, files.read_files(store.storage, keys), strict=True)
             if content
         }
-    files.write_document(
-        store.storage, "zarr.json", root_document(pipeline or store.pipeline, metadata, members))
+    files.write_files(store.storage, {"zarr.json": files.encoded(
+        root_document(pipeline or store.pipeline, metadata, members))})
 
 
 # --------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from sweep.experiment.draws import SAMPLINGS
-from sweep.experiment.grid import Axis
+from sweep.experiment.grid import MAX_LISTED, Axis
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.sampling import not_continued
 from sweep.version import __version__
@@ -138,7 +138,9 @@ def _values(value: Any) -> Any:
     """Return a value to be compared: of an axis the values of each of its parameters."""
     if not isinstance(value, Axis):
         return value
-    return {name: list(column) for name, column in value.columns.items()}
+    # Values that are listed may be those of a range; a longer one has no like but itself.
+    return {name: list(column) if len(column) <= MAX_LISTED else column
+            for name, column in value.columns.items()}
 
 
 def _shown(value: Any) -> str:

@@ -71,7 +71,7 @@ def receipt_of(store, number, wall_s):
     return Receipt(
         run_id=store.run_id, processors=("simulated",), scenes=scenes,
         computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
-        detection=[0, scenes], estimate=[0, scenes],
+        detection={"detected": scenes}, estimate={"solved": scenes},
         seconds={"scene": [0.0], "detection": [0.0], "estimation": [0.0]}, failures=(),
         wall_s=wall_s, written=time.time(), block=number,
         checksums={variable.name: 123456789 for variable in store.variables},

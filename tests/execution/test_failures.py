@@ -4,6 +4,7 @@ import errno
 import itertools
 import os
 import shutil
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -33,7 +34,6 @@ from sweep.execution.status import (
 from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
-from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import FailedCell, begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
 
@@ -46,11 +46,8 @@ TRACEBACK = """Traceback (most recent call last):
 
 
 def outcome(detection, estimate, cells):
-    counts = [[given.get(flag.name, 0) for flag in flags]
-              for flags, given in ((DetectionStatus, detection), (EstimateStatus, estimate))]
-    totals = Totals(
-        detection=np.array(counts[0]), estimate=np.array(counts[1]),
-        lost={"failed": cells, "crashed": []})
+    totals = Totals(detection=Counter(detection), estimate=Counter(estimate),
+                    lost={"failed": cells, "crashed": []})
     return outcome_of("a b.zarr", totals, "trial=0")
 
 
@@ -233,7 +230,7 @@ def run_on(client, url):
     with Interrupts() as interrupts:
         compute(store, OnCluster(client), (), 600.0, interrupts)
     counts = open_store(str(url)).run_metadata["counts"]
-    return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
+    return sum(counts[flags].get("failed", 0) for flags in ("detection", "estimate"))
 
 
 @pytest.mark.parametrize(("fault", "place"), [
